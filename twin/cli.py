@@ -435,7 +435,7 @@ def fit_surrogate(
 
 @app.command("calibrate", hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def calibrate() -> None:
-    """Old name of fit-surrogate."""
+    """Old name of the command fit-surrogate; ends with an error that states the new name."""
     raise TwinError("calibrate", "renamed to fit-surrogate")
 
 

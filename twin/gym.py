@@ -109,7 +109,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def frames_per_step(self) -> int:
-        """Number of frames of a step. It depends on the floor, and therefore on the seed of the scenario."""
+        """Returns the number of frames of a step. It depends on the floor, and thus on the seed of the scenario."""
         return self._world.mission.plan.n_frames_per_keyframe
 
     def reset(

@@ -16,7 +16,7 @@ from twin.errors import TwinError
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
 MAX_BYTES = 500_000_000  #: size of the largest file that is read
-MAX_TEXELS = 250_000_000  #: of all textures of a floor together
+MAX_TEXELS = 250_000_000  #: largest number of texels of all textures of a floor together
 TEXTURED_FACES = 200_000  #: largest number of triangles of a divided mesh, whose corners sample the texture
 
 Array = NDArray[np.float64]

@@ -24,7 +24,7 @@ class Parts(NamedTuple):
     """Bounds of the n parts of a mesh, in the axes of the object.
 
     With c the centre of a part, p a corner and m the unit normal of any of its triangles, the angle between m and
-    `axis` is at most that of `cos_sin`, and m (p - c) >= -`behind_m`.
+    `axis` is at most the one whose cosine and sine are `cos_sin`, and m (p - c) >= -`behind_m`.
 
     Args:
         centre_m: (n, 3) centre of the bounding box.

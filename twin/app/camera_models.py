@@ -1,4 +1,4 @@
-"""Believed and true calibration of the delivered images of a scenario as camera models of OpenCV."""
+"""Believed and true calibration of the images of a scenario, as camera models of OpenCV."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ def believed_calibration(rig: StereoRig) -> RigCalibration:
 def true_calibration(scenario: Scenario) -> RigCalibration:
     """Returns the true calibration of the delivered images, which are rectified with the believed calibration.
 
-    The true image of a point is that of `TrueCameras.project`, which follows the rays through port, lens and
-    rectification. Camera matrix, distortion (k1, k2, p1, p2, k3) and, for the right camera, its rotation are fitted to
-    the images of points at depths of 0.6, 1 and 1.4 times the planned altitude by least squares; `residual_px` is the
-    RMS distance that remains. For cameras without lens distortion, port and calibration errors (except that of the
-    baseline), the result is exact, and `residual_px` is zero.
+    The true pixel of a point is computed by `TrueCameras.project`, which models port, lens and rectification. Camera
+    matrix, distortion (k1, k2, p1, p2, k3) and, for the right camera, its rotation are fitted to the images of points
+    at depths of 0.6, 1 and 1.4 times the planned altitude by least squares; `residual_px` is the RMS distance that
+    remains. For cameras without lens distortion, port and calibration errors (except that of the baseline), the result
+    is exact, and `residual_px` is zero.
 
     Raises:
         TwinError: the cameras of the scenario are invalid, see `make_true_cameras`.

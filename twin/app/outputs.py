@@ -15,7 +15,7 @@ _STEM_BYTES = 100
 
 
 def new_folder(folder: Path, option: str = "--out") -> Path:
-    """Returns the folder. Raises TwinError unless it is new or empty and can be written."""
+    """Returns the folder. Raises TwinError unless the folder is new or empty and can be written."""
     _check_path(folder, option, "a new or an empty folder")
     if folder.exists() and not folder.is_dir():
         raise TwinError(option, f"{folder} is not a folder", "a new or an empty folder")
@@ -35,7 +35,7 @@ def unused_folder(first: Path) -> Path:
 
 
 def output_file(file: Path, option: str = "--out") -> Path:
-    """Returns `file`. Raises TwinError if this path exists but is not a file, or if its folder cannot be written."""
+    """Returns `file`. Raises TwinError if the path is invalid or not that of a file, or the folder is not writable."""
     _check_path(file, option, "the path of a file")
     if file.exists() and not file.is_file():
         raise TwinError(option, f"{file} is not a file", "the path of a file")

@@ -48,37 +48,37 @@ class StereoRig:
 
     @property
     def fx_px(self) -> float:
-        """Focal length along the rows of the image [px]."""
+        """Returns the focal length along the rows of the image [px]."""
         return self.focal_px
 
     @property
     def fy_px(self) -> float:
-        """Focal length along the columns of the image [px]."""
+        """Returns the focal length along the columns of the image [px]."""
         return self.focal_px if self.focal_y_px is None else self.focal_y_px
 
     @property
     def focals_px(self) -> Array:
-        """Focal lengths (fx, fy) along the rows and the columns of the image [px]."""
+        """Returns the focal lengths (fx, fy) along the rows and the columns of the image [px]."""
         return np.array([self.fx_px, self.fy_px])
 
     @property
     def cx_px(self) -> float:
-        """Column of the principal point [px]."""
+        """Returns the column of the principal point [px]."""
         return (self.width_px - 1) / 2 if self.principal_point_px is None else self.principal_point_px[0]
 
     @property
     def cy_px(self) -> float:
-        """Row of the principal point [px]."""
+        """Returns the row of the principal point [px]."""
         return (self.height_px - 1) / 2 if self.principal_point_px is None else self.principal_point_px[1]
 
     @property
     def matrix(self) -> Array:
-        """(3, 3) camera matrix K of both cameras [px]."""
+        """Returns the camera matrix K (3, 3) of both cameras [px]."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     @property
     def left_from_right(self) -> Array:
-        """(4, 4) pose of the right camera in the frame of the left camera."""
+        """Returns the pose (4, 4) of the right camera in the frame of the left camera."""
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
@@ -270,7 +270,7 @@ class Trajectory:
 
     @property
     def positions(self) -> Array:
-        """(n, 3) positions of the left camera in the world [m]."""
+        """Returns the positions (n, 3) of the left camera in the world [m]."""
         return self.world_from_camera[:, :3, 3]
 
     def save(self, path: Path) -> None:

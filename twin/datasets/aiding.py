@@ -117,8 +117,8 @@ class Aiding:
         gives an offset between the recorded heights and those of the world; `at` adds the mean offset from now on.
 
         If none of the first frames has a height, heights are not used from now on. If none of them has an attitude and
-        `known` is None, neither attitudes nor heights are used from now on, and the result is None. In both cases,
-        `notes` says so.
+        `known` is None, neither attitudes nor heights are used from now on, and the result is None. In both cases, a
+        sentence on this is added to `notes`.
 
         Args:
             opening: the first frames.

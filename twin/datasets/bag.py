@@ -219,9 +219,10 @@ def _typestore() -> Any:
 
 @cache
 def _bound_decompression() -> None:
-    """Limits the data that rosbags decompresses from a chunk to the size that the chunk states.
+    """Makes rosbags stop the decompression of a chunk one byte after the size that the chunk states.
 
-    rosbags decompresses a chunk before it compares the size, so a small chunk could fill the memory.
+    rosbags decompresses a chunk before it compares the size, so a small chunk could fill the memory. A chunk that
+    states more than `_MOST_CHUNK_BYTES` is not decompressed.
     """
     storage = optional("rosbags.rosbag2.storage_mcap", "exchange", _PURPOSE)
     lz4 = optional("lz4.frame", "exchange", _PURPOSE)

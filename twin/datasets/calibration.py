@@ -53,7 +53,7 @@ class StereoCalibration:
 
     @property
     def baseline_m(self) -> float:
-        """Distance between the two cameras [m]."""
+        """Returns the distance between the two cameras [m]."""
         return float(np.linalg.norm(self.right_from_left[:3, 3]))
 
     def for_images(self, width_px: int, height_px: int) -> StereoCalibration:

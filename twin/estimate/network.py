@@ -137,7 +137,7 @@ class KeyframeNetwork:
 
     @property
     def poses(self) -> Array:
-        """(n, 4, 4) world_from_camera of all keyframes."""
+        """Returns the world_from_camera (n, 4, 4) of all keyframes."""
         return np.array([k.world_from_camera for k in self.keyframes]).reshape(-1, 4, 4)
 
     def add(self, keyframe: Keyframe) -> None:

@@ -124,9 +124,9 @@ class Navigator:
 
         Args:
             cov: (6, 6) covariance of the start [rotation, translation] in camera axes (rad, m), for the online pose.
-            prior_cov: (6, 6) the same for the prior of the first node in the alignments. It should be large in the
-                directions that the readings at all nodes determine: these readings are factors of the alignment, and a
-                prior computed from them would count them twice.
+            prior_cov: (6, 6) covariance, in the same order and axes, of the prior factor of the first node in the
+                alignments. It should be large in the directions that the readings at all nodes determine: these
+                readings are factors of the alignment, and a prior computed from them would count them twice.
         """
         self.filter.cov = cov
         self.network.reference_cov = prior_cov
@@ -306,7 +306,7 @@ class Navigator:
 
     @property
     def dead_reckoning(self) -> DeadReckoningState:
-        """Dead-reckoning state at the last frame; `dead_reckon` advances it by one frame."""
+        """Returns the dead-reckoning state at the last frame; `dead_reckon` advances it by one frame."""
         online = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
         return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
 

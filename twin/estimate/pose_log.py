@@ -22,17 +22,17 @@ class PoseLog:
 
     @property
     def times_s(self) -> Array:
-        """(n,) times of the frames [s]."""
+        """Returns the times (n,) of the frames [s]."""
         return self._times_s.array
 
     @property
     def f2f(self) -> Array:
-        """(n, 4, 4) world_from_camera from frame-to-frame motion alone."""
+        """Returns the world_from_camera (n, 4, 4) from frame-to-frame motion alone."""
         return self._f2f.array
 
     @property
     def online(self) -> Array:
-        """(n, 4, 4) world_from_camera as estimated online."""
+        """Returns the world_from_camera (n, 4, 4) as estimated online."""
         return self._online.array
 
     def append(self, times_s: float | Array, f2f: Array, online: Array) -> None:

@@ -111,7 +111,7 @@ class StereoVision:
 
     @cached_property
     def mosaic(self) -> Mosaic:
-        """The mosaic; it is created at the first access, which requires a keyframe."""
+        """Returns the mosaic; it is created at the first access, which requires a keyframe."""
         assert self._points is not None
         cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")

@@ -38,7 +38,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     All messages are in the order of time. Topics: /left/image_rect/compressed, /left/camera_info and the same for
     right; /tf_static; /odometry and /tf of the final trajectory; /ground_truth/odometry if the truth is known; and, if
     recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure and /dvl. All times are those
-    of `euroc.timestamp_ns`.
+    that `euroc.timestamp_ns` returns.
 
     Raises:
         TwinError: the package rosbags is not installed, the bag exists already, or an image is truncated or not a PNG
@@ -176,7 +176,10 @@ def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
 
 
 def _inertial(imu: RecordedImu, factory: MessageFactory) -> Iterator[Message]:
-    """Yields the readings of the IMU; white noise of density s, sampled at a rate f, has the variance s^2 f."""
+    """Yields the messages with the readings of the IMU.
+
+    The variances are s^2 f, for white noise of density s that is sampled at the rate f.
+    """
     root = np.sqrt(imu.rate_hz)
     sigmas = imu.noise.gyroscope_noise_density * root, imu.noise.accelerometer_noise_density * root
     for time_s, rates, forces in zip(*imu.readings, strict=True):

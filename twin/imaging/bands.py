@@ -6,7 +6,7 @@ one camera. A coefficient of a band is the mean over the wavelengths, weighted w
 the light. Absorption in the red band changes so steeply with wavelength that the light of this band does not decay as
 one exponential. The effective coefficient over a path L is
 
-    -ln(sum w exp(-a L)) / L,    w: normalised weights,
+    -ln(sum w exp(-a L)) / L,    w: normalised weights, a: coefficient at each wavelength,
 
 which makes the light at the end of the path exact; for L = 0 it is the mean.
 """

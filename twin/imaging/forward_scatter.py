@@ -35,6 +35,7 @@ Depth: TypeAlias = NDArray[np.float32]
 Place: TypeAlias = NDArray[np.float32]
 
 SHARE_STEPS = 512  # number of steps of r / (r + RANGE_SCALE_M) from 0 to 1
+#: Lengths "as a tangent" are in units of the focal length.
 SURROUNDINGS_TAN = 1.6  # half the extent of the surroundings along the longer side of the image, as a tangent
 SURROUNDINGS_STEP_TAN = 0.035  # side of a pixel of the surroundings, as a tangent, within a factor of 1.4
 WIDENING = 1.5  # exponent of 1 / cos(theta) in the pixels that an angle covers
@@ -155,7 +156,11 @@ class ForwardScatter:
         return light
 
     def core(self, range_m: Array) -> Array:
-        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel, at ranges (H, W)."""
+        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel.
+
+        Args:
+            range_m: (H, W) distance of the floor from the camera; inf is valid.
+        """
         place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
         return np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)
 
@@ -180,7 +185,7 @@ def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) 
 
     Args:
         bands: water in the bands R, G, B.
-        focal_px: focal length.
+        focal_px: focal length [px].
         levels: number of levels of the pyramid.
 
     Returns:
@@ -262,7 +267,7 @@ def _tables(weights: Array, moved: Array) -> NDArray[np.float32]:
 def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int) -> list[Radiance]:
     """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid.
 
-    The share is computed for each pixel (rows, cols) of a level.
+    Each element of the list has the shares (rows, cols) of the pixels of one level.
 
     Args:
         rig: the camera.
@@ -339,7 +344,7 @@ def _weigh(image, place, table, widening, wider):
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _add_upsampled(small, light, first, end):
-    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows `first` to `end` of `light` (H, 3 W).
+    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows `first` to `end` - 1 of `light` (H, 3 W).
 
     Along each axis, the filter of the even pixels is (1, 6, 1) / 8 and that of the odd pixels (1, 1) / 2. Rows before
     the first one are mirrored, and the last row is repeated. The same holds for columns.

@@ -64,7 +64,7 @@ class ImageFormation:
         scenario: settings of lamps, material, wind, marine snow and current, and which effects are enabled.
         illumination: optical properties of the water, and daylight.
         floor: heights of the floor, which has facets and, with `imaging.shadows`, casts shadows; None = a smooth floor
-            without shadows, whose normals follow from its depth.
+            whose normals follow from its depth, and no shadows, not even of objects.
         snow_rng: random stream of the positions and diameters of the particles.
         rig: the rendered cameras; None = the believed rig.
         objects: objects on the floor; None = none.

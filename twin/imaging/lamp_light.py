@@ -4,10 +4,10 @@ A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular 
 
     (I(theta) exp(-c d) + S(theta, d)) / d^2,
 
-where S is exp(-a d) times the beam convolved with the kernel of `spread.lamp_mixture`: the scattered light is not lost,
-but makes the beam wider and its edge softer. In water without scattering, or with single scattering, S is 0. Light that
-the floor reflects and the water scatters back to it is neglected, and so are the shadows of the floor in scattered
-light.
+with c the attenuation. S is exp(-a d), with a the absorption, times the beam convolved with the kernel of
+`spread.lamp_mixture`: the scattered light is not lost, but makes the beam wider and its edge softer. In water without
+scattering, or with single scattering, S is 0. Light that the floor reflects and the water scatters back to it is
+neglected, and so are the shadows of the floor in scattered light.
 """
 
 from __future__ import annotations
@@ -35,7 +35,9 @@ RINGS, AZIMUTHS = 120, 24  # rings around the straight path, and directions on o
 
 
 class LampLight:
-    """Light of the lamps on particles in the water, at points in the axes of one camera; for the floor: `floor_tables`.
+    """Light of the lamps on particles in the water, at points in the axes of one camera.
+
+    See `floor_tables` for their light on the floor.
 
     Args:
         sources: lamps in the axes of the camera.
@@ -74,6 +76,8 @@ class LampLight:
 
     def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
         """Returns the light (..., n, 3) that the water scatters into a ray to the camera, per metre of the ray [cd/m3].
+
+        Its loss on the way from these points to the camera is not included.
 
         Args:
             points: (..., n, 3) points of the ray in the axes of the camera [m].

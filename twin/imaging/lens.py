@@ -32,7 +32,7 @@ class Distortion(NamedTuple):
 
 
 def true_lens(lens: LensConfig) -> Distortion:
-    """Returns the true distortion of both lenses."""
+    """Returns the true distortion, which is the same for both lenses."""
     return Distortion(lens.k1, lens.k2, lens.k3, lens.p1, lens.p2)
 
 
@@ -58,7 +58,7 @@ def distort(normalised: Array, lens: Distortion) -> Array:
 def undistort(distorted: Array, lens: Distortion) -> Array:
     """Returns the normalised coordinates (..., 2) of the rays with the distorted image coordinates (..., 2).
 
-    Inverse of `distort` by Newton's method; NaN where it does not converge to a radius below `fold`.
+    `distort` is inverted by Newton's method; the result is NaN where it does not converge to a radius below `fold`.
     """
     normalised = distorted
     for _ in range(STEPS):

@@ -14,8 +14,8 @@ A point at depth z is imaged as a disc of the diameter (circle of confusion)
     c = A f |1/z - 1/s|
 
 for a lens with an aperture of diameter A, focused at depth s, with f the focal length in water [px] (thin lens; the
-focal length is negligible compared with s). Light is gathered with the disc of the receiving pixel, so the blur of a
-near object does not spread over the background.
+focal length is negligible compared with s). A pixel gets the mean light over the disc that belongs to its own depth, so
+the blur of a near object does not spread over the background.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
 Depth = NDArray[np.float32]
 
-REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; REACH_PX must be even
+REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; `_add_across` is written for 4
 TAPS = 4  # taps of cubic interpolation
 GRID = 64  # samples of the MTF along each axis, from which the kernel is computed
 MTF_ERROR = 5e-3  # separable terms are added until their transform is within this of that of the kernel
-NEAREST_FOCUS_M = 0.05  # nearest depth in focus
+NEAREST_FOCUS_M = 0.05  # smallest depth to which a lens can be focused
 SMALL_PX = 3.0  # largest circle of confusion for the 3 x 3 kernel
 NEGLIGIBLE_PX = 0.1  # circles of confusion up to this diameter are ignored: their variance is below 0.001 px^2
 
 
 class Defocus(NamedTuple):
-    """Aperture diameter [m], and the inverse of the depth in focus [1/m]; 0 = infinity."""
+    """Aperture diameter [m], and the inverse of the depth in focus [1/m], 0 for a lens focused at infinity."""
 
     aperture_m: float
     focus_per_m: float
@@ -57,7 +57,7 @@ class Defocus(NamedTuple):
 
 
 def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
-    """Returns aperture and focus of the lenses; None if the scenario has no depth of field.
+    """Returns aperture and focus of the lenses; None without a sensor, or if `lens.focus_m` is 0.
 
     The aperture is the focal length in air divided by the f-number.
 
@@ -86,7 +86,7 @@ def diffraction_mtf(cycles_per_px: Array, wavelength_nm: float, sensor: SensorCo
 
 
 class LensPsf:
-    """Point spread function of both lenses; applied to the light in the rendered image.
+    """Point spread function of both lenses, which is applied to the light of a rendered image.
 
     Args:
         scenario: lens, port and sensor; without a sensor there is neither diffraction nor depth of field.
@@ -100,7 +100,7 @@ class LensPsf:
         self._scales = _magnification(lens, rig) if any(lens.lateral_colour) else None
 
     def out_of_focus(self, light: Radiance, depth: Depth) -> Radiance:
-        """Returns the radiance (H, W, 3) with defocus blur; `light` itself if the blur is negligible.
+        """Returns the radiance (H, W, 3) with defocus blur; `light` itself if the blur is off or negligible.
 
         Args:
             light: (H, W, 3) radiance.
@@ -199,10 +199,10 @@ class _Magnification(NamedTuple):
     """Lateral colour: the images of the red and the blue band are magnified relative to the green one.
 
     Args:
-        runs: (k, 4) band, first and end column of each run of pixels with the same first tap relative to the pixel, and
-            this tap.
+        runs: (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band,
+            first column, end column (exclusive), and this offset.
         across: (3, TAPS, W) weights along the rows, for each band.
-        lines: (3, H) first tap of each row, relative to the row.
+        lines: (3, H) offset of the first tap of each row from the row.
         down: (3, H, TAPS) weights along the columns.
     """
 
@@ -235,8 +235,8 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
         scales: (3,) magnification of the bands.
 
     Returns:
-        For R, G, B, the first tap of each pixel (3, n) relative to it [px], and weights (3, n, TAPS) of consecutive
-        pixels.
+        For R, G, B, the offset (3, n) of the first tap of each pixel from this pixel [px], and the weights (3, n, TAPS)
+        of the TAPS consecutive pixels from there.
     """
     at = middle_px + (np.arange(n) - middle_px) / scales[:, None]
     whole = np.floor(at)
@@ -249,14 +249,14 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
 
 @njit(cache=True, nogil=True)
 def _split_rows(light, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
     for v in range(first, end):
         _split_row(light[v], out[v, 0], out[v, 1], out[v, 2])
 
 
 @njit(cache=True, nogil=True)
 def _join_rows(bands, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W) from `bands` (H, 3, W)."""
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) from `bands` (H, 3, W)."""
     for v in range(first, end):
         _join_row(bands[v, 0], bands[v, 1], bands[v, 2], out[v])
 
@@ -278,7 +278,7 @@ def _join_row(red, green, blue, row):
 
 @njit(cache=True, nogil=True)
 def _convolve(light, down, across, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
 
     The bands are kept apart, so that the weights of a row are constant. The latest rows of the image are stored in
     `lines`: row v in lines[v modulo their number].
@@ -343,7 +343,7 @@ def _add_across(wide, weights, out, is_first):
 
 @njit(cache=True, nogil=True)
 def _magnify(light, runs, across, lines, down, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
 
     The other arguments are those of `_Magnification`.
     """
@@ -369,14 +369,14 @@ def _magnify(light, runs, across, lines, down, out, first, end):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
 def _weighted_sum(a, b, c, d, of_a, of_b, of_c, of_d, out):
-    """Fills `out` (n,) with the sum of four arrays (n,) times their weights."""
+    """Fills `out` (n,) with the weighted sum of four arrays (n,)."""
     for k in range(out.size):
         out[k] = of_a * a[k] + of_b * b[k] + of_c * c[k] + of_d * d[k]
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
 def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
-    """Fills `out` (n,) with the sums of TAPS consecutive `values` (n + TAPS - 1,) times their weights (n,)."""
+    """Fills `out` (n,) with sums of TAPS consecutive `values` (n + TAPS - 1,), weighted by the arrays `of_...` (n,)."""
     second, third, fourth = values[1:], values[2:], values[3:]
     for k in range(out.size):
         left = of_first[k] * values[k] + of_second[k] * second[k]
@@ -385,7 +385,7 @@ def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
 
 @njit(cache=True, nogil=True)
 def _defocus(light, near, scale, focus, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
 
     Args:
         near: (H, W) inverse depth [1/m].

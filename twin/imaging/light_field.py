@@ -64,7 +64,8 @@ class _Mode(NamedTuple):
 
     Args:
         decay_per_m: (n,) eigenvalues.
-        down, up: (n, n) downwelling and upwelling parts of the decaying eigenvectors; exchanged in the growing ones.
+        down, up: (n, n) downwelling and upwelling parts of the decaying eigenvectors, as columns; the growing ones have
+            these parts exchanged.
         beam_down, beam_up: (n,) particular solution at depth 0.
         sky: (n,) radiance of the sky at the surface.
         kernel: (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes, with P_l^m normalised as in `_legendre`.
@@ -114,7 +115,9 @@ class LightField:
         return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
-        """Returns the downwelling and the upwelling radiance without the beam, each (modes, nodes) [cd/m2].
+        """Returns the downwelling and the upwelling radiance without the beam [cd/m2].
+
+        Each is an array (modes, nodes): the terms of the series in azimuth at the nodes of the quadrature.
 
         Args:
             depth_m: depth below the surface.
@@ -226,7 +229,10 @@ class LightField:
         return down, decaying @ mode.up.T + growing @ mode.down.T + beam * mode.beam_up
 
     def _veil_of(self, m: int, mode: _Mode, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns one term of `veil`: the integral, over depth, of the light scattered into each line of sight."""
+        """Returns term m (views, floors) of `veil`: the light scattered into the lines of sight, integrated over depth.
+
+        `mode` has the solutions of this term; the other arguments are those of `veil`.
+        """
         c, b, chi = self._scaled
         n, weights, order = (
             mode.decay_per_m.size,
@@ -252,7 +258,7 @@ class LightField:
     def _exact_once(self, m: int, cosine: Array) -> Array:
         """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0.
 
-        The light is given per metre of the line of sight.
+        The light is given per metre of the line of sight [cd/m3].
 
         Args:
             m: number of the term, from 0.

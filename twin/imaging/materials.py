@@ -73,9 +73,13 @@ def material_of(terrain: TerrainConfig) -> Material | None:
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def reflectance(material, albedo, mu_i, mu_o, phase):
-    """Returns the bidirectional reflectance [1/sr] for cosines of incidence, of view and of the phase angle.
+    """Returns the bidirectional reflectance [1/sr].
 
-    All arguments are of single precision; the cosines `mu_i` and `mu_o` are positive.
+    Args:
+        material: `Material`.
+        albedo: albedo, 0 to 1; like the following arguments in single precision.
+        mu_i, mu_o: cosines of the angles of incidence and of view, above 0.
+        phase: cosine of the phase angle.
     """
     kind, a, b, specular, alpha_squared = material
     one, two, zero = np.float32(1), np.float32(2), np.float32(0)

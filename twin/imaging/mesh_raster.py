@@ -1,13 +1,14 @@
 """Rasterization of triangle meshes into images of depth, normals and labels, with a depth test, as in OpenGL.
 
 One kernel serves the cameras, the shadow maps of lamps and sun, and the view from above that gives the true heights.
-A pixel shows the triangle that the ray through the pixel centre meets first, and the exact depth of this point. Within
-a triangle, 1 / depth is linear in column and row in a perspective view; in a parallel view, depth is linear.
+A pixel shows the triangle that the ray through the pixel centre meets first, and has the exact depth of the point where
+they meet. Within a triangle, 1 / depth is linear in column and row in a perspective view; in a parallel view, depth is
+linear.
 
-Triangles are about as large as a pixel, so most of the time would be lost by branches that the processor predicts
+Triangles are about as large as a pixel, so most of the time would be lost to branches that the processor predicts
 wrongly. Each part of a mesh (`terrains.objects.parts`) therefore passes through loops that write lists, almost without
-branches: triangles that cover pixel centres, covered pixel centres, drawn pixels. Parts outside the image, and those of
-which all triangles face away, are left out; neither changes the image.
+branches: triangles that cover pixel centres, covered pixel centres, drawn pixels. Parts outside the image, and parts of
+closed meshes of which all triangles face away, are left out; this does not change the image.
 """
 
 from __future__ import annotations
@@ -100,7 +101,7 @@ class DrawnMesh(NamedTuple):
 
 
 def draw_meshes(drawn: Sequence[DrawnMesh], projection: Projection, target: Target) -> None:
-    """Draws meshes into images, in the pixels where each is nearer than what they show; bands of rows are parallel.
+    """Draws meshes into images, in the pixels where a mesh is nearer than what they show, in parallel bands of rows.
 
     Args:
         drawn: the meshes, in the order in which they are drawn.
@@ -189,12 +190,13 @@ def _draw(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _list_parts(parts, matrix, projection, window, closed, shown):
-    """Lists the parts that the image may show by their numbers in `shown`; returns how many there are.
+    """Writes the numbers of the parts that the image may show to `shown`; returns how many there are.
 
-    The other parts have no pixel centre of the `window` (first column, end, first row, end) in the rectangle around
-    their box, or all their triangles face away. A triangle with the corner p and the normal m faces away from a camera
-    at e if m (p - e) >= 0. With the centre c of the part, w = c - e, the angle b between w and the axis, and the angle
-    a of the cone, m (p - e) >= |w| cos(a + b) - behind_m. In a parallel view, w is the direction of view, and m w >= 0
+    The other parts are nearer than the near plane, have no pixel centre of the `window` (first column, end, first row,
+    end) in the rectangle around their box, or belong to a closed mesh and all their triangles face away. A triangle
+    with the corner p and the unit normal m faces away from a camera at e if m (p - e) >= 0. With the centre c of the
+    part, w = c - e, the angle b between w and the axis of the cone of normals, and the angle a of this cone,
+    m (p - e) >= |w| cos(a + b) - behind_m (see `Parts`). In a parallel view, w is the direction of view, and m w >= 0
     suffices.
     """
     centre, half, axis, cos_sin, behind = parts
@@ -234,7 +236,12 @@ def _list_parts(parts, matrix, projection, window, closed, shown):
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _interval(row, centre, half):
-    """Returns centre and half extent of a box along an axis of the camera, given this row of the matrix."""
+    """Returns centre and half extent of a box along one axis of the camera.
+
+    Args:
+        row: (4,) row of the map from the axes of the box to this axis.
+        centre, half: (3,) centre and half extent of the box in its own axes [m].
+    """
     middle = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2] + row[3]
     return middle, abs(row[0]) * half[0] + abs(row[1]) * half[1] + abs(row[2]) * half[2]
 
@@ -278,7 +285,7 @@ def _project(points, matrix, projection, point, place):
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _list_triangles(faces, start, end, place, window, closed, kept):
-    """Lists those of the triangles `start` to `end` - 1 that may cover pixel centres in `kept`; returns their number.
+    """Writes to `kept` those of the triangles `start` to `end` - 1 that may cover pixel centres; returns their number.
 
     Triangles with a corner nearer than the near plane are not listed, nor, with `closed`, those that face away.
     """
@@ -296,7 +303,10 @@ def _list_triangles(faces, start, end, place, window, closed, kept):
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _rectangle(ua, va, ub, vb, uc, vc, window):
-    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle."""
+    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle.
+
+    Only pixels of the `window` count, see `_list_parts`. If there are none, a last value is less than the first one.
+    """
     left, right, top, bottom = window
     u0, u1 = max(np.ceil(min(ua, ub, uc)), np.float64(left)), min(np.floor(max(ua, ub, uc)), np.float64(right - 1))
     v0, v1 = max(np.ceil(min(va, vb, vc)), np.float64(top)), min(np.floor(max(va, vb, vc)), np.float64(bottom - 1))
@@ -307,14 +317,15 @@ def _rectangle(ua, va, ub, vb, uc, vc, window):
 def _list_pixels(
     faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits
 ):  # fmt: skip
-    """Lists the pixel centres that triangles cover, from row `row` of triangle number `k` of the list `kept` on.
+    """Lists the pixel centres that the triangles `kept[k]` to `kept[n_kept - 1]` cover, from row `row` of the first on.
 
     The rectangle around a triangle is divided into blocks of 2 x 2 pixels, of which most triangles need one. For each
-    block, the function fills its triangle, its first column and row, and the weights of the second and third corner
+    block, the function writes its triangle, its first column and row, and the weights of the second and third corner
     at its pixels. A hit is 4 times the number of a block plus that of a pixel in it.
 
     Returns:
-        Number of hits; number and row of the triangle that does not fit into the arrays any more, or `n_kept`.
+        Number of hits, and the values of `k` and `row` at which to continue if the arrays are full; `n_kept` for `k` if
+        all triangles are listed.
     """
     u, v = place[0], place[1]
     n_blocks, n_hits = 0, 0
@@ -348,7 +359,10 @@ def _list_pixels(
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _normal(point, i, j, k, perspective):
-    """Returns the unit normal of the triangle of points i, j, k (3, n) in camera axes, on the side that is seen."""
+    """Returns the unit normal of a triangle in camera axes, towards the camera.
+
+    i, j, k are the columns of its corners in `point` (3, n).
+    """
     x, y, z = point[0], point[1], point[2]
     px, py, pz, qx, qy, qz = x[j] - x[i], y[j] - y[i], z[j] - z[i], x[k] - x[i], y[k] - y[i], z[k] - z[i]
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx

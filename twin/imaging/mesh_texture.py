@@ -34,7 +34,7 @@ def paint_textures(target: Target, projection: Projection, surface: TexturedSurf
     """Draws the textures into `target.albedo` wherever `target.label` names a mesh with a texture.
 
     Args:
-        target: images that `draw_mesh` has drawn into; none of them is None.
+        target: images that `draw_meshes` has drawn into; none of them is None.
         projection: projection of the camera.
         surface: the textures.
     """
@@ -72,7 +72,13 @@ def _paint(depth, albedo, normal, label, uv, projection, texels, levels, of_labe
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _sample(texels, level, across, down):
-    """Returns red, green and blue of a level at texture coordinates, interpolated bilinearly; the texture repeats."""
+    """Returns red, green and blue of a level at texture coordinates, interpolated bilinearly; the texture repeats.
+
+    Args:
+        texels: texels of all levels of all textures.
+        level: index of the level's first texel, and its numbers of rows and columns.
+        across, down: texture coordinates; a whole number is one repetition of the texture.
+    """
     first, rows, cols = level
     col, row = (across - np.floor(across)) * cols - 0.5, (down - np.floor(down)) * rows - 0.5
     c0, r0 = int(np.floor(col)), int(np.floor(row))

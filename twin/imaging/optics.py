@@ -8,11 +8,11 @@ Radiance of a pixel that shows a floor of albedo rho at range r, for a camera an
 
 with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
 of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`), psi_i the
-scattering angle at the distance s from the camera, p the phase function, b the scattering coefficient and c = a + b the
-attenuation (`water.Medium`). The model has no free scale factors. For lamps, these equations describe single
-scattering. With multiple scattering, light that is scattered on its way arrives too: that of the lamps as a softer beam
-(`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists of softened beams and is
-blurred (`backscatter`). Shadows and caustics are computed in other modules.
+scattering angle at the distance s from the camera, p the phase function, a the absorption coefficient, b the scattering
+coefficient and c = a + b the attenuation (`water.Medium`). The model has no free scale factors. For lamps, these
+equations describe single scattering. With multiple scattering, light that is scattered on its way arrives too: that of
+the lamps as a softer beam (`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists
+of softened beams and is blurred (`backscatter`). Shadows and caustics are computed in other modules.
 """
 
 from __future__ import annotations
@@ -251,9 +251,9 @@ class Optics:
     ) -> Radiance:
         """Returns the illuminance of the floor (H, W, 3) [lx].
 
-        It is NaN where there is no floor, and where the transmission to the camera is too small. It is computed from
-        the light of a white Lambertian floor, divided by the transmission from floor to camera. The arguments are those
-        of `radiance`.
+        It is NaN where there is no floor, and where the transmission to the camera is `LEAST_TRANSMISSION` or less. It
+        is computed from the light of a white Lambertian floor, divided by the transmission from floor to camera. The
+        arguments are those of `radiance`.
         """
         matt = None if floor is None else floor._replace(material=None)
         white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)
@@ -284,7 +284,10 @@ class Optics:
     def around(
         self, albedo: Image, depth: Depth, camera: int, surface: WaterSurface | None = None
     ) -> tuple[Radiance, Place]:
-        """Returns the argument `around` of `ForwardScatter.add`, the light of the floor around the image."""
+        """Returns the argument `around` of `ForwardScatter.add`, which describes the floor around the image.
+
+        The other arguments are those of `radiance`. With single scattering, there is no such argument.
+        """
         assert self._forward is not None
         grid, (plane, place) = self._forward.surroundings, self._forward.plane(depth)
         light, uniform = np.empty((*grid.shape, 3), np.float32), np.empty((*grid.shape, 3), np.uint8)
@@ -318,7 +321,8 @@ class Optics:
             image: albedo and depth.
             camera, floor, surface: see `radiance`.
             out: arrays to fill.
-            focal_px: focal length of the image of the surroundings, which has no backscatter; None: the image of `rig`.
+            focal_px: focal length of the image of the surroundings, which gets no backscatter; None: the image is that
+                of `rig`, with backscatter.
             day_loss_per_m: (3,) loss of daylight between floor and camera [1/m]; None: that of the illumination.
         """
         albedo, depth = image
@@ -335,7 +339,7 @@ class Optics:
         in_row_bands(lambda first, end: shade(*scene, *view, *out, first, end), len(depth))
 
     def _backscatter(self, camera: int, surface: WaterSurface) -> NDArray[np.float32]:
-        """Returns the backscatter of lamps and daylight, see `_Tables.backscatter`."""
+        """Returns the backscatter of lamps and daylight, in the form of `_Tables.backscatter`."""
         of_lamps = self._tables_of(camera).backscatter
         if self._veil is None:
             return of_lamps

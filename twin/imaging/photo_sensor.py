@@ -138,7 +138,7 @@ class PhotoSensor:
     def develop(self, raw: Raw, white: tuple[float, float, float] | None = None) -> Image:
         """Returns the 8-bit RGB image (H, W, 3) of a raw image.
 
-        Subtracts the black level, applies white balance and tone curve, and demosaics.
+        The black level is subtracted, white balance and tone curve are applied, and a Bayer image is demosaiced.
 
         Args:
             raw: digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
@@ -183,7 +183,7 @@ def _weighted_mean(light, weights):
 
 @njit(cache=True, nogil=True)
 def _tone(raw, tones, out, first, end):
-    """Fills rows `first` to `end` of `out` with the 8-bit values of `raw` (H, W, 1 or 3), from the tone table."""
+    """Fills rows `first` to `end` - 1 of `out` with the 8-bit values of `raw` (H, W, 1 or 3), from the tone table."""
     _, width, bands = raw.shape
     for v in range(first, end):
         for u in range(width):

@@ -70,7 +70,7 @@ def read_out(
 
 @njit(cache=True, nogil=True)
 def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, W, 1 or 3) with digital numbers, see `read_out`.
+    """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`.
 
     Args:
         response: (8,) float32 fields of `PixelResponse`, one after the other.

@@ -52,7 +52,8 @@ def pinhole(port: PortConfig) -> Pinhole:
 def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
     """Returns the origin on the outer face [m] and the unit direction in water of rays, both (..., 3).
 
-    NaN where a ray misses the port or is totally reflected. Without a port, rays start at the entrance pupil.
+    The direction is NaN where a ray misses the port or is totally reflected; the origin is NaN where a ray misses the
+    port. Without a port, rays start at the entrance pupil.
 
     Args:
         port: geometry and refractive indices.
@@ -71,9 +72,9 @@ def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
 
 
 def air_coordinates(port: PortConfig, points_m: Array) -> Array:
-    """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN where no ray exists.
+    """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN where none is found.
 
-    Inverse of `water_rays` by Newton's method, starting from the equivalent pinhole. For a flat pane, convergence is
+    `water_rays` is inverted by Newton's method, starting from the equivalent pinhole. For a flat pane, convergence is
     monotonic, because the angle in air grows faster than the angle in water.
     """
     normalised = points_m[..., :2] / points_m[..., 2:]

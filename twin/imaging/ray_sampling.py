@@ -1,6 +1,7 @@
 """Sampling of a rendered image along the rays of the true pixels: lens, port and rolling shutter in one resampling.
 
-A pixel of the raw image has a ray o + s d in the axes of the rendered camera. A rolling shutter exposes row v at
+A pixel of the raw image has a ray o + s d in the axes of the rendered camera, with the origin o, the direction d and
+the parameter s. A rolling shutter exposes row v of h rows at
 
     t = readout (v / (h - 1) - 1/2)
 
@@ -96,7 +97,7 @@ def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[flo
 
 @njit(cache=True, nogil=True)
 def _intersect(near, positions, parallax, motion, out, first, end):
-    """Writes the intersections of rows `first` to `end` (exclusive) to `out`; `near` is the inverse depth."""
+    """Writes the intersections of rows `first` to `end` - 1 to `out`; `near` is the inverse depth."""
     rays, cells = np.empty((8, out.shape[1]), np.float32), np.empty(out.shape[1], np.int32)
     for v in range(first, end):
         _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
@@ -106,7 +107,7 @@ def _intersect(near, positions, parallax, motion, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _sample_rays(source, near, positions, parallax, motion, out, first, end):
-    """Fills rows `first` to `end` of `out` (h, w, 3) from `source` (H, 3 W); `near` is the inverse depth."""
+    """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W); `near` is the inverse depth."""
     n = out.shape[1]
     rays, cells, weights = np.empty((8, n), np.float32), np.empty(n, np.int32), np.empty((8, n), np.float32)
     for v in range(first, end):

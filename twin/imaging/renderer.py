@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 class Renderer:
     """Renderer of the floor of a scene, without the vehicle, for a pinhole camera (x right, y down, z forward).
 
-    Owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
+    A renderer owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
 
     Args:
         scene: MuJoCo model of the scene.
@@ -138,7 +138,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the tiles that may be in view; each other tile lies outside a plane of the view frustum.
+    """Returns a mask (n,) of the floor tiles that may be in view; all others lie outside a plane of the view frustum.
 
     Args:
         scene: MuJoCo model of the scene.

@@ -51,7 +51,7 @@ def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
 
 @njit(cache=True, nogil=True)
 def _fill_from(source, positions, out, first, end):
-    """Fills rows `first` to `end` of `out` (h, w, 3) from `source` (H, 3 W)."""
+    """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W)."""
     n = out.shape[1]
     x, y, weights, cells = _row_memory(n)
     for v in range(first, end):
@@ -61,7 +61,7 @@ def _fill_from(source, positions, out, first, end):
 
 @njit(cache=True, nogil=True)
 def _fill_rounded_from(source, positions, out, first, end):
-    """Same as `_fill_from`, but for 8-bit `out`: numbers are rounded and clipped."""
+    """Fills rows `first` to `end` - 1 of 8-bit `out` as `_fill_from` does; the values are rounded and clipped."""
     n = out.shape[1]
     x, y, weights, cells = _row_memory(n)
     row, least, most = np.empty(3 * n, np.float32), np.float32(0.0), np.float32(255.0)
@@ -100,7 +100,7 @@ def spline_row(source, x, y, weights, cells, out):
 
 @njit(cache=True, nogil=True)
 def sum_row(source, x, y, weights, cells, out):
-    """Same as `spline_row`, for given weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
+    """Fills `out` as `spline_row` does, with given weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
     rows, cols = source.shape[0], source.shape[1] // 3
     _inner_cells(x, y, rows, cols, cells)
     for u in range(x.size):
@@ -132,7 +132,7 @@ def _inner_cells(x, y, rows, cols, cells):
 
 @njit(cache=True, nogil=True)
 def _sum_at_border(source, x, y, weights, u, out):
-    """Same as `sum_of_pixels` for pixel u of `out`, but the pixels of the image border are repeated beyond it."""
+    """Fills pixel u of `out` with the result of `sum_of_pixels`; beyond the image, its border pixels are repeated."""
     rows, cols = source.shape[0], source.shape[1] // 3
     col, row = int(np.floor(x)), int(np.floor(y))
     for band in range(3):
@@ -147,14 +147,14 @@ def _sum_at_border(source, x, y, weights, u, out):
 
 @njit(cache=True, nogil=True)
 def _filter_columns(image, first, end):
-    """Replaces columns `first` to `end` of an image (H, n) by cubic B-spline coefficients, with mirrored borders."""
+    """Replaces columns `first` to `end` - 1 of an image (H, n) by cubic B-spline coefficients; borders are mirrored."""
     for start in range(first, end, BLOCK):
         _filter_block(image, start, min(start + BLOCK, end))
 
 
 @njit(cache=True, nogil=True)
 def _filter_block(image, first, end):
-    """Filters columns `first` to `end` of an image, see `_filter_columns`.
+    """Filters columns `first` to `end` - 1 of an image, see `_filter_columns`.
 
     The filter 6 / (1 - p z^-1) is followed by -p / (1 - p z), with p the pole (Unser et al. 1993).
     """
@@ -180,7 +180,7 @@ def _filter_block(image, first, end):
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
 def _filter_rows(image, first, end):
-    """Same as `_filter_columns`, but for rows `first` to `end` of an image (H, 3 W).
+    """Replaces rows `first` to `end` - 1 of an image (H, 3 W) as `_filter_columns` does with columns.
 
     The two recursive filters have the impulse response -6 p / (1 - p^2) p^|n|, which is symmetric and is summed up to
     |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the previous pixel.

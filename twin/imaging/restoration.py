@@ -1,9 +1,9 @@
 """Restoration: the albedo of the floor from an image, without the effects of lamps, daylight and water.
 
-It inverts the model of `optics` with the believed calibration, lamps and water, and with the estimated floor. With W
-the light of a white floor that absorption alone attenuates, u = exp(-b r) the unscattered share, k the share that
-arrives without blur, F the blur by forward scatter (`forward_scatter`) and B the backscatter, the radiance of an image
-is
+It inverts the model of `optics` with the believed calibration, lamps and water, and with the estimated floor. With rho
+the albedo, W the light of a white floor that absorption alone attenuates on its way to the camera, u = exp(-b r) the
+unscattered share (b the scattering coefficient, r the range), k the share that arrives without blur, F the scattered
+light of the floor (`forward_scatter`) and B the backscatter, the radiance of an image is
 
     L = rho W u + F(rho W) + B.
 
@@ -12,9 +12,9 @@ is subtracted, and the rest is light without blur:
 
     rho <- (L - B - (F(rho W) - (k - u) rho W)) / (k W).
 
-The first estimate is right for all detail that is wider than the blur, so few steps suffice. Marine snow, caustics,
-shadows of objects, blur of the lens and of motion, and saturated pixels are not restored; the floor is taken to be
-Lambertian.
+The first estimate is right for all detail that is wider than the blur, so few steps suffice. With single scattering,
+rho = (L - B) / W, where scattering attenuates W too. Marine snow, caustics, shadows of objects, blur of the lens and of
+motion, and saturation are not corrected; the floor is taken to be Lambertian.
 """
 
 from __future__ import annotations

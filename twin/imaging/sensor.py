@@ -170,7 +170,7 @@ def _mean(light):
 
 @njit(cache=True, nogil=True)
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
-    """Fills rows `first` to `end` of `image` (H, 3 W) with noisy 8-bit values.
+    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values.
 
     64 random bits select four normally distributed noise values from the table `normal`.
     """

@@ -26,7 +26,7 @@ def shade(
     albedo, depth, focal, lamps, beams, soft, lamp_loss, scatter_table, sky, facets, lit, material, objects, out,
     other, kept, place, first, end,
 ):  # fmt: skip
-    """Computes the light of the floor and the backscatter in rows `first` to `end` of an image.
+    """Computes the light of the floor and the backscatter in rows `first` to `end` - 1 of an image.
 
     An empty array stands for an effect that the image does not have, so one compiled version serves all images without
     a `material`; for `material` None, the compiler removes the code of materials. In the steps of the tables, r is the
@@ -38,15 +38,17 @@ def shade(
         focal: focal length [px].
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) relative intensity, at even steps of sqrt(1 - cos(angle)) from 0 to 1.
-        soft: (n, 2, k, l, 4) scattered light and all light of each lamp on the floor, at even steps of
-            sqrt(1 - cos(angle)) and, for a distance d, of d / (d + scale); empty with single scattering.
+        soft: (n, 2, k, l, 4) scattered light and all light of each lamp on the floor, relative to an isotropic lamp
+            of the same intensity in clear water, at even steps of sqrt(1 - cos(angle)) and, with d the distance from
+            the lamp, of d / (d + scale); empty with single scattering.
         lamp_loss: (3,) attenuation of the unscattered light of lamps on its way to the floor [1/m].
         scatter_table: (rows, cols, ranges, 4) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
-        sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other daylight (3, 10)
-            [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the form in the order xx, yy,
-            zz, 2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and range of the fit (3,) [m]; attenuation with
-            range from the camera (2, 3) of lamp light and of daylight [1/m]; caustics (m + 1, m + 1) or empty; (3, 4)
-            map from a point in the camera axes to column and row in the caustics and depth below the surface.
+        sky: tuple of the direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other
+            daylight (3, 10) [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the elements of
+            the quadratic form in the order xx, yy, zz, 2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and the
+            limits of the fit (3,) [m]; attenuation with range from the camera (2, 3) of lamp light and of daylight
+            [1/m]; caustics (m + 1, m + 1) or empty; (3, 4) map from a point in the camera axes to column and row in the
+            caustics and depth below the surface [m].
         facets: triangles of the floor (`facets.FacetView`); without normals = normals from the depth.
         lit: (n, H, W) or, with the sun, (n + 1, H, W) 0 where floor or objects block the light, else 1; empty =
             no shadows.
@@ -367,7 +369,7 @@ def _add_daylight(sky, normal, range_m, daylight, light):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_rows(table, row, out):
-    """Fills `out` (cols, ranges, 4) with the backscatter for a row of pixels, interpolated between rows of `table`."""
+    """Fills `out` (cols, ranges, 4) with the backscatter at the fractional row `row` of `table`, by interpolation."""
     j = min(int(row), table.shape[0] - 2)
     w = row - np.float32(j)
     lower, upper, filled = table[j].reshape(-1), table[j + 1].reshape(-1), out.reshape(-1)

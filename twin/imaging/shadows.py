@@ -70,9 +70,9 @@ class Shadows:
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
-        """Returns a mask (lamps, H, W) uint8: 0 where the floor occludes the lamp, else 1 (also without floor).
+        """Returns masks (lamps, H, W) uint8: 0 where the floor occludes the lamp, else 1 (also without floor).
 
-        The last mask is that of the sun if it casts shadows.
+        If the sun casts shadows, a mask of the sun follows those of the lamps.
 
         Args:
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
@@ -109,7 +109,7 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
-    """Marks the pixels of rows `first` to `end` in `out` (lamps, H, W).
+    """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W).
 
     The mark is DARK where facets face away from the lamp, CLEAR without floor, else OPEN (rays decide, see
     `_grow_shadows`). Pixels that show an object, i.e. whose `label` is not 0, are OPEN; without objects, `label` is
@@ -297,7 +297,7 @@ def _occluded(height, cell_tops, block_tops, x, y, z, dx, dy, dz):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end, block_r, block_c):
-    """Same as `_occluded`, for the part of the ray from t to `end`, which lies in one block."""
+    """Returns the result of `_occluded` for the part of the ray from t to `end`, which lies in one block."""
     first_r, first_c = block_r * BLOCK_CELLS, block_c * BLOCK_CELLS
     last_r = min(first_r + BLOCK_CELLS, cell_tops.shape[0]) - 1
     last_c = min(first_c + BLOCK_CELLS, cell_tops.shape[1]) - 1

@@ -1,7 +1,8 @@
 """Finite exposure time: motion blur, and the row delays of a rolling shutter.
 
-A point of the floor at depth Z moves through the image of a camera with twist (w, v) by (Longuet-Higgins & Prazdny
-1980; x, y relative to the principal point, divided by the focal length f)
+A point of the floor at depth Z moves through the image of a camera with angular velocity w and linear velocity v by
+(Longuet-Higgins & Prazdny 1980; x, y are image coordinates relative to the principal point, divided by the focal length
+f; in du/dt and dv/dt, u and v are column and row)
 
     du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
     dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
@@ -222,7 +223,10 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
 
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
-    """Fills rows `first` to `end` of `out` (H, W, 3) as read out by a rolling shutter; see `apply_rolling_shutter`."""
+    """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter.
+
+    Compiled kernel of `apply_rolling_shutter`.
+    """
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
     right, low = np.float32(width - 1), np.float32(height - 1)

@@ -2,12 +2,13 @@
 
 The particles fill a periodic box around the left camera: when the vehicle moves, a particle that leaves the box on one
 side re-enters on the opposite side. Both cameras and consecutive frames therefore show the same particles. A particle
-of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2. Its image is blurred by one
-pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens with an aperture of diameter A, focused
-at depth s. During the exposure the particle moves through the image; its light is spread evenly along this path, whose
-length is its velocity in the image times the exposure time. A rolling shutter images it where it is when its row is
-read. If the rolling shutter is applied to the whole image after the particles are drawn, it displaces them like the
-floor behind them; they are therefore drawn displaced by the difference between their own displacement and the floor's.
+of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, f the focal length. Its image is
+blurred by one pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens with an aperture of
+diameter A, focused at depth s. During the exposure the particle moves through the image; its light is spread evenly
+along this path, whose length is its velocity in the image times the exposure time. A rolling shutter images it where it
+is when its row is read. If the rolling shutter is applied to the whole image after the particles are drawn, it
+displaces them like the floor behind them; they are therefore drawn displaced by the difference between their own
+displacement and the floor's.
 
 The particles have one diameter or a size distribution: Junge (1963) found that the number of particles per interval of
 diameter falls as a power of the diameter, n(D) ~ D^-j. The cumulative distribution between the limits a and b is
@@ -175,7 +176,7 @@ class MarineSnow:
     def _paths(
         self, seen: VisibleParticles, depth: Depth, world_from_left: Array, camera: int, motion: ExposureMotion
     ) -> tuple[Array, Array]:
-        """Returns the middle (n, 2) and the extent (n, 2) of the path of each particle in the image [px].
+        """Returns the middle (n, 2) of each particle's path in the image, and the vector (n, 2) from start to end [px].
 
         `seen` are the particles in view; the other arguments are those of `draw`.
         """
@@ -189,8 +190,9 @@ class MarineSnow:
     def _radiance(self, points: Array, lamps: LampLight, height_m: float) -> Array:
         """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
 
-        Light that is scattered between a particle and the camera is lost. At the camera, daylight has its value at the
-        height `height_m` of the camera above the reference plane z = 0; it decreases along the optical axis.
+        Light that is scattered between a particle and the camera is lost. At the camera, daylight has the illuminance
+        that belongs to the camera's height `height_m` above the reference plane z = 0; it decreases along the optical
+        axis.
         """
         day, loss_per_m = lamps.sources.daylight, self._water.attenuation_per_m
         below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
@@ -245,7 +247,7 @@ def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
-    """Fills `centre` (n, 2) and `path` (n, 2), the middle and the extent of the paths of particles [px].
+    """Fills `centre` (n, 2) with the middle of each particle's path, and `path` (n, 2) with the vector along it [px].
 
     A rolling shutter reads the row v at t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row
     v_0 at mid-exposure and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the
@@ -258,7 +260,8 @@ def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
         lens: focal length, and column and row of the principal point [px].
         drift: (3,) velocity of the particles, in the axes of the camera [m/s].
         twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        moves: exposure time and read-out time [s], and whether the rolling shutter is applied to the image later.
+        moves: exposure time and read-out time [s], and whether the rolling shutter is applied to the image later. If
+            so, the displacement of the floor behind a particle by the rolling shutter is subtracted.
     """
     (focal, cx, cy), (exposure_s, readout_s, rolls_later) = lens, moves
     row_s, bottom, right, still = readout_s / (depth.shape[0] - 1), depth.shape[0] - 1, depth.shape[1] - 1, np.zeros(3)
@@ -276,7 +279,10 @@ def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _image_velocity(x, y, z, focal, drift, twist):
-    """Returns the image velocity [px/s] of a point (x, y, z) that drifts at `drift` (3,) in the axes of the camera."""
+    """Returns the image velocity (columns, rows) [px/s] of a point (x, y, z), in the axes of the camera.
+
+    The point drifts at `drift` (3,) [m/s]; the camera moves with `twist` (6,), see `_trace_paths`.
+    """
     forward = drift[2] - twist[5] + x * twist[1] - y * twist[0]
     across = drift[0] - twist[3] + y * twist[2] - z * twist[1] - x / z * forward
     down = drift[1] - twist[4] + z * twist[0] - x * twist[2] - y / z * forward
@@ -288,9 +294,9 @@ def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_
     """Returns the indices (n,) of the particles in view, their positions in the axes of the camera, and their pixels.
 
     The positions are (n, 3), the pixels (n, 2). A particle is in view if its depth is between NEAREST_M and
-    `farthest_m`, and its projection is less than `margin_px` + `reach_px_m` / depth outside the image. `start` (m, 3)
-    are the positions in the box at time 0, to which `shift` (3,) is added before they are wrapped into the box whose
-    lower corner is `low` (3,) [m].
+    `farthest_m`, and its projection is less than `margin_px` + `reach_px_m` / depth outside the image. With `start`
+    (m, 3) the positions in the box at time 0, `low` (3,) the lower corner of the present box and `shift` (3,) the drift
+    minus `low`, the positions in the world are `low` + mod(`start` + `shift`, BOX_M) [m].
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
     pixel, focal, (cx, cy) = np.empty((len(start), 2)), focals[0], (middle[0], middle[1])
@@ -311,7 +317,7 @@ def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_
 def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
     """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened.
 
-    Has neither branches nor reads of other arrays in the loop, so that the compiler can vectorize it.
+    Its loop has neither branches nor reads of other arrays, so that the compiler can vectorize it.
     """
     per_box, (px, py, pz), (lx, ly, lz) = 1 / BOX_M, (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
     pose = camera_from_world
@@ -330,7 +336,7 @@ def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
 
 @njit(cache=True, nogil=True)
 def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, farthest_m, seen):
-    """Computes which particles are in view, see `_in_view`; without branches, so that the compiler can vectorize it."""
+    """Fills `seen` with whether each particle is in view, see `_in_view`; a loop that the compiler can vectorize."""
     for k in range(seen.size):
         z = zs[k]
         margin = margin_px * z + reach_px_m
@@ -341,7 +347,7 @@ def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, 
 
 @njit(cache=True, nogil=True)
 def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
-    """Draws each particle into rows `first` to `end` of `light`, except where the floor is nearer.
+    """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer.
 
     A particle is a disc with an antialiased edge that moves along a straight path: `path` (n, 2) [px] is the vector
     from the start to the end of each path, `centre` (n, 2) [px] its middle.
@@ -400,6 +406,7 @@ def _swept(radius, du, dv, step_u, step_v, steps):
 def _rim(radius, du, dv):
     """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px].
 
-    The edge of the disc is antialiased: the coverage decreases to 0 at the distance `radius` [px].
+    The edge of the disc is antialiased: the coverage decreases from 1 to 0 between the distances `radius` - 1 and
+    `radius` [px].
     """
     return min(max(radius - np.sqrt(du * du + dv * dv), 0.0), 1.0)

@@ -6,10 +6,11 @@ frequency k is
 
     exp(-a d - b d (1 - K(k))),
 
-with K the transform of the kernel of light scattered once. The kernel of an image is that of a beam with the path
-reversed. Here K is not approximated by small angles, but exact for light scattered once, also at wide angles: with t
-the scattering angle, and alpha and beta the angles at the point and at the lamp of the triangle lamp, scattering, point
-(alpha + beta = t), the volume element divided by both squared distances is d(alpha) d(beta) d(azimuth) / d, so that
+with a and b the absorption and scattering coefficients of the water, and K the transform of the kernel of light
+scattered once, per b d. The kernel of an image is that of a beam with the path reversed. Here K is not approximated by
+small angles, but exact for light scattered once, also at wide angles: with t the scattering angle, and alpha and beta
+the angles at the point and at the lamp of the triangle lamp, scattering, point (alpha + beta = t), the volume element
+divided by both squared distances is d(alpha) d(beta) d(azimuth) / d, so that
 
     k1(beta) = integral over t > beta of p(t) g(t - beta) exp(-a d (path / d - 1)),  per d(beta) d(azimuth),
 
@@ -38,7 +39,7 @@ Array = NDArray[np.float64]
 Receiver = Literal["floor", "particle"]
 
 ANGLES = 140  # number of cells of the scattering angle, even in its logarithm
-LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; of the outermost ring of a camera, as a tangent
+LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; that of a camera's outermost ring, as a tangent
 STEPS = 24  # number of positions of a scattering along a ray of the camera
 MAX_GROWTH = 1.0  # upper limit of b d (K - 1), the logarithm of the transform relative to exp(-a d)
 WEIGHT_OF_TOTAL = 10.0  # weight of the integral of the kernel in the fit of a mixture

@@ -4,7 +4,7 @@ The floor is rendered for two parallel pinhole cameras in water, with images lar
 Each pixel of a raw image has its own ray through lens and port; the radiance of the pixel is sampled from the rendered
 image at the point where its ray intersects the rendered floor. The sensor model converts the sampled radiance to the
 raw image, which is rectified with the believed calibration to obtain the frame. If both true cameras equal the believed
-pinhole cameras, the rendered image is used unchanged.
+pinhole cameras, apart from the baseline, the rendered image is used unchanged.
 
 Raw images have the size of the frames plus a border that the rectification needs.
 """
@@ -43,8 +43,7 @@ class CameraModel(NamedTuple):
     """Model of one camera, true or believed, in the axes of the believed camera.
 
     Args:
-        focal_px: focal length of the lens, that of the equivalent pinhole camera divided by `pinhole.focal_ratio`: in
-            air behind a port, in water without a port.
+        focal_px: focal length of the lens: that of the equivalent pinhole camera divided by `pinhole.focal_ratio`.
         principal_px: (2,) column and row of the principal point.
         lens: distortion coefficients.
         port: geometry and refractive indices of the port.
@@ -62,8 +61,8 @@ class CameraModel(NamedTuple):
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water.
 
-        Both are in the axes of the believed camera. They are NaN for a pixel without a ray, e.g. if the ray is totally
-        reflected at the port.
+        Both are in the axes of the believed camera. The direction is NaN for a pixel without a ray, e.g. if the ray is
+        totally reflected at the port.
         """
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
         if self.port.kind == "none":
@@ -75,8 +74,9 @@ class CameraModel(NamedTuple):
     def pixels(self, points_m: Array) -> Array:
         """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in the axes of the believed camera.
 
-        The points must lie in front of the camera; whether they lie inside the image is not checked. NaN for a point
-        without a ray through the port, and for one that is too far off the optical axis for the distortion model.
+        The points must lie in front of the camera; whether they lie inside the image is not checked. The result is NaN
+        for a point without a ray through the port, and for one that is too far off the optical axis for the distortion
+        model or more than arctan(`WIDEST_TANGENT`) off it.
         """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
@@ -250,14 +250,20 @@ def _believed_model(scenario: Scenario) -> CameraModel:
 
 
 def right_rotation(calibration: CalibrationErrorConfig) -> Array:
-    """Returns the rotation error (3, 3) of the right camera: R_y(yaw) R_x(pitch) R_z(roll), with y pointing down."""
+    """Returns the rotation error (3, 3) of the right camera, from its true axes to the believed ones.
+
+    It is R_y(yaw) R_x(pitch) R_z(roll), with x right, y down, z forward.
+    """
     roll, pitch, yaw = np.deg2rad([calibration.right_roll_deg, calibration.right_pitch_deg, calibration.right_yaw_deg])
     x, y, z = np.eye(3)
     return geometry.so3_exp(yaw * y) @ geometry.so3_exp(pitch * x) @ geometry.so3_exp(roll * z)
 
 
 def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    """Returns whether both true cameras equal the believed pinhole cameras, apart from the baseline."""
+    """Returns whether the true and the believed cameras are the same pinhole camera without a port.
+
+    The baseline may differ.
+    """
     same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 

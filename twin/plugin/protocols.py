@@ -12,16 +12,16 @@ from twin.core.records import Estimate, Frame, SensorNoise, StereoRig
 
 
 class ControllerSetup(NamedTuple):
-    """Argument of the class of a controller: the vehicle with its published parameters.
+    """Argument with which the class of a controller is called: calibration, and published parameters of the vehicle.
 
-    The factors of the scenario on the drag and the added mass of the true vehicle are not applied.
+    The factors of the scenario on drag and added mass, which change the true vehicle, are not applied.
 
     Args:
         rig: believed calibration; `rig.body_from_camera` is the pose of the left camera in the body.
-        period_s: time between commands, that of a frame [s].
+        period_s: time between commands, which is that between frames [s].
         hull: inertia, added mass and drag of the BlueROV2 Heavy.
-        allocation: its thrust allocation; `allocation.commands(wrench)[0]` are the thruster commands (8,) for a wrench
-            (6,) [moment, force] in the body [N m, N].
+        allocation: thrust allocation of the vehicle; `allocation.commands(wrench)[0]` are the thruster commands (8,)
+            for a wrench (6,) [moment, force] in the body [N m, N].
         n_commands: length of a command: 8, one per thruster; 3 for vehicle.dynamics = "kinematic".
     """
 

@@ -32,10 +32,10 @@ def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
 
 
 def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
-    """Returns the times and durations [ms] of all calls, by stage.
+    """Returns, for each stage, the frames of its calls and their durations [ms].
 
     The stages are global alignment and, of the stages in `Keyframes.timing_ms`, those called once per frame or once per
-    keyframe; long series are subsampled.
+    keyframe. More than `N_SAMPLES` calls are subsampled evenly. The result is empty without an online trajectory.
     """
     path = run.trajectories.get("online")
     if path is None:

@@ -1,4 +1,4 @@
-"""Elevation maps as coloured surfaces for the 3-D view, divided by the time at which each part is first observed."""
+"""Elevation maps as coloured surfaces for the 3-D view, split into parts by the time of their first observation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Errors of the estimates of a run over its true path, with the alignment of its metrics."""
+"""Errors of the estimated trajectories of a run, with the alignment to the truth that its metrics use."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ def run_alignment(run: Run) -> AlignmentName | None:
 def run_errors(run: Run, name: str) -> PathErrors:
     """Returns the errors of an estimate at the frames that have a true pose.
 
-    The estimate of a replay is aligned with the truth as its metrics state; any other estimate is anchored at the first
-    true pose.
+    The estimate of a replay is aligned with the truth by the method that its metrics state (`run_alignment`); any other
+    estimate is anchored at the first true pose.
 
     Args:
         run: the run, with a true path.

@@ -94,12 +94,12 @@ class DaylightCell(NamedTuple):
 
     @property
     def reflectance(self) -> tuple[float, BatchMean]:
-        """Upwelling radiance over a black floor divided by illuminance at the camera [1/sr]: model, reference."""
+        """Returns upwelling radiance over a black floor / illuminance at the camera [1/sr]: by model and reference."""
         return self.model_veil / self.model_lx[0], _quotient(self.truth_veil, self.truth_lx[0])
 
     @property
     def bright_reflectance(self) -> tuple[float, BatchMean]:
-        """Same as `reflectance`, over a floor of albedo `ALBEDO` / 255."""
+        """Returns the values of `reflectance` for a floor of albedo `ALBEDO` / 255."""
         return self.model_lu / self.model_lx[0], _quotient(self.truth_lu, self.truth_lx[0])
 
 

@@ -33,12 +33,12 @@ class ModelLight(NamedTuple):
 
     @property
     def total(self) -> float:
-        """Total radiance [cd/m2]."""
+        """Returns the total radiance [cd/m2]."""
         return self.direct + self.blurred + self.veil
 
     @property
     def sharp_share(self) -> float:
-        """Share of the total that comes from the floor and was not scattered between floor and camera."""
+        """Returns the share of the total that comes from the floor and was not scattered between floor and camera."""
         return self.direct / self.total
 
 

@@ -449,18 +449,18 @@ class WaterConfig(Section):
 
     @property
     def label(self) -> str:
-        """Name of the water in reports."""
+        """Returns the name of the water in reports."""
         own = "own values" if self.absorption_per_m else Path(self.spectrum_file).name if self.spectrum_file else ""
         return f"{own or self._type_label}, turbidity {self.turbidity:g}"
 
     @property
     def _type_label(self) -> str:
-        """Name of the Jerlov type with its source, or `jerlov` alone if the water is of no Jerlov type."""
+        """Returns the name of the Jerlov type with its source, or `jerlov` alone if the water is of no Jerlov type."""
         return f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
 
     @property
     def is_jerlov_type(self) -> bool:
-        """Whether absorption and scattering are those of a Jerlov type."""
+        """Returns whether absorption and scattering are those of a Jerlov type."""
         return self.jerlov != "clear" and self.absorption_per_m is None and self.spectrum_file is None
 
     @field_validator("jerlov")
@@ -942,12 +942,12 @@ class Scenario(Section):
 
     @property
     def source(self) -> Source:
-        """Files and overrides from which the scenario was read, with line numbers, for error messages."""
+        """Returns the files and overrides from which the scenario was read, with line numbers, for error messages."""
         return self._source
 
     @property
     def delivers_linear_images(self) -> bool:
-        """Whether images are proportional to the radiance.
+        """Returns whether images are proportional to the radiance.
 
         They are without [sensor], or with a linear tone curve and the white balance "white_light".
         """
@@ -956,7 +956,7 @@ class Scenario(Section):
 
     @property
     def texel_m(self) -> float:
-        """Size of a texture pixel [m]: `terrain.texture_px_m`, or by default `COARSEST_TEXEL_M` for a photo.
+        """Returns the size of a texture pixel [m]: `terrain.texture_px_m`, or by default COARSEST_TEXEL_M for a photo.
 
         The default without a photo is the size of an image pixel on the reference plane, limited to the range from
         `FINEST_TEXEL_M` to `COARSEST_TEXEL_M`.

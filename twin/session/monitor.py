@@ -103,5 +103,5 @@ class SurveyMonitor:
 
     @property
     def wall_s(self) -> float:
-        """Wall time since the start of the survey [s]."""
+        """Returns the wall time since the start of the survey [s]."""
         return time.perf_counter() - self.start_s

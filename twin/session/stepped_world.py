@@ -153,44 +153,44 @@ class SteppedWorld:
 
     @property
     def mission(self) -> Mission:
-        """The survey as planned, with its scenario, floor and map grid."""
+        """Returns the survey as planned, with its scenario, floor and map grid."""
         return self._mission
 
     @property
     def rig(self) -> StereoRig:
-        """Believed calibration of the cameras."""
+        """Returns the believed calibration of the cameras."""
         return self._mission.rig
 
     @property
     def world(self) -> World:
-        """The simulated world of the flight. Raises RuntimeError before `reset`."""
+        """Returns the simulated world of the flight. Raises RuntimeError before `reset`."""
         if self._world is None:
             raise RuntimeError("call reset first")
         return self._world
 
     @property
     def flight(self) -> Flight:
-        """The flight. Raises RuntimeError before `reset`."""
+        """Returns the flight in progress. Raises RuntimeError before `reset`."""
         if self._flight is None:
             raise RuntimeError("call reset first")
         return self._flight
 
     @property
     def reference(self) -> Reference:
-        """Planned position, velocity, yaw and acceleration of the left camera at the current frame."""
+        """Returns the planned position, velocity, yaw and acceleration of the left camera at the current frame."""
         return self.flight.reference
 
     @property
     def track(self) -> int:
-        """Number of the track of the current frame, from 1."""
+        """Returns the number of the track of the current frame, from 1."""
         return self.flight.track
 
     @property
     def aligns(self) -> bool:
-        """Whether the estimators align the network before they process the current frame (`Flight.aligns`)."""
+        """Returns whether the network is aligned before the current frame is estimated (`Flight.aligns`)."""
         return self.flight.aligns
 
     @property
     def true_pose(self) -> Array:
-        """True pose world_from_camera (4, 4) of the left camera at the current frame; not for estimators."""
+        """Returns the true world_from_camera (4, 4) of the left camera at the current frame; not for estimators."""
         return self.world.world_from_camera

@@ -1,7 +1,7 @@
 """Pose controller, top speed and thruster loads of the BlueROV2.
 
 The controller is designed with the published vehicle parameters and ignores the drag and added-mass factors of the
-scenario, which therefore act as model errors. Top speed and loads take these factors into account.
+scenario, which therefore act as model errors. The top speed includes the drag factor, the loads include both factors.
 """
 
 from __future__ import annotations
@@ -36,9 +36,10 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     """Returns the speed in still water along a direction at which the first thruster reaches full thrust [m/s].
 
-    Full thrust is the steady thrust at command 1. Drag along each axis is a v + b v |v|, with the coefficients a of
-    linear and b of quadratic drag. At the speed v, each thruster therefore needs the thrust p v + q v^2; p and q follow
-    from a, b and the thrust allocation. The Munk moment and the net buoyancy are neglected.
+    Full thrust is the steady thrust at command 1. Drag along each axis is a u + b u |u|, with the velocity u along the
+    axis and the coefficients a of linear and b of quadratic drag. At the speed v, each thruster therefore needs the
+    thrust p v + q v^2; p and q follow from a, b and the thrust allocation. The Munk moment and the net buoyancy are
+    neglected.
 
     Args:
         vehicle: vehicle settings of the scenario, with the factor on drag.

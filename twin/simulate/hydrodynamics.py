@@ -5,11 +5,11 @@
 M_RB is the inertia of the rigid body, M_A that of the added mass; C_RB and C_A are the Coriolis and centripetal
 matrices of the two, D is the drag matrix, and -g is the wrench of weight and buoyancy. The twist nu is the [angular,
 linear] velocity of the centre of gravity in body axes, w its angular part, and nu' its rate of change; tau is the
-thruster wrench [moment, force]. R is the rotation world_from_body and v_c the velocity of a steady current in the
-world; R'v_c and w x R'v_c stand for twists with a zero angular part. The fourth term is due to the rate of change of
-R'v_c when the body rotates; without it, the dynamics would not be Galilean invariant. The equation is solved for nu'
-with the total inertia M_RB + M_A. Computing the added-mass force from the acceleration of the previous step instead
-would be unstable where added mass exceeds mass.
+thruster wrench [moment, force]. R is the rotation world_from_body, R' its transpose, and v_c the velocity of a steady
+current in the world; R'v_c and w x R'v_c stand for twists with a zero angular part. The fourth term is due to the rate
+of change of R'v_c when the body rotates; without it, the dynamics would not be Galilean invariant. The equation is
+solved for nu' with the total inertia M_RB + M_A. Computing the added-mass force from the acceleration of the previous
+step instead would be unstable where added mass exceeds mass.
 """
 
 from __future__ import annotations
@@ -99,8 +99,8 @@ def free_joint_acceleration(
 ) -> Array:
     """Returns the acceleration (6,) in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
 
-    These coordinates are [linear in world axes, angular in body axes]. The linear part is R (v' + w x v), with v the
-    linear and w the angular velocity in body axes.
+    These coordinates are [linear in world axes, angular in body axes]. The linear part is R (v' + w x v), with R =
+    `world_from_body`, v the linear and w the angular velocity in body axes, and v' the rate of change of v.
 
     Args:
         hull, world_from_body: as defined in `acceleration`.
@@ -120,7 +120,10 @@ def free_joint_acceleration(
 
 @njit(cache=True, nogil=True)
 def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
-    """Returns the twist (6,) in body axes of a free joint's velocity (6,), [linear in world, angular in body axes]."""
+    """Returns the [angular, linear] velocity (6,) in body axes from the velocity (6,) of a free joint of MuJoCo.
+
+    The velocity of a free joint is [linear in world axes, angular in body axes] [m/s, rad/s].
+    """
     twist = np.zeros(6)
     for k in range(3):
         twist[k] = velocity[3 + k]

@@ -16,18 +16,20 @@ Array = NDArray[np.float64]
 
 
 def inertial_quantities(rotation: Array, rate_radps: Array, acceleration_mps2: Array) -> Array:
-    """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]: f = R' (a + g z).
+    """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2].
+
+    The specific force is R' (a + g z), with g = GRAVITY_MPS2 and z the unit vector upwards.
 
     Args:
         rotation: (3, 3) rotation R world_from_body.
         rate_radps: (3,) angular rate in body axes.
-        acceleration_mps2: (3,) acceleration a of the origin of the body in the world, whose axis z points up.
+        acceleration_mps2: (3,) acceleration a of the origin of the body, in world axes.
     """
     return np.concatenate([rate_radps, rotation.T @ (acceleration_mps2 + [0.0, 0.0, GRAVITY_MPS2])])
 
 
 def imu_rate_hz(settings: ImuConfig, motion_rate_hz: float) -> float:
-    """Returns the rate of the readings.
+    """Returns the rate of the readings [Hz].
 
     Args:
         settings: section [imu] of the scenario.
@@ -48,9 +50,9 @@ class InertialSensor:
     """Inertial measurement unit at the origin of the body.
 
     The true values are known at each step of the simulated motion and interpolated linearly at the times of the
-    readings, k / rate. The noise model is that of Kalibr: at a rate f, white noise of density s has the standard
-    deviation s sqrt(f), and the bias changes from reading to reading by steps with the standard deviation w / sqrt(f),
-    with w the density of its random walk.
+    readings, k / rate with k = 0, 1, 2, ... The noise model is that of Kalibr: at a rate f, white noise of density s
+    has the standard deviation s sqrt(f), and the bias changes from reading to reading by steps with the standard
+    deviation w / sqrt(f), with w the density of its random walk.
 
     Args:
         settings: section [imu] of the scenario.
@@ -78,7 +80,7 @@ class InertialSensor:
         self._true.append(true)
 
     def read(self) -> ImuReadings:
-        """Returns the readings since the last call, up to the last value added; at the first call from 0 s on."""
+        """Returns the readings since the last call, or since 0 s, up to the time of the last value added."""
         last = self._first + len(self._true) - 1
         ratio = self._motion_rate_hz / self._rate_hz
         end = math.floor(last / ratio + 1e-9) + 1

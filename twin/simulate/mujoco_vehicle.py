@@ -131,7 +131,10 @@ class MujocoVehicle:
         raise SurveyAborted(f"the physics diverged at {self.time_s:.3f} s; last states: {states}")
 
     def _snapshot(self) -> tuple[float, Array, Array]:
-        """Returns time [s], position (3,) [m] and velocity of the free joint (6,), ordered as `qvel` [m/s, rad/s]."""
+        """Returns time [s], position (3,) [m] and velocity of the free joint (6,) [m/s, rad/s].
+
+        The velocity is ordered as `qvel` and refers to the time half a timestep earlier.
+        """
         return self.time_s, self._data.xpos[self._body].copy(), self._velocity.copy()
 
 

@@ -18,11 +18,11 @@ from twin.simulate.inertial_sensor import InertialSensor
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-_BEACON_HEIGHT_M = 0.05  # greatest height of a beacon above the surface on which it is mounted
+_BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded
 
 
 class NavigationSensors:
-    """All navigation sensors of a vehicle; of those that may aid, only those in `navigation.aiding` return readings.
+    """Navigation sensors of a vehicle; the sensors in `navigation.aiding` and the IMU return readings.
 
     Args:
         settings: the sensors used for aiding, and the interval of acoustic fixes.
@@ -173,7 +173,10 @@ def read_pressure_and_attitude(
 
 @njit(cache=True, nogil=True)
 def _height_and_attitude(world_from_body, body_from_camera, pressure_sigma_m, attitude_sigmas_rad, numbers):
-    """Returns measured camera height [m] and roll, pitch, yaw (3,) [rad]; `numbers` (4,) are standard normal."""
+    """Returns measured height of the left camera [m] and roll, pitch, yaw (3,) of the body [rad].
+
+    `numbers` (4,) are standard normal.
+    """
     up, arm = world_from_body[2], body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
     angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + attitude_sigmas_rad * numbers[1:]

@@ -118,7 +118,9 @@ def thruster_wrench(thrusters):
 
 
 def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Array]:
-    """Returns the discrete form of 1 / denominator for inputs that are constant over a timestep dt.
+    """Returns the discrete state-space form of the transfer function 1 / denominator.
+
+    The input is constant over a timestep dt.
 
     With A and B the matrices of its controllable canonical form in continuous time, the first n rows of
     exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).

@@ -160,7 +160,7 @@ def median(values: Array) -> Array:
 
 
 def percentile(values: Array, percent: float) -> Array:
-    """Returns a percentile, 0 to 100, along the last axis, ignoring NaN."""
+    """Returns the percentile `percent` (0 to 100) along the last axis, ignoring NaN."""
     function = np.nanpercentile if np.isnan(values).any() else np.percentile
     return function(values, percent, axis=-1)
 

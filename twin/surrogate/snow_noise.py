@@ -3,7 +3,7 @@
 Let g be the gradient of a patch along the rows, and n the change of its grey levels by particles. Least-squares
 matching shifts the patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its
 weight, 1 / variance, is smaller. A patch that particles change too much is not matched: the correlation between its two
-images is too low. The image of a particle, its defocus and the light on it are those of `imaging.snow`.
+images is too low. Images, defocus and illumination of the particles are computed by `imaging.snow`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from twin.imaging.snow import BOX_M
 
 Gray = NDArray[np.float32]
 
-_MIN_CORRELATION = 0.7  # of a match, as in `estimate.vision.patches`
+_MIN_CORRELATION = 0.7  # least correlation of a match, as in `estimate.vision.patches`
 _VIEWS = 3  # number of views with different particles
 
 

@@ -315,9 +315,10 @@ class ComparisonVision:
     def _cell_classes(self) -> dict[str, np.ndarray]:
         """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared, by name.
 
-        Level cells are divided by roughness and by the number of consecutive keyframes that observed them, cells near
-        walls by `edge_strength`. Steep smooth cells are one class. Cells near the image border belong to no class, and
-        level or steep cells belong to none if a wall or a rough cell lies within a matching window of them.
+        Level cells are divided into classes of roughness and of the number of consecutive keyframes that observed them,
+        cells near walls into classes of `edge_strength`. Steep smooth cells are one class. Cells near the image border
+        belong to no class, and level or steep cells belong to none if a wall or a rough cell lies within a matching
+        window of them.
         """
         map_model = self.surrogate.scene.map_model
         rough = self._in_px(map_model.roughness_m)

@@ -298,7 +298,7 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
     At distance zero, both stereo pairs of a link contribute the same variance. The contribution of the earlier pair is
     multiplied by 1 + (growth * distance)^2, so the variance of the link is multiplied by
-    1 + (growth * distance)^2 / 2. The distance is that of `SurrogateVision.distance_in_depths`.
+    1 + (growth * distance)^2 / 2. The distance is computed by `SurrogateVision.distance_in_depths`.
 
     Returns:
         The growth; and, for each of n surveys, the ratio of the standard deviation of links reported for image

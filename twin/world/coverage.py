@@ -29,7 +29,7 @@ class Coverage:
     Args:
         grid: grid of the map.
         rig: calibration of the cameras of the depth images.
-        top_m: (rows, cols) true height of the surface seen from above [m]; None: a height grid without objects.
+        top_m: (rows, cols) true height of the surface seen from above [m]; None: the floor has no overhangs.
 
     Attributes:
         seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.
@@ -142,7 +142,10 @@ def _height(u, v, z, pose, camera):
 
 @njit(cache=True, nogil=True)
 def _mark_top_triangle(seen, top, slack, a, b, c):
-    """Marks the cells inside a triangle a, b, c (column, row, height) where it lies at most `slack` [m] below `top`."""
+    """Marks the cells whose centre lies in a triangle where the triangle is at most `slack` [m] below `top`.
+
+    The corners a, b, c are (column, row, height). A triangle without area marks no cell.
+    """
     ca, ra, za = a
     cb, rb, zb = b
     cc, rc, zc = c
@@ -169,7 +172,10 @@ def _is_surface(left, u, v):
 
 @njit(cache=True, nogil=True)
 def _mark_triangle(seen, ca, ra, cb, rb, cc, rc):
-    """Marks the cells whose centre lies inside or on the edge of a triangle a, b, c, given by columns and rows."""
+    """Marks the cells whose centre lies inside or on the edge of the triangle a, b, c.
+
+    The corners are (ca, ra), (cb, rb) and (cc, rc), each (column, row).
+    """
     row0, row1 = max(0, int(np.ceil(min(ra, rb, rc)))), min(seen.shape[0] - 1, int(np.floor(max(ra, rb, rc))))
     col0, col1 = max(0, int(np.ceil(min(ca, cb, cc)))), min(seen.shape[1] - 1, int(np.floor(max(ca, cb, cc))))
     for r in range(row0, row1 + 1):

@@ -37,12 +37,12 @@ class Flight:
 
     @property
     def reference(self) -> Reference:
-        """Planned position, velocity, yaw and acceleration of the left camera at the current frame."""
+        """Returns the planned position, velocity, yaw and acceleration of the left camera at the current frame."""
         return self._step.reference
 
     @property
     def holding(self) -> bool:
-        """Whether the vehicle keeps station at the current frame."""
+        """Returns whether the vehicle keeps station at the current frame."""
         return self._step.holding
 
     def start(self) -> Frame:
@@ -89,13 +89,13 @@ class Flight:
             yield self.mission.station_keeping_frames(track), track, True
 
     def _enter(self, sequence: FrameSequence, track: int, aligns: bool = False) -> None:
-        """Starts a sequence of frames of a track."""
+        """Starts a sequence of frames of a track; `aligns` is the value of the attribute at its first frame."""
         self._sequence, self._k = sequence, 0
         self.track, self.aligns = track, aligns
         self.world.start_sequence(sequence, track)
 
     def _observe(self, keyframe: bool | None = None) -> Frame:
-        """Returns the frame at the current pose."""
+        """Returns the frame at the current pose; `keyframe` is whether it is a keyframe (None: as planned)."""
         planned = self._sequence[self._k]
         self._step: Step = planned if keyframe is None else planned._replace(keyframe=keyframe)
         return self.world.observe(self._step)

@@ -26,7 +26,7 @@ _COVERAGE_CELLS = 1000
 
 
 class Spread(NamedTuple):
-    """Minimum, 5th percentile, median and maximum of a quantity; all None if it has no finite value."""
+    """Minimum, 5th percentile, median and maximum of a quantity; all are None if it has no finite value."""
 
     minimum: float | None
     p05: float | None
@@ -72,7 +72,10 @@ class FloorForecast:
 
 
 class PlannedOverlap(NamedTuple):
-    """Median overlap and sidelap of the planned keyframes, by ray casting on floor and objects; None without pairs."""
+    """Median overlap and sidelap of the planned keyframes, by ray casting on floor and objects.
+
+    A value is None if there is no pair whose first image shows floor.
+    """
 
     along: float | None
     across: float | None
@@ -139,7 +142,10 @@ def _row_statistic(statistic, values: Array) -> Array:
 
 
 def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
-    """Returns the share of the asked area that both cameras see in at least one planned keyframe."""
+    """Returns the share of the asked area on the terrain that both cameras see in at least one planned keyframe.
+
+    It is 0 if no cell of the terrain lies in the asked area.
+    """
     small, grid = _reduced(mission.rig), _grid_of_terrain(mission)
     coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
     shape = small.height_px, small.width_px
@@ -152,7 +158,10 @@ def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
 
 
 def _grid_of_terrain(mission: Mission) -> MapGrid:
-    """Returns a grid over the whole terrain, with cells as large as those of the map, or larger on a large terrain."""
+    """Returns a grid over the terrain from its north-west corner, without cells that lie only partly on the terrain.
+
+    The cells are as large as those of the map, or larger if there would be more than _COVERAGE_CELLS along a side.
+    """
     t = mission.terrain
     cell_m = max(mission.grid.cell_m, max(t.size_m) / _COVERAGE_CELLS)
     cols, rows = (max(1, int(side / cell_m)) for side in t.size_m)

@@ -1,4 +1,4 @@
-"""Sea floor that is a mesh, e.g. a photogrammetric model: what is rendered, and its surface as seen from above.
+"""Sea floor that is a mesh, e.g. a photogrammetric model: its tiles, and its surface as seen from above.
 
 The mesh is rendered in tiles. Plan, clearance, placed objects and the surrogate use a height grid of its highest
 surface. The truth of the map is the highest surface at each cell, by a parallel projection of all triangles. Below the
@@ -41,9 +41,9 @@ from twin.world.top_surface import FROM_ABOVE, FROM_BELOW, OVERHANG_M
 
 FIELD = "terrain.mesh_file"
 FINEST_GRID_M = 0.005  #: least spacing of the height grid
-MOST_NODES = 2_000_000  #: of the height grid; its spacing grows beyond `terrain.grid_m` if necessary
-MARGIN_M = 0.005  #: by which the height grid below the mesh is lowered
-_ROWS_PER_BLOCK = 256  # the images of a block take 35 bytes per texel
+MOST_NODES = 2_000_000  #: most nodes of the height grid; its spacing exceeds `terrain.grid_m` if necessary
+MARGIN_M = 0.005  #: distance by which the height grid below the mesh is lowered
+_ROWS_PER_BLOCK = 256  # the images of a block take 33 bytes per texel
 
 Layer = NDArray[np.float32]
 
@@ -53,8 +53,8 @@ class MeshFloor(NamedTuple):
 
     Args:
         terrain: height grid of the highest surface, with its colours as texture.
-        under: height grid below the mesh, which is rendered with it.
-        tiles: the mesh.
+        under: height grid below the mesh; it is rendered together with the mesh.
+        tiles: the mesh, divided into tiles.
     """
 
     terrain: terrains.Terrain
@@ -63,7 +63,7 @@ class MeshFloor(NamedTuple):
 
 
 class FloorSurface(NamedTuple):
-    """Surface of a mesh floor from above: height [m] float32 and overhung bool (rows, cols), see `TopSurface`."""
+    """Surface of a mesh floor as seen from above; both arrays (rows, cols) are defined as in `TopSurface`."""
 
     height_m: Layer
     overhung: NDArray[np.bool_]
@@ -101,8 +101,8 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
 def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
     """Returns the highest surface of a mesh floor at the cell centres of a grid.
 
-    Where the mesh has a hole, this is the height grid below it. A cell is overhung if the mesh has a surface that faces
-    down more than OVERHANG_M above one that faces up.
+    In holes of the mesh, it is the height of `floor.under`. A cell is overhung if the highest surface of the mesh that
+    faces down lies more than OVERHANG_M above the lowest one that faces up.
     """
     meshes = [tile.placed.model.levels[0].mesh for tile in floor.tiles.tiles]
     top = -_depth(meshes, grid, FROM_ABOVE)
@@ -113,7 +113,11 @@ def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
 
 
 def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
-    """Returns a mesh without long edges; raises TwinError if this needs too many triangles or the mesh is too large."""
+    """Returns the mesh with its long edges divided.
+
+    Raises:
+        TwinError: the division needs too many triangles, or the extent of the mesh is not finite.
+    """
     if not np.isfinite(extent(whole.mesh)).all():
         raise TwinError(FIELD, f"{file.name!r} is too large", "a mesh that covers the planned area")
     try:
@@ -123,7 +127,7 @@ def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
 
 
 def _mesh_file(t: TerrainConfig) -> Path:
-    """Returns the file of the mesh; raises TwinError if it is missing, or other keys contradict it."""
+    """Returns the file of the mesh; raises TwinError if it is not given, or keys without effect on a mesh are set."""
     if t.mesh_file is None:
         raise TwinError(FIELD, "missing", 'a mesh, as terrain.kind is "mesh"')
     for key in ("height_file", "texture_file", "orthophoto_file", "z", "cover", "plugin"):
@@ -133,7 +137,7 @@ def _mesh_file(t: TerrainConfig) -> Path:
 
 
 def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
-    """Returns the grid whose cell centres are the nodes of the height grid, in the middle of the extent of the mesh.
+    """Returns the grid whose cell centres are the nodes of the height grid, centred at the origin as the mesh is.
 
     The spacing is the median length of an edge, but at least FINEST_GRID_M and at most `coarsest_m`, or as large as
     MOST_NODES requires. Raises TwinError if the mesh is too small for two nodes along x or y.
@@ -173,9 +177,9 @@ def _projection(grid: MapGrid, first: int) -> Projection:
 
 
 def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
-    """Returns the least height (rows, cols) of surfaces that face up: at the cell centre and of vertices in the cell.
+    """Returns the least height (rows, cols) of the surfaces that face up in each cell; inf where there are none.
 
-    It is inf where there are none.
+    It is taken over the points of the surfaces at the cell centre and over their vertices in the cell.
     """
     low = _depth([upward], grid, FROM_BELOW)
     x, y, z = upward.vertices_m[np.unique(upward.faces)].T
@@ -186,7 +190,7 @@ def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
 
 
 def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Returns row and column (rows, cols) of the nearest covered node of each node."""
+    """Returns for each node (rows, cols) the row and the column of the nearest covered node."""
     rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
     return rows, cols
 
@@ -197,7 +201,7 @@ def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArra
     Args:
         drawn: the tiles of the mesh.
         grid: the cells, whose width is `grid.cell_m`.
-        row_m: height of the cells, nearly equal to their width.
+        row_m: extent of the cells along y, nearly equal to their width.
     """
     stretch = grid.cell_m / row_m
     axes = np.diag([1.0, stretch, 1.0, 1.0]) @ FROM_ABOVE
@@ -216,7 +220,7 @@ def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArra
 
 
 def _borders(view: Projection, shape: tuple[int, int]) -> Array:
-    """Returns the planes (4, 4) around a parallel view with (rows, cols) pixels, see `Objects.in_view`."""
+    """Returns the planes (4, 4) that bound a parallel view of (rows, cols) pixels: `limits` of `Objects.in_view`."""
     corner = np.array([view.cx_px, view.cy_px])
     west, north = (-0.5 - corner) / view.focal_px
     east, south = (np.array(shape[::-1]) - 0.5 - corner) / view.focal_px
@@ -230,7 +234,7 @@ def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) 
         drawn: the tiles of the mesh.
         grid: grid of the nodes.
         colours: (rows, cols, 3) colours of the nodes, which fill holes.
-        scenario: size of the texels.
+        scenario: the scenario, which determines the size of the texels.
     """
     t, ny, nx = scenario.terrain, grid.rows, grid.cols
     size_m = (nx - 1) * grid.cell_m, (ny - 1) * grid.cell_m
@@ -246,7 +250,10 @@ def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) 
 
 
 def _terrain(height_m: Layer, grid: MapGrid, texture: Image, n_filled: int) -> terrains.Terrain:
-    """Returns the terrain with the heights (rows, cols) of the nodes of a grid, row 0 = north."""
+    """Returns the terrain with a texture and the heights (rows, cols) of the nodes at the cell centres of a grid.
+
+    Row 0 of the heights is in the north. `n_filled` is the number of nodes that the mesh does not cover.
+    """
     west_m, south_m = grid.west_m + grid.cell_m / 2, grid.north_m - (grid.rows - 0.5) * grid.cell_m
     heights, texel_m = (
         np.ascontiguousarray(height_m[::-1], np.float32),

@@ -92,7 +92,7 @@ class Mission:
 
     Args:
         scenario: description of the survey.
-        terrain: sea floor; of a mesh, its highest surface.
+        terrain: sea floor as a height grid; of a mesh floor, that of its highest surface.
         plan: planned path.
         rig: calibration that the estimators use.
         grid: cells of the map.
@@ -114,7 +114,7 @@ class Mission:
 
     @property
     def rendered_terrain(self) -> terrains.Terrain:
-        """Returns the height grid that is rendered: the sea floor, or what lies below a mesh floor."""
+        """Returns the height grid that is rendered: the sea floor, or the height grid below a mesh floor."""
         return self.terrain if self.mesh_floor is None else self.mesh_floor.under
 
     def rendered_objects(self) -> Objects | None:
@@ -141,9 +141,9 @@ class Mission:
         return FrameSequence(self.plan.references(track, times_s), keyframes, holding=False, path_times_s=times_s)
 
     def station_keeping_frames(self, track: int) -> FrameSequence:
-        """Returns the planned frames of the first or the second half of the station keeping after a track.
+        """Returns the planned frames of one half of the station keeping after a track (numbered from 1).
 
-        Both halves are the same; the global alignment runs between them. Tracks are numbered from 1.
+        Both halves have the same frames; the global alignment runs between them.
         """
         n = self._n_holding
         times_s = np.full(n, self.plan.track_duration_s(track))
@@ -177,7 +177,7 @@ class Mission:
 
     @property
     def n_frames(self) -> int:
-        """Returns the number of frames of the whole survey, including station keeping."""
+        """Returns the number of frames of the whole survey at the planned speed, including station keeping."""
         return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
 
     @property
@@ -190,7 +190,8 @@ def prepare(scenario: Scenario) -> Mission:
     """Returns the mission of a scenario: loads its floor and objects, plans the survey, and checks all of them.
 
     Raises:
-        ScenarioError: the survey cannot be flown; the error lists every reason with file and line, or with its `--set`.
+        ScenarioError: the survey cannot be flown; the error lists every reason with file and line, or with the `--set`
+            that caused it.
     """
     errors: list[str] = []
     source = scenario.source
@@ -249,7 +250,10 @@ def _attempt(build, source: Source, errors: list[str]):
 
 
 def motion_rate_hz(scenario: Scenario) -> float:
-    """Returns the rate at which the motion of the vehicle is simulated: that of the physics, or that of the frames."""
+    """Returns the number of simulated steps of the vehicle per second.
+
+    These are the timesteps of the physics or, for a kinematic vehicle, the frames.
+    """
     frame_rate_hz = scenario.rig.frame_rate_hz
     rigid = scenario.vehicle.dynamics == "rigid"
     return round(1 / (frame_rate_hz * physics_timestep_s(frame_rate_hz))) * frame_rate_hz if rigid else frame_rate_hz
@@ -297,7 +301,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
 
 
 def _check_texture_keys(t: TerrainConfig) -> None:
-    """Raises TwinError if `cover` is set together with a photo, or `texture_tiling` is not the default without one."""
+    """Raises TwinError if `cover` is set with `texture_file`, or `texture_tiling` is changed without `texture_file`."""
     if t.texture_file is not None and t.cover is not None:
         raise TwinError("terrain.cover", "has no effect on a floor with terrain.texture_file", "one of the two")
     if t.texture_file is None and t.texture_tiling != TerrainConfig.model_fields["texture_tiling"].default:
@@ -312,7 +316,7 @@ def _check_mesh_keys(t: TerrainConfig) -> None:
 
 
 def _check_plugins(scenario: Scenario) -> None:
-    """Raises TwinError if the controller or the estimator of another package cannot be loaded or used."""
+    """Raises TwinError if a plug-in (controller or estimator) cannot be loaded, or an estimator would get no images."""
     check_loadable("control.plugin", CONTROLLERS, scenario.control.plugin)
     check_loadable("estimate.plugin", ESTIMATORS, scenario.estimate.plugin)
     if scenario.estimate.plugin is not None and scenario.imaging.fidelity != "rendered":
@@ -322,9 +326,12 @@ def _check_plugins(scenario: Scenario) -> None:
 def _check_speed(scenario: Scenario, plan: SurveyPlan | None) -> None:
     """Raises TwinError if the cruise speed exceeds the top speed: forwards or, for loops, in the slowest direction.
 
+    A kinematic vehicle is not checked.
+
     Args:
         scenario: the vehicle, and `plan.speed_mps`.
-        plan: the planned survey, which is slower than `plan.speed_mps` on tight loops; None: it could not be planned.
+        plan: the planned survey, whose cruise speed is below `plan.speed_mps` on tight loops; None: it could not be
+            planned.
     """
     if scenario.vehicle.dynamics == "kinematic":
         return
@@ -377,7 +384,7 @@ def _illumination(scenario: Scenario) -> Illumination:
 
 
 def _check_lamp(number: int, scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if a lamp is below the floor anywhere on the path, for any heading of the bow on the legs."""
+    """Raises TwinError if a lamp is below the floor at a point of the path, with any heading of the bow on the legs."""
     corners, offset = plan.outline(), np.array(scenario.lamps[number].position_m)
     offset = offset - scenario.believed_rig().body_from_camera[:3, 3]
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
@@ -404,7 +411,7 @@ def _check_exposure(sensor: SensorConfig) -> None:
 
 
 def _check_white_balance(sensor: SensorConfig) -> None:
-    """Raises TwinError if gains or a colour temperature are set, but not used by the white balance."""
+    """Raises TwinError if gains or a colour temperature are set that the mode of the white balance does not use."""
     unused = {"white_gains": "gains", "white_temperature_k": "temperature"}
     for key, mode in unused.items():
         if getattr(sensor, key) != SensorConfig.model_fields[key].default and sensor.white_balance != mode:
@@ -415,7 +422,7 @@ def _check_white_balance(sensor: SensorConfig) -> None:
 
 
 def _check_lens_blur(scenario: Scenario) -> None:
-    """Raises TwinError if the blur of the lens needs a sensor that is not given, or the focus is too near."""
+    """Raises TwinError if [sensor] is missing although the blur of the lens needs it, or if the focus is too near."""
     lens = scenario.lens
     for key, used in (("diffraction", lens.diffraction), ("focus_m", lens.focus_m > 0)):
         if used and scenario.sensor is None:
@@ -447,7 +454,7 @@ def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
 
 
 def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if the area is larger than the terrain, or the path leaves it or has too little clearance."""
+    """Raises TwinError if the area exceeds the terrain, or the path leaves the terrain or is too near the floor."""
     size, outline = terrain.size_m, plan.area.outline()
     extent = f"{size[0]:.2f} x {size[1]:.2f} m"
     # a tolerance: rotation rounds the corners of an area as large as the terrain
@@ -486,7 +493,10 @@ def _grid(scenario: Scenario, plan: SurveyPlan, terrain: terrains.Terrain) -> Ma
 
 
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
-    """Returns half the extent of a footprint along x and y [m], the maximum over the headings on the path."""
+    """Returns half the extent of a footprint on the reference plane along x and y [m].
+
+    It is the maximum over the headings on the path; with turns on the spot, half the diagonal of the footprint.
+    """
     across_m, along_m = plan.footprint_m
     if plan.turns_on_the_spot:
         diagonal_m = float(np.hypot(along_m, across_m))

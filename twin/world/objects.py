@@ -20,7 +20,7 @@ from twin.world.clearance import path_points
 
 GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours
 SHAPE_SIZE_M = 0.4  #: size of a built-in shape without `size_m`
-MAX_FACES = 8_000_000  #: triangles of all shapes together
+MAX_FACES = 8_000_000  #: largest number of triangles of all built-in shapes and mesh files together
 MAX_OBJECTS = 20_000
 VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up
 
@@ -28,7 +28,7 @@ Attempt = Callable[[Callable[[], object]], object]
 
 
 def load_objects(scenario: Scenario, terrain: terrains.Terrain, attempt: Attempt) -> tuple[PlacedObject, ...]:
-    """Returns the objects of a scenario; equal shapes are built once.
+    """Returns the objects of a scenario; objects with equal shapes share one model.
 
     Args:
         scenario: the scenario.
@@ -132,8 +132,8 @@ def _unused_keys(config: ObjectConfig) -> list[str]:
 def check_path(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
     """Raises TwinError if the vehicle comes too close to an object on its planned path.
 
-    The highest corner of the bounding box of an object must be `clearance_m` below the cameras wherever the vehicle is
-    above the circle around this box.
+    The highest corner of the bounding box of an object must be at least `clearance_m` below the cameras wherever their
+    horizontal distance to the circle around this box is less than VEHICLE_REACH_M.
     """
     if not objects:
         return

@@ -9,7 +9,7 @@ import numpy as np
 from controllers.segments import Reference
 from twin.core.geometry import Array
 
-SAME_TIME_S = 1e-9  #: times that differ by less are equal
+SAME_TIME_S = 1e-9  #: times that differ by less are treated as equal
 
 
 class Pace(NamedTuple):
@@ -26,7 +26,9 @@ class Pace(NamedTuple):
     keyframe: bool = False
 
     def path_times(self, last_s: float, end_s: float, interval_s: float) -> Array:
-        """Returns the path times (n,) of the next frames [s]: one frame, or at full pace all to the end of the track.
+        """Returns the path times (n,) of the next frames [s]: one or, at full pace, all to the end of the track.
+
+        There are none if the last frame of the track has been flown.
 
         Args:
             last_s: path time of the last frame flown.

@@ -24,7 +24,11 @@ PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot: a function from the estimate and the reference of the left camera to the vehicle command."""
+    """Returns the pilot: a function from the estimate and the reference of the left camera to the vehicle command.
+
+    Raises:
+        TwinError: the controller plug-in cannot be loaded.
+    """
     scenario = mission.scenario
     if scenario.control.plugin is not None:
         return PluginPilot(mission, scenario.control.plugin)
@@ -70,9 +74,9 @@ class PilotState(NamedTuple):
     Args:
         camera_from_body: (4, 4) pose of the body in the left camera.
         body_from_camera_twist: (6, 6) adjoint that transforms a twist of the camera to the body.
-        lever_arm_m: (3,) position of the camera in the body [m].
+        lever_arm_m: (3,) position of the left camera in the body [m].
         smoothing: weight of a new twist in the exponential moving average.
-        twist: (6,) smoothed twist of the body [rad/s, m/s].
+        twist: (6,) smoothed twist of the body in body axes [rad/s, m/s].
         controller: state of the pose controller.
     """
 
@@ -112,7 +116,7 @@ def steer(state, world_from_camera, camera_velocity, position, velocity, acceler
     Args:
         state: state of the pilot.
         world_from_camera: (4, 4) estimated pose of the left camera.
-        camera_velocity: (6,) estimated twist of the left camera [rad/s, m/s].
+        camera_velocity: (6,) estimated twist of the left camera in camera axes [rad/s, m/s].
         position, velocity, acceleration: (3,) reference of the left camera in the world [m, m/s, m/s2].
         yaw: reference yaw [rad].
     """

@@ -87,7 +87,7 @@ def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
 
 
 def read_geojson(file: Path, terrain: Terrain) -> Array:
-    """Returns the corners (n, 2) of the polygon in a GeoJSON file, in the scene [m].
+    """Returns the corners (n, 2) of the polygon in a GeoJSON file, in the scene [m], in the order of the file.
 
     The coordinates are in the CRS that the member "crs" names. In a file without this member they are longitude and
     latitude (RFC 7946) if the DEM names its CRS, all of them lie within +-180 and +-90 degrees and, read in the CRS of

@@ -16,7 +16,7 @@ from twin.judge.swaths import is_turning, leg_numbers, travel_direction
 
 
 def floor_of(terrain: Terrain) -> HeightField:
-    """Returns the height field of a terrain."""
+    """Returns the height field of a terrain, for ray casting."""
     return height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
 
 
@@ -42,7 +42,7 @@ def planned_keyframes(plan: SurveyPlan, pattern: str) -> KeyframePoses:
 
 
 def planned_pairs(keyframes: KeyframePoses) -> tuple[ImagePairs, ImagePairs]:
-    """Returns the pairs of images for the overlap along the swaths, and those for the sidelap."""
+    """Returns the pairs of images from which the overlap along the swaths and the sidelap are computed."""
     return along_pairs(keyframes), across_pairs(keyframes)
 
 

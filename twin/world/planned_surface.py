@@ -15,16 +15,16 @@ from twin.world.coverage import true_heights
 from twin.world.mission import Mission
 from twin.world.top_surface import top_surface
 
-FINE_M = 0.01  #: wanted spacing of the nodes where there are objects; it is larger if MAX_NODES requires this
+FINE_M = 0.01  #: largest spacing of the nodes if there are objects, unless MAX_NODES requires a larger one
 
 
 def planned_surface(mission: Mission) -> Terrain:
     """Returns the terrain whose heights are those of the highest of floor and objects.
 
-    Each cell of the floor is divided into n x n cells. The diagonals of the small cells lie on those of the floor, so
-    the surface beside the objects is exactly that of the floor. The side of an object is a slope between two nodes, and
-    there is no space below overhangs. Without objects, and for a survey by the surrogate, which does not simulate them,
-    the terrain of the mission is returned.
+    Each cell of the floor is divided into n x n small cells. The diagonal of a cell consists of diagonals of small
+    cells, so the surface away from the objects is that of the floor. The side of an object is a slope between two
+    nodes, and there is no space below overhangs. Without objects, and for a survey by the surrogate, which does not
+    simulate them, the terrain of the mission is returned.
     """
     floor = mission.terrain
     if not mission.objects or mission.scenario.imaging.fidelity != "rendered":
@@ -38,7 +38,7 @@ def planned_surface(mission: Mission) -> Terrain:
 
 
 def _divisions(floor: Terrain) -> int:
-    """Returns the number n of divisions of the side of a cell: as FINE_M asks, with at most MAX_NODES nodes in all."""
+    """Returns the number n of divisions of the side of a cell, from FINE_M and MAX_NODES; at least 1."""
     wanted = max(1, ceil(floor.spacing_m / FINE_M - 1e-6))
     allowed = int(np.sqrt(MAX_NODES / floor.height_m.size))
     return max(1, min(wanted, allowed))

@@ -45,6 +45,8 @@ class NonOverlap(NamedTuple):
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """Returns the plan of a survey, with height and spacing adapted to the floor if the scenario requests it.
 
+    They are not adapted if the level path leaves the terrain or meets the floor, which `prepare` reports.
+
     Args:
         scenario: description of the survey.
         terrain: its floor; None: the survey is planned over the reference plane.
@@ -121,7 +123,8 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     multiplied by the factors of `_reduction`. On a floor at the reference plane they stay 1.
 
     Raises:
-        TwinError: no spacing with scales of at least `_LEAST_SCALE` was found that gives enough overlap.
+        TwinError: no spacing with scales of at least `_LEAST_SCALE` was found that gives enough overlap, or the pattern
+            cannot be planned with the reduced spacing.
     """
     make = _PATTERNS[pattern]
     whole = request._replace(tracks=0) if _n_whole(request, pattern) <= _MOST_TRACKS else request
@@ -174,7 +177,10 @@ def _reduction(found: float, allowed: float, unchanged: int) -> float:
 
 
 def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> NonOverlap:
-    """Returns `NonOverlap` of a plan over a floor, from at most _PAIRS pairs each way; 0 if there are no pairs."""
+    """Returns the `NonOverlap` of a plan over a floor, from at most _PAIRS pairs along and _PAIRS across the swaths.
+
+    A value is 0 without pairs whose first image shows floor.
+    """
     pairs = planned_pairs(planned_keyframes(plan, pattern))
     missed = [1 - overlaps(field, thinned(p, _PAIRS), rig) for p in pairs]
     known = [m[np.isfinite(m)] for m in missed]

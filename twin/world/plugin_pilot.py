@@ -31,5 +31,5 @@ class PluginPilot:
         self._plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
-        """Returns the command of the plug-in. Raises PluginFailed if it failed or the command is unusable."""
+        """Returns the command of the plug-in; raises PluginFailed if the plug-in fails or its command is unusable."""
         return self._plugin.numbers("command", self._plugin.call("command", estimate, reference), (self._n,))

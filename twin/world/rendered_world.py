@@ -81,7 +81,7 @@ class RenderedWorld(World):
 
 
 def _surface(mission: Mission) -> TrueSurface | None:
-    """Returns the true surface of objects and of a mesh floor; None for a height grid without objects."""
+    """Returns the true surface of the map with objects or a mesh floor; None for a height grid without objects."""
     grid, whole = mission.grid, mission.mesh_floor
     if whole is None and not mission.objects:
         return None

@@ -72,7 +72,7 @@ def _check_station_keeping(scenario: Scenario, hold: Array) -> None:
 
 
 def _root(function: Callable[[float], float], high: float) -> float:
-    """Returns the root of a function that has opposite signs at 0 and at `high`."""
+    """Returns a root between 0 and `high` of a function that has opposite signs at these two values."""
     return float(root_scalar(function, bracket=(0.0, high), method="brentq", xtol=1e-4).root)
 
 
@@ -92,7 +92,7 @@ def _planned_velocities(plan: SurveyPlan) -> tuple[Array, Array]:
 
 
 def _body_velocities(yaw: Array, velocity: Array) -> Array:
-    """Returns velocities (n, 3), given in world axes, in the body axes of a level vehicle at yaws (n,) [rad]."""
+    """Returns velocities (n, 3) converted from world axes to the body axes of a level vehicle at yaws (n,) [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = velocity.T
     return np.column_stack([c * x + s * y, c * y - s * x, z])

@@ -101,7 +101,7 @@ class World(ABC):
         """Returns the images of the cameras at the current pose."""
 
     def extra_pair(self) -> tuple[Image, Image]:
-        """Returns the left and the right image (H, W, 3) at the current pose; has no effect on later frames.
+        """Returns a left and a right image (H, W, 3) at the current pose, without an effect on later frames.
 
         Raises:
             TwinError: the world has no images.
@@ -110,7 +110,7 @@ class World(ABC):
 
     @abstractmethod
     def seen(self) -> NDArray[np.bool_]:
-        """Returns the cells of the map (rows, cols) that both cameras observed in at least one keyframe."""
+        """Returns for each cell of the map (rows, cols) whether both cameras observed it in at least one keyframe."""
 
     @property
     def world_from_camera(self) -> Array:
@@ -126,7 +126,7 @@ class World(ABC):
         self._sequences.append((sequence, track))
 
     def end_sequence(self, n: int) -> None:
-        """Ends the sequence after its first n frames."""
+        """Ends the current sequence after its first n frames."""
         sequence, track = self._sequences[-1]
         self._sequences[-1] = sequence.first(n), track
 
@@ -189,16 +189,16 @@ class World(ABC):
         )
 
     def true_surface(self) -> TrueSurface:
-        """Returns the true surface of the map; in this base class, that of the floor without objects."""
+        """Returns the true surface of the map; in this base class, the floor without objects."""
         return TrueSurface(true_heights(self.mission.grid, self.mission.terrain.height_at))
 
 
 def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:
-    """Returns the true world_from_camera (4, 4) of the left camera."""
+    """Returns the true world_from_camera (4, 4) of the left camera of a vehicle."""
     return geometry.compose(vehicle.world_from_body, rig.body_from_camera)
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:
-    """Returns the random generators of a survey by the name of their stream."""
+    """Returns the random generators of a survey with this seed, by the names of their streams."""
     seeds = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}

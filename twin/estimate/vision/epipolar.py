@@ -79,7 +79,7 @@ class Refinement(NamedTuple):
 
     @property
     def measurement_sigma_px(self) -> Map:
-        """Standard deviation (H, W) of the disparity without the prior, including `variance_inflation` [px]."""
+        """Returns the standard deviation (H, W) of the disparity without the prior [px], with `variance_inflation`."""
         return _measurement_sigma(self.sigma_px, self.gain) * np.float32(self.variance_inflation**0.5)
 
 

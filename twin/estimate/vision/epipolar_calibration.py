@@ -128,7 +128,7 @@ class EpipolarCalibration:
 
     @property
     def estimate(self) -> Array:
-        """(4,) estimated pitch, yaw, roll [rad] and row offset (normalised)."""
+        """Returns the estimated pitch, yaw, roll [rad] and row offset (normalised), (4,)."""
         return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
 
     def update(self, rig: StereoRig) -> bool:

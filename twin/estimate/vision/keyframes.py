@@ -1,4 +1,4 @@
-"""Keyframes of the survey."""
+"""A keyframe of a survey: its estimated pose, its matched points and its sensor readings."""
 
 from __future__ import annotations
 

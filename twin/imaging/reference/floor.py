@@ -29,7 +29,7 @@ def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True)
 def _distance_upwards(field, ox, oy, oz, dx, dy, dz):
-    """Same as `floor_distance`, for a rising ray.
+    """Returns the result of `floor_distance` for a rising ray (dz > 0) and a height field.
 
     A ray cast in the reverse direction decides whether the floor blocks the ray; steps and bisection then locate the
     point of intersection.
@@ -80,7 +80,7 @@ def _height_and_slopes(field, x, y):
 
 @njit(cache=True, nogil=True)
 def floor_normal(is_plane, field, x, y):
-    """Returns the unit normal x, y, z of the triangle of the floor at (x, y); it points up."""
+    """Returns the unit normal x, y, z of the triangle of the floor at (x, y), upwards; 0, 0, 1 outside the grid."""
     if is_plane:
         return 0.0, 0.0, 1.0
     _, east, north = _height_and_slopes(field, x, y)

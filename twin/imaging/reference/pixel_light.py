@@ -51,15 +51,16 @@ class BandWater:
 
 @dataclass(frozen=True)
 class Sunlight:
-    """Light of sun and sky that enters the water, given by its radiance just below the surface.
+    """Light of sun and sky that enters the water, just below the surface.
 
     Args:
         to_sun: (3,) unit direction to the sun under water, in world axes.
         normal_lx: illuminance just below the surface by the sun, on a plane that faces it [lx].
         surface_m: height of the surface, z in world axes; light that rises above it is lost.
-        radius_rad: radius of the sun's disc, which matters for phase functions with a sharp peak; 0: parallel light.
+        radius_rad: angular radius of the sun's disc under water, which matters for phase functions with a sharp peak;
+            0: parallel light.
         sky_cd_m2: (n,) radiance of the sky just below the surface, at even steps of the cosine of the zenith angle from
-            0 to 1; empty: none.
+            0 to 1, n of 2 or more; empty: no light of the sky.
     """
 
     to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -75,12 +76,13 @@ class ReferenceScene:
 
     Args:
         water: optical properties of the water.
-        lamps: (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity on the axis [cd].
+        lamps: (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity [cd], by which the
+            relative intensities of `beams` are multiplied.
         beams: for each lamp, (m, 2) angle from the axis [deg] and relative intensity.
         albedo: albedo of the Lambertian floor.
         relief: the floor; None = the plane z = 0.
         sun: sunlight and light of the sky; by default none, and no surface.
-        lamp_radius_m: vertices that are not farther from a lamp than this get no light from it.
+        lamp_radius_m: points within this distance of a lamp neither reflect nor scatter its unscattered light.
     """
 
     water: BandWater
@@ -132,9 +134,9 @@ class PixelLight:
     """Light that reaches a pixel, by component [cd/m2].
 
     Args:
-        sums: (batches, FIRST_BIN + 2 n) mean light of each batch, in the order of `walk.walk`.
-        bin_edges_px: (n,) lower edges of the bins of blurred light: distance between the pixel and the unscattered
-            image of the point of the floor from which the light came.
+        sums: (batches, FIRST_BIN + 2 n) mean light of each batch, in the order of `sums` of `walk.walk`.
+        bin_edges_px: (n,) lower edges of the bins of blurred light, which are bins of the distance in the image between
+            the pixel and the projection of the floor point from which the light came.
     """
 
     sums: Array
@@ -152,7 +154,10 @@ class PixelLight:
 
     @property
     def lamp_scattered(self) -> BatchMean:
-        """Light of the floor that was scattered or reflected on its way to the floor, but not scattered afterwards."""
+        """Light that was scattered or reflected before it reached the floor in the pixel, but not scattered afterwards.
+
+        It includes scattered light of sun and sky.
+        """
         return _estimate(self.sums[:, LAMP_SCATTERED])
 
     @property
@@ -167,7 +172,10 @@ class PixelLight:
 
     @property
     def blurred_straight_lamp(self) -> BatchMean:
-        """Light of the floor that was scattered between floor and camera, but not scattered or reflected before."""
+        """Light of lamps, sun and sky that was scattered between floor and camera, but not on its way to the floor.
+
+        It was reflected once, by the floor.
+        """
         return _estimate(self.blurred_by_bin[:, 0].sum(1))
 
     @property
@@ -187,11 +195,17 @@ class PixelLight:
 
     @property
     def blurred_by_bin(self) -> Array:
-        """Blurred light (batches, 2, n) [cd/m2] in n bins; index 0: direct illumination of the floor, 1: all other."""
+        """Blurred light (batches, 2, n) [cd/m2] in n bins.
+
+        Index 0 of the second axis is light that reached the floor without scattering or reflection, index 1 all other.
+        """
         return self.sums[:, FIRST_BIN:].reshape(len(self.sums), 2, -1)
 
     def blurred_share(self, from_px: float, to_px: float = np.inf) -> BatchMean:
-        """Returns the share of the blurred light in the bins between two edges of `bin_edges_px`.
+        """Returns the share of the blurred light in the bins between two edges; NaN if there is no blurred light.
+
+        Args:
+            from_px, to_px: two of `bin_edges_px`, or inf for `to_px`.
 
         Raises:
             ValueError: `from_px` or a finite `to_px` is not an edge.
@@ -236,7 +250,11 @@ class PlaneLight:
 
 
 class KernelScene(NamedTuple):
-    """A `ReferenceScene` and `Effort.plain` in the form of the compiled kernels, without lamps of zero intensity."""
+    """A `ReferenceScene` and `Effort.plain` in the form of the compiled kernels, without lamps of zero intensity.
+
+    `density_per_sr` to `beyond` are fields and properties of `PhaseTable`, `beams` (n, BEAM_STEPS + 1) has the relative
+    intensities of the lamps from 0 to 90 deg, and `sun_cosine` is the cosine of the angular radius of the sun's disc.
+    """
 
     absorption: float
     scattering: float
@@ -283,8 +301,8 @@ def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Ef
 
     Args:
         scene: water, light and floor.
-        point_m: (3,) a point of the plane above the floor, in world axes.
-        normal: (3,) unit normal of the plane; light that arrives from the side of the normal counts.
+        point_m: (3,) a point of the plane above the floor, in world axes [m].
+        normal: (3,) unit normal of the plane in world axes; light that arrives from the side of the normal counts.
         effort: number of walks, and seed.
 
     Raises:
@@ -301,13 +319,16 @@ Light = TypeVar("Light", PixelLight, PlaneLight)
 def refined(
     light_of: Callable[[Effort], Light], enough: Callable[[Light], bool], effort: Effort, most_walks: int
 ) -> Light:
-    """Repeats a computation until its standard errors are small enough, and returns the light from all rounds.
+    """Repeats a computation until its standard errors are small enough or `most_walks` would be exceeded.
 
     Args:
         light_of: computes the light of one round, e.g. with `pixel_light` or `plane_light`.
         enough: returns whether the standard errors of the light of all rounds so far are small enough.
         effort: size of each round; the rounds differ by their seeds.
         most_walks: largest number of walks of all rounds, as counted in `Effort`; the first round is always computed.
+
+    Returns:
+        The light with the batches of all rounds.
     """
     light, rounds = light_of(effort), 1
     while (rounds + 1) * effort.walks <= most_walks and not enough(light):

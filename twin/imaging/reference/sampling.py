@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-GUIDE_G = 0.9  # mean cosine of the wider lobe around a lamp, see `sample_guide`
+GUIDE_G = 0.9  # mean cosine of the wider lobe around a lamp or the sun, see `sample_guide`
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -67,18 +67,19 @@ def turn(x, y, z, cosine, sine, azimuth):
 
 @njit(cache=True, nogil=True)
 def turn_by_cosine(x, y, z, cosine, rng):
-    """Returns the unit vector at an angle of given cosine from (x, y, z), with a random azimuth."""
+    """Returns the unit vector at an angle of given cosine from the unit vector (x, y, z), with a random azimuth."""
     sine = np.sqrt(max(1 - cosine * cosine, 0.0))
     return turn(x, y, z, cosine, sine, 2 * np.pi * rng.random())
 
 
 @njit(cache=True, nogil=True)
 def sample_guide(cumulative_angle, rng):
-    """Returns a random cosine of the angle from the direction to a lamp, for directions sampled around the lamp.
+    """Returns the cosine of a random angle from the direction to a lamp or the sun, for directions sampled around it.
 
     The distribution is a mixture of two, each with probability 1/2. The first is for light that is scattered once
-    between lamp and point: uniform between 0 and a scattering angle that is sampled by `sample_angle`. The second is
-    wider, for light that is scattered more often: Henyey-Greenstein with the mean cosine `GUIDE_G`, by inversion.
+    between lamp and point: its angle is uniform between 0 and a scattering angle that is sampled by `sample_angle`. The
+    second is wider, for light that is scattered more often: Henyey-Greenstein with the mean cosine `GUIDE_G`, by
+    inversion.
     """
     if rng.random() < 0.5:
         return np.cos(sample_angle(cumulative_angle, rng) * rng.random())
@@ -89,13 +90,13 @@ def sample_guide(cumulative_angle, rng):
 
 @njit(cache=True, nogil=True)
 def guide_density(density_per_sr, beyond, angle_integral, cosine):
-    """Returns the density [1/sr] of `sample_guide` at the cosine of the angle from the lamp.
+    """Returns the density [1/sr] of the directions of `sample_guide` at the cosine of the angle from the lamp or sun.
 
     Args:
         density_per_sr: (n,) phase function table [1/sr].
         beyond: (n + 1,) integral of the phase function over the angle, from each cell boundary to pi [rad/sr].
         angle_integral: integral of phase function times angle from 0 to pi [rad^2/sr].
-        cosine: cosine of the angle from the lamp.
+        cosine: cosine of the angle from the lamp or the sun.
     """
     g, cells = GUIDE_G, density_per_sr.shape[0]
     x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 1e-18)))

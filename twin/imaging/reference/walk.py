@@ -2,22 +2,26 @@
 
 The radiance of a pixel is the integral over all paths from lamps and sun that end on the ray of the pixel (Veach 1997,
 the path integral; Mobley 1994 for the quantities). A walk starts in one of two ways: at the floor point that the pixel
-shows, with the share exp(-c r) that arrives unscattered, or at a first scattering between camera and floor, sampled
-from the truncated exponential distribution. Each vertex of the walk is connected to each lamp in two ways:
+shows, at the range r, with the share exp(-c r) that arrives unscattered, or at a first scattering between camera and
+floor, sampled from the truncated exponential distribution. Here c = a + b is the attenuation, the sum of absorption and
+scattering. Each vertex of the walk is connected in two ways to each lamp, of intensity I towards the vertex and at the
+distance d from it:
 
-* directly: rho/pi cos I/d^2 exp(-c d) at the floor, or p I/d^2 exp(-c d) in the water;
+* directly: rho/pi cos I/d^2 exp(-c d) at a floor of albedo rho, with cos the cosine of the angle of incidence, or
+  p I/d^2 exp(-c d) in the water, with p the phase function;
 * by one more scattering between vertex and lamp. With the scattering angle t = alpha + beta, where alpha and beta are
-  the angles of the triangle at vertex and lamp, and D the distance between vertex and lamp, the volume element divided
-  by both squared distances is (1/D) d(alpha) d(t) d(azimuth). If t is sampled in proportion to p(t) t, and alpha
-  uniformly between 0 and t, the weight has neither the peak of p nor the poles 1/d^2 (compare Georgiev et al. 2013).
+  the angles at vertex and lamp of the triangle vertex, scattering, lamp, the volume element divided by the squares of
+  the distances from the scattering to vertex and lamp is (1/d) d(alpha) d(t) d(azimuth). If t is sampled in proportion
+  to p(t) t, and alpha uniformly between 0 and t, the weight has neither the peak of p nor the poles of these inverse
+  squares (compare Georgiev et al. 2013).
 
-Light of a lamp whose first scattering is at a point of the water is sampled both by these connections and by the walk;
-`share_of_walk` weights the two. Vertices are connected directly to the sun, and the sky is sampled by walks that leave
-the water; a sun with a disc is sampled in both ways.
+Light of a lamp whose first scattering is at a point of the water is sampled both by the second kind of connection and
+by the walk; `share_of_walk` weights the two. Vertices are connected directly to the sun, and the sky is sampled by
+walks that leave the water; at vertices in the water, a sun with a disc is sampled in both ways.
 
 The direction to the next vertex is sampled from a mixture: the phase function (or Lambert's cosine at the floor), lobes
-around the lamps and the sun, and, for downward walks in daylight, the upper hemisphere. Absorption reduces the weight
-of a walk. Russian roulette ends walks of small weight; no contribution is clipped.
+around the lamps and the sun, and, for downward walks in water with daylight, the upper hemisphere. Absorption reduces
+the weight of a walk. Russian roulette ends walks of small weight; no contribution is clipped.
 """
 
 from __future__ import annotations
@@ -36,18 +40,18 @@ from twin.imaging.reference.sampling import (
     turn_by_cosine,
 )
 
-#: Sums that a walk adds to, before the bins of the blurred light.
+#: Indices of the sums to which `walk` adds light; the bins of the blurred light start at FIRST_BIN.
 DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE, FIRST_BIN = 0, 1, 2, 3, 4
 GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that are sampled around lamps and sun
 UPWARDS = 0.1  # share of the directions that are sampled upwards, for downward walks in water with daylight
 #: Kinds of vertices. As an argument, an `int` constant would make numba compile each function once for each value.
 ON_FLOOR, IN_WATER = np.int64(0), np.int64(1)
-WEAK, STEPS = 0.002, 10000  # weight relative to the first below which roulette starts; largest number of vertices
+WEAK, STEPS = 0.002, 10000  # share of the first weight below which Russian roulette starts; most vertices of a walk
 
 
 @njit(cache=True, nogil=True)
 def beam_at(beam, cosine):
-    """Returns the relative intensity of a lamp at the cosine of the angle from its beam axis.
+    """Returns the relative intensity of a lamp at the cosine of the angle from its beam axis; 0 beyond 90 deg.
 
     `beam` has the values at equal steps of the angle from 0 to 90 deg.
     """
@@ -63,7 +67,8 @@ def response(scene, kind, normal, direction, ox, oy, oz):
     """Returns the share of the light from a direction that a vertex sends back along the path, per solid angle [1/sr].
 
     Args:
-        kind: ON_FLOOR (albedo / pi times the cosine) or IN_WATER (phase function).
+        scene: `pixel_light.KernelScene`.
+        kind: ON_FLOOR (albedo / pi times the cosine of the angle of incidence) or IN_WATER (phase function).
         normal: unit normal of the floor; not used in water.
         direction: unit direction in which the backward path arrived.
         ox, oy, oz: unit direction from the vertex towards the light.
@@ -83,9 +88,11 @@ def towards(lamp, point):
 
 @njit(cache=True, nogil=True)
 def straight(scene, kind, point, normal, direction, before, density, step_m):
-    """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex.
+    """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
 
     Args:
+        scene, kind, normal, direction: see `response`.
+        point: the vertex.
         before: the previous vertex of the walk.
         density: density with which the direction from `before` to this vertex was sampled [1/sr]; if it is above 0, the
             light of each lamp is weighted by `share_of_walk`.
@@ -113,8 +120,8 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
 def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
     """Returns an estimate of the light of lamps that reaches a vertex after one scattering, times its `response`.
 
-    The estimate is weighted by 1 - `share_of_walk`; `guided` is the share of directions that are sampled around lamps
-    and sun.
+    The estimate [cd/m2] is weighted by 1 - `share_of_walk`. The arguments are those of `straight` and
+    `direction_density`, and the random stream `rng`.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -152,9 +159,10 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
 
 @njit(cache=True, nogil=True)
 def sunlight(scene, kind, point, normal, direction, guided, rng):
-    """Returns the unscattered sunlight at a vertex, times the `response` of the vertex.
+    """Returns the unscattered sunlight at a vertex, times the `response` of the vertex [cd/m2].
 
-    In water, a sun with a disc is sampled at a random point of the disc, weighted by 1 - `share_of_escape`.
+    For a vertex in water, a sun with a disc is sampled at a random point of the disc, and its light is weighted by
+    1 - `share_of_escape`. At the floor, all light comes from the centre of the disc.
     """
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     if scene.sun_lx <= 0 or point[2] >= scene.surface_m:
@@ -192,14 +200,14 @@ def share_of_escape(scene, density, path_m):
 
 @njit(cache=True, nogil=True)
 def light_above(scene, from_water, density, path_m, x, y, z):
-    """Returns the radiance just below the surface from a direction: sky, and the sun's disc for walks in water [cd/m2].
+    """Returns the radiance just below the surface from a direction: that of the sky and of the sun's disc [cd/m2].
 
-    The radiance of the disc is weighted by `share_of_escape`.
+    The disc is included only for a last vertex in the water; its radiance is weighted by `share_of_escape`.
 
     Args:
         from_water: whether the last vertex of the walk is a scattering in the water.
-        density: density with which the direction was sampled at this vertex [1/sr].
-        path_m: distance from the vertex to the surface.
+        density: density with which the direction was sampled at the last vertex [1/sr].
+        path_m: distance from the last vertex to the surface.
         x, y, z: unit direction towards the light, in world axes.
     """
     last = scene.sky.shape[0] - 1
@@ -226,7 +234,7 @@ def axis_of(scene, k, point):
 
 @njit(cache=True, nogil=True, inline="always")
 def upward_share(scene, kind, direction, guided):
-    """Returns the share of upward samples among the directions that are not sampled around a lamp or the sun."""
+    """Returns the share of directions sampled upwards, among those that are not sampled around a lamp or the sun."""
     sunny = scene.sun_lx > 0 or scene.sky.shape[0] > 1
     return UPWARDS if sunny and kind == IN_WATER and guided > 0 and direction[2] < 0 else 0.0
 
@@ -257,8 +265,8 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
         kind: ON_FLOOR or IN_WATER.
         direction: unit direction in which the backward path arrived at the vertex.
         guided: share of the directions that are sampled around lamps and sun.
-        own: response of the vertex to the direction (x, y, z); divided by the albedo of a floor, it is the density of
-            directions sampled by reflection or scattering.
+        own: response of the vertex to the direction (x, y, z). It is the density of the directions sampled from the
+            phase function; divided by the albedo, that of the directions sampled from Lambert's cosine.
     """
     own = own / scene.albedo if kind == ON_FLOOR else own
     upwards = upward_share(scene, kind, direction, guided)
@@ -280,10 +288,11 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
     """Returns the weight of the walk's estimate of the light that leaves a lamp and is first scattered at a point.
 
     The walk and `by_one_scattering` sample the same point with the densities per volume w and s; their estimates
-    are weighted by w / (w + s) and s / (w + s) (the balance heuristic of Veach 1997, section 9.2.2).
+    are weighted by w / (w + s) and s / (w + s) (the balance heuristic of Veach 1997, section 9.2.2). The common factor
+    1 / step_m^2 of both densities is left out.
 
     Args:
-        lamp_m: distance of the lamp from the previous vertex, which the light reaches after the point.
+        lamp_m: distance of the lamp from the previous vertex of the walk, where light scattered at the point arrives.
         phase: value of the phase function for the scattering at the point [1/sr].
         to_lamp_m: distance of the lamp from the point.
         density: density with which the walk samples the direction from the previous vertex to the point [1/sr].
@@ -296,7 +305,7 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
 
 @njit(cache=True, nogil=True)
 def bin_of(view, bin_edges_px, x, y, z):
-    """Returns the bin of the distance between a pixel and the unscattered image of a point.
+    """Returns the bin of the distance in the image between a pixel and the projection of a point.
 
     The last bin has no upper limit and also holds points behind the camera.
 
@@ -402,7 +411,8 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
     """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2] by component and bin, ordered as `sums` of `walk`.
 
     It is the mean over `n_walks` pairs of walks: one that starts at the floor and one that starts in the water. The
-    arguments are those of `walk`.
+    unscattered light of lamps and sun on the floor point of the pixel is computed without walks. The other arguments
+    are those of `walk`.
     """
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
     centre = (view[3, 0], view[3, 1], view[3, 2])
@@ -445,8 +455,8 @@ def trace_plane(scene, point, normal, n_walks, rng):
 
     Args:
         scene: `pixel_light.KernelScene`.
-        point: a point of the plane.
-        normal: unit normal of the plane.
+        point: a point of the plane [m].
+        normal: unit normal of the plane; light that arrives from the side of the normal counts.
         n_walks: number of walks.
         rng: random stream.
     """
