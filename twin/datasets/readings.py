@@ -61,6 +61,8 @@ class RecordedReadings(NamedTuple):
         height: heights of the left camera above a horizontal plane, whose level may be unknown [m].
         attitude: roll, pitch and yaw of the body in a world whose z axis points up [rad].
         velocity: velocities of the origin of the body over ground, in body axes [m/s].
+        vertical: unit vectors that point upwards, in body axes, with one standard deviation [rad]
+            (`inertial.vertical_series`); None if there is an attitude.
         notes: sentences on readings that are not used.
     """
 
@@ -68,6 +70,7 @@ class RecordedReadings(NamedTuple):
     height: SensorSeries | None = None
     attitude: SensorSeries | None = None
     velocity: SensorSeries | None = None
+    vertical: SensorSeries | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -153,14 +156,14 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
         sigmas = _sigmas(root / quantity.folder / "sensor.yaml", quantity.n) if file.exists() else None
         if file.exists() and sigmas is None:
             notes.append(f"The readings in {quantity.folder} are not used: sensor.yaml states no `sigma`.")
-        found.append(None if sigmas is None else _read_csv(file, quantity, sigmas, notes))
+        found.append(None if sigmas is None else read_csv(file, quantity, sigmas, notes))
     height, attitude, velocity = found
     if not notes and height is attitude is velocity is None:
         return None
-    return RecordedReadings(body_from_left, height, attitude, velocity, tuple(notes))
+    return RecordedReadings(body_from_left, height, attitude, velocity, notes=tuple(notes))
 
 
-def _read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
+def read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
     """Returns the finite readings in a file data.csv; None without any. Sentences on the others go to `notes`.
 
     Raises:

@@ -132,6 +132,8 @@ class OpenedDataset(NamedTuple):
         """Returns a phrase that states how the plane of the map was chosen."""
         if self.aiding is not None and "attitude" in self.aiding.used:
             return "plane of the map horizontal by the recorded attitude"
+        if self.aiding is not None and "vertical" in self.aiding.used:
+            return "plane of the map horizontal by the recorded specific forces"
         return f"plane of the map {'fitted to the floor' if self.plane.fitted else 'perpendicular to the first view'}"
 
 

@@ -153,6 +153,7 @@ class Navigator:
         aiding = readings_as_arrays(frame.readings)
         state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
+        self.filter.fuse_vertical(frame.readings)
         if self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose

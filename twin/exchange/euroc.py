@@ -172,6 +172,8 @@ def _write_imu(folder: Path, imu: RecordedImu) -> None:
         for time_s, row in zip(imu.readings.times_s, values.tolist(), strict=True):
             lines.write(",".join([str(timestamp_ns(time_s)), *map(repr, row)]) + "\n")
     tree = {"sensor_type": "imu", "T_BS": _matrix(np.eye(4)), "rate_hz": float(imu.rate_hz), **imu.noise._asdict()}
+    if imu.accelerometer_bias_mps2 is not None:
+        tree["accelerometer_bias_sigma"] = float(imu.accelerometer_bias_mps2)
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
     (folder / "sensor.yaml").write_text(text, encoding="utf-8")
 

@@ -63,11 +63,13 @@ class RecordedImu(NamedTuple):
         readings: all readings of the run, in body axes.
         rate_hz: number of readings per second.
         noise: noise that the scenario states.
+        accelerometer_bias_mps2: standard deviation of the bias of each specific force; None if not stated.
     """
 
     readings: ImuReadings
     rate_hz: float
     noise: ImuNoise
+    accelerometer_bias_mps2: float | None = None
 
 
 class CameraIntrinsics(NamedTuple):
