@@ -51,7 +51,7 @@ def test_exact_readings_of_a_vehicle_without_acceleration_give_the_vertical():
 
 
 def test_the_bias_of_the_gyroscope_is_estimated():
-    """A bias of 3 degrees per second and axis, 2.6 of its standard deviations, would turn the vertical by 90 degrees."""
+    """A bias of 3 degrees per second and axis, 2.6 standard deviations, would turn the vertical by 90 degrees."""
     readings, up = simulated(1, acceleration_mps2=0.0, bias_radps=0.0, noise=InertialNoise(0, 0, 0))
     found, _ = verticals(readings._replace(rates_radps=readings.rates_radps + np.deg2rad([3, -3, 3])), NOISE)
     assert np.rad2deg(errors(found, up)).max() < 1.0

@@ -15,7 +15,7 @@ from twin.core.geometry import Array
 from twin.core.pressure import PASCAL_PER_METRE
 from twin.datasets.bag import Bag
 from twin.datasets.bag_calibration import Transforms, relative_pose
-from twin.datasets.inertial import INERTIAL, USUAL_BIAS_MPS2, InertialSensor, vertical_series
+from twin.datasets.inertial import INERTIAL, USUAL_BIAS_MPS2, InertialErrorModel, vertical_series
 from twin.datasets.readings import (
     ATTITUDE,
     HEIGHT,
@@ -36,6 +36,7 @@ _TYPES = {
 }
 _Converter = Callable[[Any, str], tuple[Array, Array]]  # of a message and its place to values and variances
 _IMU = "sensor_msgs/msg/Imu"
+_NO_ORIENTATION = "states an orientation."  # end of the note on topics without attitude
 _USUAL_WALK = 1e-4  # random walk of the bias of a gyroscope, which messages do not state [rad/s2/sqrt(Hz)]
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
 _N_FIRST = 100  # number of messages of a topic in which an orientation is looked for
@@ -73,6 +74,8 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     notes: list[str] = []
     height, attitude, velocity = (_topic(bag, kind, quantity, notes) for kind, quantity in _TYPES.items())
     inertial = None if attitude is not None else _inertial(bag, notes)
+    if inertial is not None:
+        notes = [note for note in notes if not note.endswith(_NO_ORIENTATION)]
     if height is velocity is attitude is inertial is None and not notes:
         return None
     body = attitude or velocity or inertial
@@ -122,7 +125,7 @@ def _vertical(inertial: _Recorded, body_from_sensor: Array | None, notes: list[s
     times_s, _, sigmas = inertial.series
     root_s = float(np.sqrt(np.median(np.diff(times_s)))) if len(times_s) > 1 else 0.0  # a density is sigma / sqrt(rate)
     noise = InertialNoise(float(sigmas[:3].max()) * root_s, _USUAL_WALK, float(sigmas[3:].max()) * root_s)
-    sensor = InertialSensor(inertial.topic, noise, USUAL_BIAS_MPS2, body_from_sensor[:3, :3])
+    sensor = InertialErrorModel(inertial.topic, noise, USUAL_BIAS_MPS2, body_from_sensor[:3, :3])
     return vertical_series(inertial.series, sensor, notes)
 
 
@@ -194,7 +197,7 @@ def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str
     stated = [name for name in topics if any(_states_orientation(message) for message in first[name])]
     known = [name for name in stated if any(np.any(message.orientation_covariance) for message in first[name])]
     if topics and not any(message.orientation_covariance[0] >= 0 for name in topics for message in first[name]):
-        notes.append(f"The attitude is not used: no message of {_listed(topics)} states an orientation.")
+        notes.append(f"The attitude is not used: no message of {_listed(topics)} {_NO_ORIENTATION}")
         return []
     return known or stated or topics
 

@@ -25,7 +25,7 @@ _BIAS = "accelerometer_bias_sigma"
 _DENSITIES = ("gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density")
 
 
-class InertialSensor(NamedTuple):
+class InertialErrorModel(NamedTuple):
     """Error model of a recorded IMU.
 
     Args:
@@ -41,7 +41,7 @@ class InertialSensor(NamedTuple):
     body_from_sensor: Array
 
 
-def vertical_series(readings: SensorSeries, sensor: InertialSensor, notes: list[str]) -> SensorSeries | None:
+def vertical_series(readings: SensorSeries, sensor: InertialErrorModel, notes: list[str]) -> SensorSeries | None:
     """Returns the direction of the vertical in body axes (unit vectors that point upwards) and its standard deviation.
 
     The standard deviation [rad] is that about each perpendicular axis: the RMS of that of `verticals` and, on top of
@@ -95,7 +95,7 @@ def read_vertical(root: Path, notes: list[str]) -> SensorSeries | None:
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3):
         raise TwinError(f"{description}: T_BS", "is not a rigid motion", "a rotation matrix and a translation [m]")
     readings = read_csv(file, INERTIAL, np.ones(INERTIAL.n), notes)
-    sensor = InertialSensor(INERTIAL.folder, InertialNoise(rate, walk, force), bias, axes)
+    sensor = InertialErrorModel(INERTIAL.folder, InertialNoise(rate, walk, force), bias, axes)
     return None if readings is None else vertical_series(readings, sensor, notes)
 
 
