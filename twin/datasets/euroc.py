@@ -19,6 +19,7 @@ from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
 _TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0")  # folders with true poses
+_TRUE_MAP = "dem_truth.tif"  # file of true heights in such a folder, as `twin export` writes it
 _POSITIONS = "leica0"  # folder with true positions of a prism, without attitude
 
 
@@ -54,7 +55,11 @@ class EurocReader:
             notes = (f"The true positions ({_POSITIONS}) are not used: they have no attitude.",)
         times_s = np.array([image.time_s for image in left])
         readings = None if body_from_left is None else value_or_error(lambda: _readings(root, body_from_left))
-        return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left, readings)
+        heights = None if file is None else file.with_name(_TRUE_MAP)
+        return Dataset(
+            folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left, readings,
+            heights if heights is not None and heights.is_file() else None,
+        )  # fmt: skip
 
 
 def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:

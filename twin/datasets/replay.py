@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
@@ -26,7 +27,7 @@ from twin.datasets.dataset import Dataset
 from twin.datasets.frames import RecordedFrames
 from twin.datasets.image_files import BAYER, Bayer
 from twin.datasets.readers import read_dataset
-from twin.datasets.truth_files import read_truth
+from twin.datasets.truth_files import read_true_map, read_truth
 from twin.errors import SurveyAborted, TwinError
 from twin.estimate import Navigator
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
@@ -35,6 +36,7 @@ from twin.estimate.self_check import check_survey
 from twin.estimate.stereo_vision import StereoVision
 from twin.judge import recorded
 from twin.judge.recorded import AlignmentName, ReplayEvaluation, associate, evaluate_replay, unevaluated_replay
+from twin.judge.true_map import TrueMap, true_heights
 from twin.plugin.guard import check_loadable
 from twin.plugin.loading import ESTIMATORS
 from twin.plugin.navigator import NOTE, PluginNavigator
@@ -71,7 +73,8 @@ class ReplayOptions:
         topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
         estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
             whose poses the map is built; None: the estimators of `twin.estimate`.
-        aiding: whether recorded readings of pressure, attitude and DVL are used.
+        aiding: whether recorded readings of pressure, attitude, DVL and IMU are used.
+        true_map: GeoTIFF of the true heights [m] in the frame of the true poses; None: that of the data set.
     """
 
     calibration: Path | None = None
@@ -84,6 +87,7 @@ class ReplayOptions:
     topics: tuple[str, str] | None = None
     estimator: str | None = None
     aiding: bool = True
+    true_map: Path | None = None
 
 
 class ReplayResult(NamedTuple):
@@ -116,6 +120,7 @@ class OpenedDataset(NamedTuple):
         pair: the first stereo pair.
         plane: plane of the floor in the axes of the left camera at the first pair.
         aiding: readings of the navigation sensors; None if none were recorded or they are not wanted.
+        true_map: true heights in the frame of `truth`; None if they are not known.
     """
 
     name: str
@@ -126,6 +131,7 @@ class OpenedDataset(NamedTuple):
     pair: PairInspection
     plane: FloorPlane
     aiding: Aiding | None
+    true_map: TrueMap | None = None
 
     @property
     def plane_text(self) -> str:
@@ -178,12 +184,15 @@ def replay(
                 "map", lambda: navigator.build_map(result, None, lambda share: progress("map", share))
             )
         progress("report", 0.0)
+        heights = guard.attempt("evaluation", lambda: _true_heights(opened, chosen, result, elevation))
         evaluation = _evaluation(opened, chosen, result, elevation, guard)
-        evaluation = replace(evaluation, timing=_timing(start_s, result, stopwatch))
+        timing = _timing(start_s, result, stopwatch)
+        evaluation = replace(evaluation, timing=timing, true_heights_m=heights)
         metrics = guard.attempt("evaluation", lambda: evaluate_replay(evaluation)) or unevaluated_replay(evaluation)
         record = SurveyRecord(
-            result, elevation, None, None, stopwatch, metrics, recorded_truth=_truth_of_frames(opened, chosen, result)
-        )
+            result, elevation, None, None, stopwatch, metrics,
+            recorded_truth=_truth_of_frames(opened, chosen, result), recorded_heights_m=heights,
+        )  # fmt: skip
         metrics = written.finish(record, guard)
     return ReplayResult(metrics["status"], metrics, out, result, elevation)
 
@@ -304,7 +313,22 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
         problem = f"only {len(pair.points.xyz)} points of the first pair are matched"
         raise TwinError(str(folder), problem, "a rectified pair that fits the calibration; see `--preview`")
     aiding = _aiding(dataset, frames) if options.aiding else None
-    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane, aiding)
+    true_map = _true_map(dataset, truth, options)
+    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane, aiding, true_map)
+
+
+def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:
+    """Returns the true heights: those of the option, or those of the data set if the true poses are its own, too.
+
+    Raises:
+        TwinError: the file is not a height grid, or there are no true poses, in whose frame the heights are.
+    """
+    if options.true_map is None:
+        own = dataset.true_map if options.truth is None and truth is not None else None
+        return None if own is None else read_true_map(own)
+    if truth is None:
+        raise TwinError("--true-map", "the data set has no true poses, in whose frame the heights are", "--truth")
+    return read_true_map(options.true_map)
 
 
 def _aiding(dataset: Dataset, frames: RecordedFrames) -> Aiding | None:
@@ -397,12 +421,22 @@ def _evaluation(
         result,
         opened.truth,
         options.alignment,
-        None if elevation is None else elevation.grid.cell_m,
+        elevation,
         {},
         identity,
         source,
         _notes(opened, options, result),
     )
+
+
+def _true_heights(
+    opened: OpenedDataset, options: ReplayOptions, result: SurveyResult, elevation: ElevationMap | None
+) -> NDArray[np.float32] | None:
+    """Returns the true heights at the cells of the map, moved to it by the alignment; None if they are not known."""
+    if opened.true_map is None or opened.truth is None or elevation is None:
+        return None
+    moved = recorded.world_alignment(result.final, opened.truth, options.alignment)
+    return true_heights(elevation, opened.true_map, moved)
 
 
 def _unused(frames: RecordedFrames) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
 )
+_TRUTH = "state_groundtruth_estimate0"  # folder of the truth
 _FIRST_NS = 1_000_000_000  # time of a frame at 0 s: EuRoC has no times of zero
 
 
@@ -73,7 +75,7 @@ class EurocWriter:
 
     def add_truth(self, truth: Trajectory) -> None:
         """Writes a true trajectory of the left camera as poses of the body."""
-        folder = self.root / "state_groundtruth_estimate0"
+        folder = self.root / _TRUTH
         folder.mkdir(exist_ok=True)
         world_from_body = truth.world_from_camera @ geometry.inverse(self.rig.body_from_camera)
         lines = ["#timestamp [ns],x [m],y [m],z [m],qw [],qx [],qy [],qz []"]
@@ -105,7 +107,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     Returns the path of mav0, as a list of one.
 
     The readings are those of the pressure sensor, AHRS, DVL, USBL and IMU that were recorded. The truth consists of the
-    poses of the body at all frames of the survey, including those without a recorded image.
+    poses of the body at all frames of the survey, including those without a recorded image, and of the true heights
+    (dem_truth.tif), if the run has them.
     """
     writer = EurocWriter(folder, contents.rig, contents.jpeg_quality)
     for k, frame in enumerate(contents.frames):
@@ -113,6 +116,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         contents.progress((k + 1) / len(contents.frames))
     if "truth" in contents.trajectories:
         writer.add_truth(contents.trajectories["truth"])
+        if contents.true_map is not None:
+            shutil.copyfile(contents.true_map, writer.root / _TRUTH / "dem_truth.tif")
     _write_readings(writer.root, contents)
     if contents.imu is not None:
         _write_imu(writer.root / "imu0", contents.imu)

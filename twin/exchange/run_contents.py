@@ -190,6 +190,7 @@ class RunContents:
             coordinates.
         true_layers: renders the world again and returns its true layers; None without a simulated world.
         imu: readings of the IMU; None if none were recorded.
+        true_map: file of the true heights (dem_truth.tif); None without one.
         jpeg_quality: quality of the exported images as JPEG, 1 to 100; None: copies of the PNG files.
         progress: called with the completed fraction of the format that is being written, 0 to 1.
         notes: sentences on files of the run that are missing.
@@ -210,6 +211,7 @@ class RunContents:
     georeference: Georeference | None = None
     true_layers: Callable[[], TrueLayers] | None = None
     imu: RecordedImu | None = None
+    true_map: Path | None = None
     jpeg_quality: int | None = None
     progress: Callable[[float], None] = field(default=lambda _: None)
     notes: tuple[str, ...] = ()
