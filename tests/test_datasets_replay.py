@@ -185,10 +185,8 @@ def test_with_true_heights_the_map_has_the_errors_that_the_floor_gives(euroc, re
     points = geometry.transform(true_from_map, np.column_stack([x[known], y[known], elevation.height_m[known]]))
     vertical_m = points[:, 2] - recorded.hills().height_at(points[:, 0], points[:, 1])
     # along the axis of the map, tilted by t = 1 to 3 degrees: up to t times slope, 5 %, different
-    assert (
-        errors["le90_m"] == pytest.approx(np.percentile(np.abs(vertical_m), 90), rel=0.05)
+    assert errors["le90_m"] == pytest.approx(np.percentile(np.abs(vertical_m), 90), rel=0.05)
     assert errors["le90_m"] < 0.012
-    )
     assert offset["bias_m"] - errors["bias_m"] == pytest.approx(0.1, abs=0.001)
     assert errors["completeness"] is None and errors["sigma_ratio"] > 0
     run = load_run(tmp_path / "run")
