@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -183,11 +183,14 @@ def replay(
             elevation = guard.attempt(
                 "map", lambda: navigator.build_map(result, None, lambda share: progress("map", share))
             )
+            n_tiles = guard.attempt("tiles", lambda: _write_tiles(navigator, result, written, guard)) or 0
         progress("report", 0.0)
         heights = guard.attempt("evaluation", lambda: _true_heights(opened, chosen, result, elevation))
         evaluation = _evaluation(opened, chosen, result, elevation, guard)
         timing = _timing(start_s, result, stopwatch)
         evaluation = replace(evaluation, timing=timing, true_heights_m=heights)
+        if n_tiles:
+            evaluation = replace(evaluation, source=evaluation.source | {"tiles": n_tiles})
         metrics = guard.attempt("evaluation", lambda: evaluate_replay(evaluation)) or unevaluated_replay(evaluation)
         record = SurveyRecord(
             result, elevation, None, None, stopwatch, metrics,
@@ -427,6 +430,23 @@ def _evaluation(
         source,
         _notes(opened, options, result),
     )
+
+
+def _write_tiles(navigator: Navigator, result: SurveyResult, written: RunFolder, guard: StageGuard) -> int:
+    """Writes the tiles of a map whose cells were enlarged, in the folder `tiles`, and returns their number.
+
+    An error of a file ends the writing; the guard records it. The tiles that are finished by then remain.
+    """
+    folder = written.tiled_map()
+    try:
+        for tile, elevation in navigator.build_tiles(result):
+            folder.add(tile.row, tile.col, elevation)
+    except OSError as error:
+        guard.cause = guard.cause or str(error)
+    finally:
+        with suppress(OSError):
+            folder.finish()
+    return folder.n_tiles
 
 
 def _true_heights(

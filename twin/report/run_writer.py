@@ -29,6 +29,7 @@ from twin.scenario.model import Scenario
 
 if TYPE_CHECKING:
     from twin.exchange.geotiff import OrthomosaicFile
+    from twin.exchange.tiled_map import TiledMapFolder
 
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 OPTIONAL_OUTPUTS = ("report", "recording")
@@ -199,6 +200,12 @@ class RunFolder:
         from twin.exchange.geotiff import OrthomosaicFile
 
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
+
+    def tiled_map(self) -> TiledMapFolder:
+        """Returns the writer of a map in tiles, in the folder `tiles`."""
+        from twin.exchange.tiled_map import TiledMapFolder
+
+        return TiledMapFolder(self.path / "tiles")
 
     def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None], kept: Collection[str] = ()) -> None:
         """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete.
