@@ -12,7 +12,7 @@ from recorded_datasets import RIG
 
 import twin
 from twin.core import geometry
-from twin.core.records import ImuReadings, Readings
+from twin.core.records import ImuReadings, Readings, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.datasets.aiding import Aiding, Opening
 from twin.datasets.bag_reader import BagReader
@@ -180,6 +180,15 @@ def test_an_imu_without_orientation_makes_the_world_level(tmp_path, writer):
     # the smoothed vertical has 0.8 degrees over these 1.4 s; the bias is believed to be 0.12 (bag: 1.2) degrees
     np.testing.assert_allclose(sigma, sigma[0], rtol=0.05)
     assert np.deg2rad(0.4) < sigma[0] < np.deg2rad(1.6)
+
+
+def test_the_residual_of_verticals_is_in_standard_deviations():
+    """Tilts of one standard deviation about both horizontal axes: 1."""
+    sigma, tilt = 0.01, geometry.so3_exp(np.array([0.01, 0.01, 0.0]))
+    up = SensorSeries(np.array([5.0, 5.1]), np.tile(tilt[2], (2, 1)), np.array([sigma]))
+    aiding = Aiding(RecordedReadings(np.eye(4), vertical=up), np.eye(4), 5.0, 10.0)
+    level = Trajectory(np.array([0.0, 0.1]), np.tile(np.eye(4), (2, 1, 1)))
+    assert aiding.residuals(level)["vertical"] == pytest.approx(1.0, rel=1e-3)
 
 
 def test_an_attitude_precedes_an_imu_and_heights_need_either(tmp_path):

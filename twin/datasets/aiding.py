@@ -177,7 +177,7 @@ class Aiding:
         if not found.verticals:
             return None
         up = over_plane @ np.mean(found.verticals, axis=0)
-        across = np.cross(up, [0.0, 0.0, 1.0])
+        across = geometry.skew(up) @ np.array([0.0, 0.0, 1.0])
         sine = float(np.linalg.norm(across))
         axis = across / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
         return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane
@@ -260,8 +260,8 @@ class Aiding:
                 turned = geometry.rotation_from_rpy(*found.ahrs_rpy_rad).T @ pose[:3, :3] @ camera_from_body
                 parts["attitude"].append(geometry.so3_log(turned) / self.noise.attitude_sigmas_rad)
             if found.up is not None:
-                across = np.cross(camera_from_body @ found.up, pose[2, :3])
-                parts["vertical"].append(across / 2**0.5 / self.noise.up_rad)  # of two components
+                across = geometry.skew(camera_from_body @ found.up) @ pose[2, :3]
+                parts["vertical"].append(across * 1.5**0.5 / self.noise.up_rad)  # two of its three components vary
         return {name: float(np.sqrt(np.mean(np.square(rows)))) for name, rows in parts.items() if rows}
 
 

@@ -105,9 +105,10 @@ class PoseFilter:
 
 def perpendicular_axes(direction: Array) -> Array:
     """Returns two unit vectors (2, 3) that are perpendicular to a unit vector (3,) and to each other."""
-    first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
+    turned = geometry.skew(direction)
+    first = turned @ np.eye(3)[int(np.argmin(np.abs(direction)))]
     first = first / np.linalg.norm(first)
-    return np.stack([first, np.cross(direction, first)])
+    return np.stack([first, turned @ first])
 
 
 def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
