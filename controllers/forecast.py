@@ -132,7 +132,7 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
 
 
 def _without_gaps(path: Array, max_step_m: float) -> Array:
-    """Returns a path of points (u, v) [m], (n, 2), with points added so that v changes by at most `max_step_m`."""
+    """Returns a path (n, 2) of points (u, v) [m] with points added so that no step changes v by over `max_step_m`."""
     n_steps = np.maximum(1, np.ceil(np.abs(np.diff(path[:, 1])) / max_step_m)).astype(int)
     if (n_steps == 1).all():
         return path

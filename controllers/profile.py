@@ -23,16 +23,16 @@ class SpeedProfile:
 
     @cached_property
     def peak_mps(self) -> float:
-        """Returns the greatest speed on the segment."""
+        """Returns the greatest speed on the segment [m/s]."""
         return min(self.cruise_mps, math.sqrt(self.length_m * self.acceleration_mps2))
 
     @cached_property
     def duration_s(self) -> float:
-        """Returns the time from start to end."""
+        """Returns the time from start to end [s]."""
         return self.length_m / self.peak_mps + self.peak_mps / self.acceleration_mps2
 
     def at(self, time_s: float) -> tuple[float, float, float]:
-        """Returns distance [m], speed [m/s] and acceleration [m/s2] at a time since the start.
+        """Returns distance [m], speed [m/s] and acceleration [m/s2] at a time since the start [s].
 
         The speed is 0 before the start and after the end.
         """

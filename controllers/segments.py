@@ -133,7 +133,7 @@ Segment = Line | Circle | Turn
 
 
 def _along(profile: SpeedProfile, times_s: Array) -> Array:
-    """Returns distance, speed and acceleration along a profile at times (n,): (3, n, 1) [m, m/s, m/s2]."""
+    """Returns distance, speed and acceleration (3, n, 1) along a profile at times (n,) [m or rad, and s]."""
     return np.array([profile.at(t) for t in times_s.tolist()]).reshape(-1, 3).T[:, :, None]
 
 

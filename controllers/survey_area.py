@@ -28,8 +28,8 @@ class SurveyArea:
     """Area that a survey has to cover, in the scene.
 
     Args:
-        shape: rectangle, disc (of diameter `size_m`) or polygon.
-        size_m: extent along and across the legs.
+        shape: rectangle, disc or polygon.
+        size_m: extent along and across the legs; for a disc, the first value is its diameter.
         centre_m: x, y of the centre of the extent.
         heading: direction of the legs [rad, counter-clockwise from east].
         corners: corners (u, v) of a polygon in the axes of the legs [m]; empty for other shapes.
@@ -62,7 +62,7 @@ class SurveyArea:
         return c * x + s * y, c * y - s * x
 
     def contains(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
-        """Returns which points of the scene lie in the area; the edges of a rectangle and a disc belong to it."""
+        """Returns whether each scene point lies in the area; the edges of a rectangle and a disc belong to it."""
         u, v = self.to_legs(x_m, y_m)
         if self.shape == "polygon":
             return _in_polygon(u, v, self.corners)
@@ -148,7 +148,7 @@ def _clipped(a: Corner, b: Corner, low_m: float, high_m: float) -> list[float]:
 
 
 def _in_polygon(u: Array, v: Array, corners: tuple[Corner, ...]) -> NDArray[np.bool_]:
-    """Returns which points lie in a polygon: a ray from such a point along +u crosses an odd number of edges."""
+    """Returns whether each point lies in a polygon: a ray from it along +u then crosses an odd number of edges."""
     inside = np.zeros(np.broadcast(u, v).shape, np.bool_)
     for (ua, va), (ub, vb) in pairwise([*corners, corners[0]]):
         if va != vb:

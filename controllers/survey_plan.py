@@ -29,7 +29,8 @@ class SurveyRequest(NamedTuple):
 
     Args:
         area_m: extent along and across the legs.
-        altitude_m: height of the left camera above the reference plane z = 0.
+        altitude_m: height of the left camera above the reference plane z = 0 or, with `surface`, above the smoothed
+            floor.
         speed_mps: cruise speed.
         overlap_along: required overlap of consecutive keyframes, as a fraction of the image width (see
             `frames_per_keyframe`).
@@ -76,11 +77,11 @@ class SurveyPlan:
     Args:
         paths: segments of each track; tracks are numbered from 1, and every segment starts and ends at rest.
         area: area to cover; the legs, and the bow on the first leg, point along its heading.
-        altitude_m: height of the camera above the reference plane z = 0.
+        altitude_m: height of the camera above the reference plane z = 0 or, with `surface`, above the smoothed floor.
         speed_mps: cruise speed along the swaths.
         frame_rate_hz: frames per second.
         n_frames_per_keyframe: N, frames from one keyframe to the next.
-        swath_length_m: length of a swath: the mean over the legs, or that of a loop.
+        swath_length_m: length of a swath: the mean over all legs that fill the area, or that of a loop.
         swath_spacing_m: greatest distance between neighbouring swaths.
         n_tracks_to_fill: number of tracks that fill the area, of which the first `n_tracks` are planned.
         footprint_m: width (across the heading) and height (along the heading) of the image on the reference plane.
@@ -113,11 +114,11 @@ class SurveyPlan:
         return self.area.size_m
 
     def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
-        """Returns which points of the scene lie in the asked area, the area that the planned tracks have to cover.
+        """Returns whether each point of the scene lies in the asked area, which the planned tracks have to cover.
 
-        If all tracks are planned, the asked area is the whole area. If only the first tracks are, it is the part up to
-        half a `swath_spacing_m` beyond the last planned leg of a lawnmower, or the points of the disc within half a
-        `swath_spacing_m` of a planned loop.
+        If the planned tracks fill the area, the asked area is the whole area. Otherwise it is the part of the area up
+        to half of `swath_spacing_m` beyond the last planned leg of a lawnmower, or within half of `swath_spacing_m`
+        of a planned loop.
 
         Args:
             x_m, y_m: coordinates of the points, arrays of any shape that broadcast.
@@ -155,7 +156,7 @@ class SurveyPlan:
         return np.concatenate([self.waypoints(track) for track in range(1, self.n_tracks + 1)])
 
     def _near_loop(self, circles: list[Circle], x_m: Array, y_m: Array) -> NDArray[np.bool_]:
-        """Returns which points lie within half of `swath_spacing_m` of a circle."""
+        """Returns whether each point lies within half of `swath_spacing_m` of one of the circles."""
         near = np.zeros(x_m.shape, np.bool_)
         for circle in circles:
             radius_m, (x, y, _) = math.dist(circle.start, circle.centre), circle.centre
@@ -163,7 +164,7 @@ class SurveyPlan:
         return near
 
     def track_length_m(self, track: int) -> float:
-        """Returns the path length of a track [m]."""
+        """Returns the horizontal path length of a track [m]."""
         return sum(segment.length_m for segment in self.paths[track - 1])
 
     def track_duration_s(self, track: int) -> float:
@@ -192,14 +193,14 @@ class SurveyPlan:
         return np.array([isinstance(segment, Turn) for segment in path])[current]
 
     def reference(self, track: int, time_s: float) -> Reference:
-        """Returns the reference of the left camera at a time since the start of a track.
+        """Returns the reference of the left camera at a time since the start of a track [s].
 
         The velocity is 0 before the start and after the end of the track.
         """
         return self.references(track, np.array([time_s])).row(0)
 
     def references(self, track: int, times_s: Array) -> Reference:
-        """Returns the references of the left camera at increasing times (n,) since the start of a track."""
+        """Returns the references of the left camera at increasing times (n,) since the start of a track [s]."""
         *others, last = self.paths[track - 1]
         parts, remaining_s = [], times_s
         for segment in others:

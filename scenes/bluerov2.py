@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 
 def _array(*rows: object) -> Array:
-    """Returns the rows as a read-only array."""
+    """Returns the numbers or rows as a read-only array."""
     values = np.array(rows, dtype=np.float64)
     values.setflags(write=False)
     return values
@@ -45,10 +45,11 @@ class VehicleParameters:
 
     Args:
         mass_kg, displaced_volume_m3: dry mass, and volume of the displaced water.
-        inertia_kgm2: (3,) principal moments of inertia about the centre of gravity, along the body axes.
+        inertia_kgm2: (3,) principal moments of inertia about the body axes, which pass through the centre of gravity.
         centre_of_buoyancy_m: (3,) position of the centre of buoyancy relative to the centre of gravity, in the body.
         added_mass: (6,) diagonal of the added mass matrix M_A [kg, kg m2].
-        linear_damping, quadratic_damping: (6,) diagonals of D_l and D_q in D(nu) = D_l + D_q |nu|.
+        linear_damping, quadratic_damping: (6,) diagonals of D_l and D_q in the damping matrix D(nu) = D_l + D_q |nu|,
+            with nu the body velocity.
         thruster_positions_m, thruster_directions: (8, 3) positions and unit vectors in the body: four horizontal
             thrusters (front right, front left, rear right, rear left), then four vertical ones in the same order.
             Positive thrust pushes the vehicle along the direction.

@@ -127,7 +127,7 @@ def _add_vehicle(spec: MjSpec, vehicle: VehicleParameters) -> MjsBody:
 
 
 def _add_hull(body: MjsBody, vehicle: VehicleParameters) -> None:
-    """Adds two boxes without mass: a blue one (buoyancy foam) above a black one (chassis)."""
+    """Adds two boxes without mass: a blue one (buoyancy foam) and, lower, a black one (chassis)."""
     length, width, height = vehicle.size_m / 2
     common = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
     body.add_geom(name="float", size=[length, width, height / 4], pos=[0, 0, 0.075], rgba=[0.1, 0.35, 0.8, 1], **common)

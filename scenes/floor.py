@@ -51,7 +51,7 @@ def tile_cells(n_rows: int, n_cols: int) -> int:
 
 
 def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
-    """Adds the tile of the given grid rows and columns: texture, material, mesh and geom."""
+    """Adds the tile of the given grid rows and columns (texture, material, mesh and geom), and returns it."""
     name = f"floor_{rows.start}_{cols.start}"
     texture, texcoord = _tile_texture(terrain, rows, cols)
     image = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, nchannel=3)

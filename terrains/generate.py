@@ -97,7 +97,7 @@ def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights
 
 
 def _flat(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Returns zero heights."""
+    """Returns heights (ny, nx) of zero."""
     return np.zeros(shape, np.float32)
 
 

@@ -94,6 +94,9 @@ def _vertical_axis(source: rasterio.DatasetReader, vertical: dict[str, Any] | No
     """Returns the vertical axis that the vertical CRS, the band's unit and the tags describe.
 
     The unit of the band takes precedence over that of the vertical CRS; without either, heights are in metres.
+
+    Raises:
+        TwinError: the unit of the band is unknown.
     """
     tags, file_tags = source.tags(1), source.tags()
     names = [source.descriptions[0] or "", *(tags.get(key, "") for key in _BAND_TAGS)]

@@ -26,8 +26,8 @@ class Cover:
         dark, medium, bright: albedo as 8-bit RGB at the ends and in the middle of the ramp.
         structure: one of GRAINS to SHELLS.
         size_m: distance between the elements of the structure.
-        strength: change along the ramp due to the structure, as a fraction of the ramp.
-        noise: change along the ramp over the full range of the noise of all scales, as a fraction of the ramp.
+        strength: change along the ramp where the value of the structure (`_structure`) is 1, as a fraction of the ramp.
+        noise: change along the ramp as the pink noise increases from 0 to 255, as a fraction of the ramp.
     """
 
     dark: Colour
@@ -80,7 +80,7 @@ def paint(
     Args:
         material: (rows, cols) level that selects the material: its quarters belong to the four materials of the cover,
             with gradual transitions between them.
-        tone: (rows, cols) noise of all scales with mean 128.
+        tone: (rows, cols) pink noise with mean 128, see `noise.pink_noise`.
         texel_m: side of a texel.
         cover: a key of COVERS.
         rng: random generator of the structures.
@@ -93,7 +93,7 @@ def paint(
 
 
 def _ramp(cover: Cover) -> NDArray[np.float32]:
-    """Returns the colours (256, 3) of a material from dark to bright."""
+    """Returns the ramp of a material: 256 colours (256, 3) from dark to bright, 0 to 255."""
     tones = np.linspace(0.0, 1.0, _TONES)
     bands = zip(cover.dark, cover.medium, cover.bright, strict=True)
     return np.stack([np.interp(tones, (0.0, 0.5, 1.0), band) for band in bands], axis=1).astype(np.float32)
@@ -196,5 +196,5 @@ def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (com
 
 @njit(cache=True)
 def _soft(inside: float, width: float) -> float:  # pragma: no cover (compiled)
-    """Returns 0 outside and 1 inside a spot, given the distance inwards from its edge and the width of the edge."""
+    """Returns 0 outside and 1 inside a spot, from the distance `inside` its edge and the `width` of the soft edge."""
     return min(max(inside / width + 0.5, 0.0), 1.0)

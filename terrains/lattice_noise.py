@@ -1,6 +1,6 @@
-"""Noise as a function of position: value noise, fractal noise and cellular noise of a periodic lattice of numbers.
+"""Noise as a function of position: value, fractal and cellular noise from a periodic lattice of random numbers.
 
-Cellular noise: Worley 1996, A cellular texture basis function. Compiled, for use in loops over the texels of a floor.
+Cellular noise: Worley 1996, A cellular texture basis function. The functions are compiled for use in loops over texels.
 """
 
 from __future__ import annotations
@@ -41,7 +41,9 @@ def value_noise(x: float, y: float, table: Table, layer: int) -> float:  # pragm
 
 @njit(cache=True, inline="always")
 def fractal_noise(x: float, y: float, octaves: int, table: Table, layer: int) -> float:  # pragma: no cover (compiled)
-    """Returns a sum of octaves of value noise with halved amplitudes, about -1 to 1 with mean 0.
+    """Returns a sum of octaves of value noise, about -1 to 1 with a mean of about 0.
+
+    Each octave has half the amplitude and half the wavelength of the previous one.
 
     Args:
         x, y: position in lattice spacings of the first octave.

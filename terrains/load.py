@@ -47,8 +47,8 @@ def load(
     """Reads a terrain, fills its holes, centres it at the origin and moves its lowest point to z = 0.
 
     Args:
-        height_file: heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain is one
-            cell smaller than the raster in both directions.
+        height_file: file of heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain
+            is one cell smaller than the raster in both directions.
         texture: source of the texture.
         height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
         height_range_m: height difference between white and black in a PNG.

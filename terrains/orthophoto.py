@@ -30,8 +30,8 @@ def lay_orthophoto(
 ) -> float:
     """Replaces the texture of a floor by an orthophoto wherever the orthophoto has valid pixels.
 
-    The orthophoto is transformed to the CRS of the DEM. An orthophoto without a CRS has the coordinates of the DEM.
-    Coarse pixels are interpolated, fine ones averaged over a texel.
+    The orthophoto is transformed to the CRS of the DEM. An orthophoto without a CRS is taken to be in that of the DEM.
+    If more than 1.5 of its pixels fit along the side of a texel, they are averaged over the texel, else interpolated.
 
     Args:
         texture: (rows, cols, 3) uint8 RGB, row 0 = north, changed in place.
@@ -79,7 +79,7 @@ def _read(
     shape: tuple[int, ...],
     georeference: Georeference,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Returns the colours (rows, cols, 3) of an orthophoto at texels, and whether each texel (rows, cols) is valid.
+    """Returns the colours (rows, cols, 3) of an orthophoto at the texels, and whether it covers each texel.
 
     Raises:
         TwinError: the bands are not those of an orthophoto, the DEM names no CRS although the orthophoto has one, they
@@ -141,7 +141,7 @@ def _check_overlap(
 
 
 def _check_resolution(source: rasterio.DatasetReader, file: Path, target: CRS, grid: Affine) -> None:
-    """Raises TwinError if an orthophoto has too many pixels and is much finer than the texels."""
+    """Raises TwinError if an orthophoto has too many pixels and is over _MAX_SHARP times finer than the texels."""
     if _finer(source, target, grid) > _MAX_SHARP:
         check_texel_count(source.width, source.height, file, ORTHOPHOTO_FIELD)
 

@@ -23,9 +23,12 @@ MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
 def even_lighting(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Removes slow variations of brightness from a photo of a floor; the mean brightness stays about the same.
 
-    The photo is divided by a polynomial of degree 2 in row and column, fitted by least squares to its brightness, and
-    multiplied by its mean brightness. In a large photo, the polynomial is fitted to about LIGHTING_SAMPLES pixels on a
-    regular grid. The memory beyond photo and result is that of these pixels and of a few blocks of LIGHTING_ROWS rows.
+    A polynomial of degree 2 in row and column is fitted by least squares to the brightness, the mean of R, G and B. The
+    photo is multiplied by the mean brightness and divided by this polynomial, or by 5 % of the mean where the
+    polynomial is less. A black photo is returned unchanged.
+
+    In a large photo, the polynomial is fitted to about LIGHTING_SAMPLES pixels on a regular grid. In addition to photo
+    and result, memory is needed for these pixels and for a few blocks of LIGHTING_ROWS rows.
 
     Args:
         photo: (h, w, 3) uint8 RGB.
@@ -97,7 +100,7 @@ def _lay(
         side: rows and columns of a block.
         overlap: rows or columns that neighbouring blocks share.
         places: (n_rows, n_cols, k, 2) row and column of the upper left corner of the k candidates of each block.
-        draws: (n_rows, n_cols) uniform random numbers that choose among the acceptable candidates.
+        draws: (n_rows, n_cols) uniform random numbers, 0 to 1, that choose among the acceptable candidates.
     """
     step = side - overlap
     n_rows, n_cols, n_places = places.shape[:3]
@@ -125,7 +128,7 @@ def _lay(
 def _difference(
     target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
 ) -> float:  # pragma: no cover (compiled)
-    """Returns the sum of squared differences of block and target over the overlaps with the blocks above and left.
+    """Returns the sum of squared differences of block and target in the overlaps with the blocks above and to the left.
 
     Only every second pixel of every second row is used.
     """
@@ -152,9 +155,10 @@ def _squared(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:  # pragma: no
 def _join(
     target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
 ) -> None:  # pragma: no cover (compiled)
-    """Copies the part of a block (side, side, 3) beyond the cuts through its overlaps onto the target.
+    """Copies the part of a block (side, side, 3) below and right of the cuts through its overlaps onto the target.
 
-    Block and target are blended over a width of 3 px across the cuts.
+    A cut is the path of least difference through the overlap with the block above or to the left. Block and target are
+    blended over a width of 3 px across the cuts.
     """
     side = target.shape[0]
     upper, west = np.full(side, -2.0), np.full(side, -2.0)

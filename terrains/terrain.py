@@ -25,7 +25,7 @@ class Terrain:
         spacing_m: distance between neighbouring nodes along x and y.
         west_m, south_m: position of node (0, 0).
         texture: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH.
-        texture_px_m: side of a texel.
+        texture_px_m: side of a texel along x; along y, it may differ by rounding.
         n_filled: number of nodes without a height in the source, filled with the nearest height.
         georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
         orthophoto_share: share of the texels that an orthophoto covers; None without an orthophoto.

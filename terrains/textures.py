@@ -1,4 +1,4 @@
-"""Seafloor textures: generated sand, rock and coral, or made from a photo."""
+"""Seafloor textures: generated from materials such as sand, rock and coral, or made from a photo."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def texture_from_photo(
 
 
 def _scaled(photo: NDArray[np.uint8], factor: float) -> NDArray[np.uint8]:
-    """Returns a photo (h, w, 3) with rows and columns multiplied by a factor and rounded."""
+    """Returns a photo (h, w, 3) resampled so that its numbers of rows and columns are multiplied by a factor."""
     rows, cols = (max(1, round(n * factor)) for n in photo.shape[:2])
     if (rows, cols) == photo.shape[:2]:
         return photo

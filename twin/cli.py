@@ -1,8 +1,9 @@
 """Command line `twin`: parses arguments and calls the function that implements the command.
 
-Exit status: 0 success; 1 a survey is not complete, a requirement is missed, or no plan is recommended; 2 invalid input,
-missing system library or failed check of the machine; 130 interrupted by Ctrl-C; 143 terminated by SIGTERM. `twin view`
-returns the status of the viewer.
+Exit status: 0 success; 1 a survey is not complete, a requirement is missed, no plan is recommended, or a study has no
+result, cannot be written or finds that surrogate and rendered surveys disagree; 2 invalid input, a study of which every
+survey is refused, missing system library or failed check of the machine; 130 interrupted by Ctrl-C; 143 terminated by
+SIGTERM. `twin view` returns the status of the viewer.
 """
 
 from __future__ import annotations
@@ -288,7 +289,7 @@ def look(
     out: SheetOption = None,
     as_json: SummaryOption = False,
 ) -> None:
-    """Render the stereo pair at one position, draw its light components as one sheet, and print the image quality."""
+    """Render the stereo pair at one position, draw its light components on one sheet, and print the image quality."""
     from twin.app import look as viewing
     from twin.app import look_sheet
     from twin.scenario.file import load_scenario
@@ -632,7 +633,10 @@ def schema() -> None:
 
 
 def exit_status(result: RunResult | ReplayResult) -> int:
-    """Returns the exit status of a survey: 130 interrupted; 1 aborted, degraded or requirement missed; 0 otherwise."""
+    """Returns the exit status of a survey or a replay.
+
+    130 if it was interrupted; 1 if aborted for another reason, degraded, or if it misses a requirement; otherwise 0.
+    """
     if result.status == "aborted" and result.metrics["reason"].startswith("interrupted"):
         return INTERRUPTED
     missed = [r for r in result.metrics["require"].values() if not r["passed"]]

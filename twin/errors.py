@@ -1,10 +1,10 @@
-"""Exceptions of the project. This module imports nothing, so that every package can use it."""
+"""Exceptions of the project. The module imports no other one of the project, so that every package can use it."""
 
 from __future__ import annotations
 
 
 class TwinError(Exception):
-    """Invalid user input or a missing system library; the command line reports it and exits with status 2.
+    """Invalid user input, an unwritable file or a missing system library, reported by the command line with status 2.
 
     Args:
         field: dotted scenario key (``plan.altitude_m``), or the name of the file, argument or command concerned.
@@ -18,7 +18,7 @@ class TwinError(Exception):
 
 
 class ScenarioError(TwinError):
-    """All errors of one scenario; the message has one line per error, with file and line number or with its `--set`."""
+    """All errors of one scenario; the message has one line per error, with file and line number or with `--set`."""
 
     def __init__(self, lines: list[str]):
         self.lines = lines

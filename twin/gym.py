@@ -26,7 +26,7 @@ except ImportError as error:
     raise ImportError("twin.gym needs the package gymnasium: pip install 'seabed-twin[gym]'") from error
 
 ENVIRONMENT = "SeabedTwin-v0"
-#: Turn rate at full yaw action [rad/s]; speed at full velocity action / planned speed.
+#: Turn rate for a yaw action of 1 [rad/s]; speed for a velocity action of 1, divided by the planned speed.
 YAW_RATE_RADPS, SPEED_RATIO = 0.5, 1.5
 #: An episode ends if the left camera is less than this above the floor below it [m].
 LEAST_CLEARANCE_M = 0.1
@@ -168,11 +168,14 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return np.concatenate([self._frame.left, self._right()], axis=1)
 
     def close(self) -> None:
-        """Releases the OpenGL context."""
+        """Ends the episode: closes the estimators and releases the OpenGL context."""
         self._world.close()
 
     def _command(self, values: Array) -> Array:
-        """Returns the command of the vehicle for one frame, given the action."""
+        """Returns the command of the vehicle for one frame, given the values of an action in [-1, 1].
+
+        With the action "velocity", it also moves the target to which the controller steers.
+        """
         if not self._velocity_action:
             return values
         interval_s, last = 1 / self._world.rig.frame_rate_hz, self._target

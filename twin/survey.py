@@ -40,7 +40,8 @@ def run(
     Args:
         scenario: description of the survey.
         out: run folder.
-        progress: function called with the progress after every frame and during the later stages.
+        progress: function called with the progress during the later stages and after every frame, except frames between
+            keyframes that the compiled loop of a surrogate survey simulates.
         live: whether to show the survey in Rerun while it runs.
         outputs: outputs to write in addition to metrics, trajectories and maps: "report", "recording", both or none of
             them. None: write the metrics only.
@@ -95,9 +96,10 @@ def fly(
         mission: the survey to fly.
         world: simulates the vehicle, which executes the commands, and returns the frames.
         navigator: estimates the pose from the frames.
-        observe: called with the estimate and its frame after every update of the navigator.
-        actions: chooses the pace along the path: the vehicle slows down or stops if tracking is poor or lost, until it
-            recovers; None: the vehicle always flies at the planned speed.
+        observe: called with the estimate and its frame after every update of the navigator; not called for frames
+            between keyframes that the compiled loop of a surrogate survey simulates.
+        actions: chooses the pace along the path: the vehicle slows down or stops if tracking is poor or lost, until
+            tracking recovers; None: the vehicle always flies at the planned speed.
 
     Raises:
         SurveyAborted: the physics diverged, an alignment or a plug-in failed, or `observe` aborted the survey.

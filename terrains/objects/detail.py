@@ -41,7 +41,8 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
     """Returns the levels of detail, finest first.
 
     The first level is the full mesh. The side of the cells of the others starts at the median edge length of the full
-    mesh and grows in steps of a factor sqrt(2); a step that removes no triangles makes no level.
+    mesh and grows by a factor of sqrt(2) in each step; a step that removes no triangles makes no level. The last level
+    has at most FEWEST_FACES triangles, or the next step would leave none.
     """
     corners = mesh.vertices_m[mesh.faces]
     cell_m = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
@@ -86,7 +87,7 @@ def _smallest_first(faces: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Returns a number (n,) for each triple (n, 3) of integers >= 0, the same for equal triples only."""
+    """Returns a number (n,) for each triple (n, 3) of integers >= 0; only equal triples have equal numbers."""
     size = triples.max(axis=0, initial=0) + 1
     return (triples[:, 0] * size[1] + triples[:, 1]) * size[2] + triples[:, 2]
 

@@ -21,7 +21,7 @@ TILE_M = 1.0  #: side of a tile; larger if there were more than MAX_TILES tiles
 MAX_TILES = 4000
 LONGEST_EDGE_M = 0.5  #: longer edges are halved; for a mesh larger than 200 m, those longer than a 400th of it
 MAX_DIVIDED = 2 * MAX_FACES  #: largest number of triangles after long edges have been halved
-LARGEST_CELL_M = 0.1  #: over which the colours of vertices are averaged in the coarsest level
+LARGEST_CELL_M = 0.1  #: largest side of the cells over which the colours of vertices are averaged
 NO_GROUP = -1  #: `PlacedObject.group` of a tile
 
 Array = NDArray[np.float64]
@@ -71,12 +71,13 @@ def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
 
 
 def divided(whole: TexturedMesh) -> TexturedMesh:
-    """Returns a mesh whose long edges are halved until none is longer than LONGEST_EDGE_M, without cracks.
+    """Returns a mesh whose long edges are halved until none is longer than allowed, without cracks.
 
-    The rasterizer leaves out a triangle with a corner behind the camera, so that no triangle should be large.
+    The limit is LONGEST_EDGE_M, or a 400th of the largest extent of the mesh if that is longer. The rasterizer leaves
+    out a triangle with a corner behind the camera, so that no triangle should be large.
 
     Raises:
-        ValueError: more than MAX_DIVIDED triangles would be needed, because the mesh has many long slivers.
+        ValueError: more than MAX_DIVIDED triangles would be needed.
     """
     longest_m = max(LONGEST_EDGE_M, float(np.ptp(whole.mesh.vertices_m, axis=0).max()) / 400)
     while True:
@@ -144,7 +145,10 @@ def downward_part(mesh: Mesh) -> Mesh:
 
 
 def tiles_of(whole: TexturedMesh) -> FloorTiles:
-    """Returns a mesh floor in square tiles; a triangle belongs to the tile in which its centre lies."""
+    """Returns a mesh floor in square tiles, separate ones for each texture.
+
+    A triangle belongs to the tile of its texture in which its centre lies.
+    """
     mesh, texture = whole.mesh, whole.texture
     centres = mesh.vertices_m[mesh.faces].mean(axis=1)[:, :2]
     side_m = TILE_M
@@ -171,7 +175,7 @@ def _tile(
         mesh: the whole floor.
         part: (k,) numbers of triangles.
         uv: (n, 3) see `FloorTile.uv`, of all vertices.
-        colours: colours (n, 3) of all vertices, and side of the cells [m] over which they are means, finest first.
+        colours: pairs of colours (n, 3) of all vertices and side of the cells [m], see `_colour_levels`.
         texture: number of the texture.
     """
     used, faces = np.unique(mesh.faces[part], return_inverse=True)
@@ -206,7 +210,11 @@ def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
 
 
 def _colour_levels(whole: TexturedMesh) -> list[tuple[NDArray[np.uint8], float]]:
-    """Returns the colours (n, 3) of the vertices with 0, and their means over cubic cells with the side [m]."""
+    """Returns pairs of colours (n, 3) of the vertices and the side [m] of the cells over which they are averaged.
+
+    The first pair has the colours themselves and the side 0. The others have means over larger and larger cubic cells;
+    there are none if every triangle has a texture.
+    """
     mesh = whole.mesh
     levels = [(mesh.colours, 0.0)]
     if (whole.texture >= 0).all():

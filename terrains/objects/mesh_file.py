@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: bool = False) -> Mesh:
-    """Returns the mesh of a file, in the unit of the file.
+    """Returns the mesh of a file, in the unit of the file; a mesh far from the origin is moved to it.
 
     A mesh may be open, as photogrammetric models are, but no edge may belong to more than two triangles. A texture is
     sampled at the vertices, after the triangles have been divided.
@@ -34,7 +34,8 @@ def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: 
         albedo: albedo of a mesh without colours, 0 to 1.
         y_up: whether y of the file points up, instead of z.
     Raises:
-        TwinError: the file is missing, unreadable, empty, too large or not a manifold mesh.
+        TwinError: the file is missing, unreadable, too large, or is a mesh without triangles, without extent or not
+            manifold.
     """
     parts = _read(
         file, field, lambda loaded: [_coloured(part, albedo, TEXTURED_FACES // len(loaded)) for part in loaded]
@@ -62,14 +63,15 @@ class TexturedMesh(NamedTuple):
 
 
 def read_textured_mesh(file: Path, field: str, y_up: bool = False) -> TexturedMesh:
-    """Returns the mesh of a file with its textures, in the unit of the file.
+    """Returns the mesh of a file with its textures, in the unit of the file; a mesh far from the origin is moved to it.
 
     Args:
         file: path of a PLY, OBJ or GLB file.
         field: scenario key of the file, for error messages.
         y_up: whether y of the file points up, instead of z.
     Raises:
-        TwinError: the file is missing, unreadable, empty, too large, not a manifold mesh, or without colours.
+        TwinError: the file is missing, unreadable, too large, or is a mesh without triangles, without extent, not
+            manifold or without colours.
     """
     parts = [part for part in _read(file, field, lambda loaded: [_part(p) for p in loaded]) if len(part.mesh.faces)]
     mesh = _joined([part.mesh for part in parts])
@@ -92,7 +94,14 @@ def read_textured_mesh(file: Path, field: str, y_up: bool = False) -> TexturedMe
 
 
 class _Part(NamedTuple):
-    """Mesh of one material: triangles, (n, 2) texture coordinates, PIL image of the texture or None, any colours."""
+    """Mesh of one material.
+
+    Args:
+        mesh: triangles, with the colours of their vertices.
+        uv: (n, 2) texture coordinates of the vertices.
+        image: PIL image of the texture; None without a texture.
+        coloured: whether the file gives the mesh a texture or colours.
+    """
 
     mesh: Mesh
     uv: NDArray[np.float32]
@@ -101,7 +110,7 @@ class _Part(NamedTuple):
 
 
 def _part(part: Any) -> _Part:
-    """Returns a trimesh mesh with its texture, else the base colour of its material or the colours of its vertices."""
+    """Returns a trimesh mesh with its texture, else with the colours of its vertices or its material, else white."""
     n, texture, factor = len(part.vertices), _texture_of(part), _base_colour(part)
     colours = np.full((n, 3), 255, np.uint8)
     if texture is not None:
@@ -117,7 +126,7 @@ def _part(part: Any) -> _Part:
 
 
 def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> list[Any]:
-    """Returns what `convert` makes of the trimesh meshes of a file; the size of the file is checked first.
+    """Returns the result of `convert` for the trimesh meshes of a file, whose size is checked first.
 
     Raises:
         TwinError: the file is missing, unreadable or too large.
@@ -135,9 +144,11 @@ def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> 
 
 
 def _near_origin(parts: list[Any]) -> list[Any]:
-    """Returns trimesh meshes, moved together to the origin if its distance is more than 8 times their extent.
+    """Returns trimesh meshes; moves them together so that their centre is the origin if it is far from it.
 
-    Georeferenced models have coordinates of 1e5 to 1e7 m, which single precision rounds to steps of up to 1 m.
+    The centre is that of their bounding box. It is far from the origin if the magnitude of one of its coordinates
+    exceeds 8 times the largest side of the box. Georeferenced models have coordinates of 1e5 to 1e7 m, which single
+    precision rounds to steps of up to 1 m.
     """
     corners = [np.asarray(part.vertices) for part in parts if len(part.vertices)]
     if not corners:
@@ -189,7 +200,7 @@ def _parts(loaded: Any) -> list[Any]:
 
 
 def _coloured(part: Any, albedo: tuple[float, float, float], most_faces: int) -> Mesh:
-    """Returns a mesh with the texture, vertex colours or base colour of a trimesh mesh; with `albedo` without any.
+    """Returns a trimesh mesh as a mesh with the colours of its texture, vertices or material; `albedo` if it has none.
 
     A textured mesh is divided into at most `most_faces` triangles, or not at all.
     """
@@ -255,7 +266,7 @@ def _base_colour(part: Any) -> tuple[int, ...] | None:
 
 
 def _texture_of(part: Any) -> tuple[Any, Any] | None:
-    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it has no texture."""
+    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either."""
     material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     return None if image is None or uv is None or len(uv) != len(part.vertices) else (image, uv)

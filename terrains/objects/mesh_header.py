@@ -1,4 +1,4 @@
-"""Number of triangles that a mesh file declares, found without loading the mesh, which may be huge."""
+"""Number of triangles that a mesh file declares, found without loading the mesh, because it may be very large."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from collections import Counter
 from pathlib import Path
 
 FORMATS = "a PLY, OBJ or GLB file with triangles"
-_LONGEST_HEADER = 65_536  # bytes of a PLY header, and of a piece in which a line of an OBJ file is read
-_LONGEST_JSON = 16_777_216  # bytes of the description in a GLB file
+_LONGEST_HEADER = 65_536  # largest number of bytes of a PLY header, and of a part of an OBJ line read at once
+_LONGEST_JSON = 16_777_216  # largest number of bytes of the description in a GLB file
 
 
 def face_count(file: Path) -> int:

@@ -14,12 +14,14 @@ Array = NDArray[np.float64]
 
 
 class ObjectModel(NamedTuple):
-    """Shape that several objects share; it stands on the plane z = 0, centred at x = y = 0.
+    """Shape that several objects share, or a tile of a mesh floor.
+
+    A shape stands on the plane z = 0 and is centred at x = y = 0; a tile has world coordinates.
 
     Args:
         levels: levels of detail, finest first.
-        low_m, high_m: (3,) corners of the bounding box.
-        centre_m, radius_m: bounding sphere.
+        low_m, high_m: (3,) minimum and maximum corner of the bounding box.
+        centre_m, radius_m: centre (3,) and radius of a bounding sphere.
         sways: whether the object bends in the current.
         closed: whether the mesh encloses a volume, so that only triangles that face the viewer are seen.
     """
@@ -45,7 +47,7 @@ class PlacedObject(NamedTuple):
         model: shape of the object.
         world_from_object: (4, 4) pose, with its rotation multiplied by the scale.
         scale: size in the world divided by the size of the model.
-        group: number, from 0, of the object's entry in `[[objects]]`.
+        group: number, from 0, of the object's entry in `[[objects]]`; -1 for a tile of a mesh floor.
         phase: phase of its sway [rad].
     """
 

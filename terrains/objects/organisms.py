@@ -98,7 +98,7 @@ def sea_star(albedo: Array, rng: np.random.Generator) -> Mesh:
 
 
 def kelp(albedo: Array, rng: np.random.Generator) -> Mesh:
-    """Returns a kelp about 1 high: ribbons with wavy edges that rise from a common base."""
+    """Returns a kelp plant with a height of about 1: ribbons with wavy edges that rise from a common base."""
     return joined([_blade(angle, albedo, rng) for angle in rng.uniform(0, 2 * np.pi, 12)])
 
 

@@ -14,10 +14,10 @@ from twin.errors import TwinError
 
 Array = NDArray[np.float64]
 
-STEEP_DEG = 15.0  #: sand lies flatter than this, about half its angle of repose
+STEEP_DEG = 15.0  #: a floor less steep than this counts as sand; about half the angle of repose of sand
 MAX_SCATTERED = 5000  #: largest number of objects of one entry
 SIZE_CUT_SIGMA = 2.0  #: random sizes are limited to this many standard deviations of their logarithm
-TRIES = (8, 64, 512)  #: positions that are tried for one object, batch by batch
+TRIES = (8, 64, 512)  #: sizes of the batches of random positions that are tried in turn for one object
 
 
 class Group(Protocol):
@@ -218,7 +218,7 @@ def _at(
 
 
 def _floor_under(terrain: Terrain, x: float, y: float, reach_m: float) -> float:
-    """Returns the lowest height of the floor [m] at a point and at eight points at a distance `reach_m` around it."""
+    """Returns the least floor height [m] at a point and eight points `reach_m` from it; NaN if none is on it."""
     angle = np.arange(8) * np.pi / 4
     heights = terrain.height_at(np.append(x, x + reach_m * np.cos(angle)), np.append(y, y + reach_m * np.sin(angle)))
     return float(np.nanmin(heights)) if np.isfinite(heights).any() else np.nan

@@ -24,9 +24,9 @@ class Textures(NamedTuple):
 
 
 def textures_of(images: Sequence[NDArray[np.uint8]]) -> Textures:
-    """Returns the textures (h, w, 3) with their levels; each level has half as many rows and columns, at least 1.
+    """Returns the textures (h, w, 3) with their levels; each level has half the rows and columns of the one before.
 
-    The texels of a level are means over the texels of the level before.
+    Halves are rounded down, to at least 1. The texels of a level are means over the texels of the level before.
     """
     pyramids = [_pyramid(image) for image in images]
     most = max((len(levels) for levels in pyramids), default=1)

@@ -13,7 +13,7 @@ from twin.imaging.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
 _N_COLUMNS = 13  # columns, and rows, of the grid of pixels for the fit
-_RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as fractions of the planned altitude
+_RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as multiples of the planned altitude
 
 
 def believed_calibration(rig: StereoRig) -> RigCalibration:

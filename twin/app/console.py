@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def print_error(text: str) -> None:
-    """Prints a text on stderr, without line wrapping or colours; characters that cannot be printed become escapes."""
+    """Prints a text on stderr, without line wrapping or colours; unprintable characters become escape sequences."""
     printable = (c if c.isprintable() or c == "\n" else repr(c)[1:-1] for c in text)
     print("".join(printable), file=sys.stderr)
 
@@ -68,7 +68,7 @@ def progress_note(now: SurveyProgress) -> str:
 
 
 def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
-    """Prints a table on stdout, as wide as the terminal at most; up to 120 characters wide if it is not a terminal."""
+    """Prints a table on stdout, at most as wide as the terminal, or as 120 characters if stdout is not a terminal."""
     console = Console(width=None if sys.stdout.isatty() else 120, markup=False, emoji=False)
     grid = Table(title=title, title_justify="left", show_header=False)
     for row in rows:

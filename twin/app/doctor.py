@@ -99,7 +99,7 @@ def render_test_image() -> str:
     """Renders a white sphere and checks that the image is not black.
 
     Returns:
-        The name of the OpenGL renderer and the value of MUJOCO_GL.
+        The name of the OpenGL renderer and the value of the environment variable MUJOCO_GL, as text.
 
     Raises:
         TwinError: OpenGL is missing.

@@ -77,13 +77,13 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     """Returns the expected height error of the map, without the errors of the poses.
 
     The error has three parts. A disparity error of s pixels at depth Z is a depth error of s Z^2 / (f b), with focal
-    length f [px] and baseline b [m]. This depth error decreases with the distance between consecutive keyframes and
-    with the number of keyframes that observe a point, which is 1 / (1 - overlap along the leg). A lateral error of the
-    mapped surface causes a height error proportional to the slope of the floor. Edges and other roughness within the
-    matching window cause an error that increases with the roughness. The standard deviations of all errors, and the
-    scatter of the disparity error over the cells of a map, come from the error model fitted to rendered surveys. The
-    disparity error depends on the water, light, texture and sensor of the scenario, through the Cramér-Rao bound of
-    image matching (`Matchability`).
+    length f [px] and baseline b [m]. This depth error decreases with increasing distance between consecutive keyframes
+    and with the number of keyframes that observe a point, which is 1 / (1 - overlap along the leg). A lateral error of
+    the mapped surface causes a height error proportional to the slope of the floor. Edges and other roughness within
+    the matching window cause an error that increases with the roughness. The standard deviations of all errors, and
+    the scatter of the disparity error over the cells of a map, come from the error model fitted to rendered surveys.
+    The disparity error depends on the water, light, texture and sensor of the scenario, through the Cramér-Rao bound
+    of image matching (`Matchability`).
     """
     rig, scenario = mission.rig, mission.scenario
     fitted = error_model_file.load(scenario.imaging.error_model)
@@ -117,9 +117,9 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
 
 
 def _floor_points(mission: Mission, forecast: FloorForecast, matched: StereoRig) -> tuple[Array, Array, Array, Array]:
-    """Returns properties of the floor at n points spread evenly over the images.
+    """Returns depth [m], slope [m/m], roughness [m] and strength of edges of the floor at n points, each (n,).
 
-    Returned are depth (n,) [m], slope (n,) [m/m], roughness (n,) [m] and `MapModel.edge_m` (n,).
+    The points are spread evenly over the images. The strength of edges is `MapModel.edge_m` [m px^(-1/2)].
 
     Args:
         mission: the survey.

@@ -69,9 +69,9 @@ def export(
 
     Raises:
         TwinError: a format is unknown, an option is not valid, the folder is not that of a run, the run lacks contents
-            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or a
-            package is not installed, or an image or the true poses of the run are damaged; the formats before the one
-            that needs them were written.
+            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or a package is
+            not installed, an image or the true poses of the run are damaged, or a file has the name of the hidden
+            folder; the formats before the affected one were written.
         OSError: a file cannot be written.
     """
     chosen = chosen_formats(names)
@@ -93,10 +93,13 @@ def export(
 def _completed(folder: Path) -> Iterator[Path]:
     """Yields a hidden folder next to `folder`, which is renamed to `folder` at the end, or removed after an exception.
 
+    A hidden folder that a killed export has left is removed first.
+
     Args:
         folder: new or empty folder.
 
     Raises:
+        TwinError: a file has the name of the hidden folder.
         OSError: a folder cannot be created, removed or renamed.
     """
     unfinished = folder.with_name(f".{folder.name}.partial")
@@ -158,7 +161,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
 
 
 def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
-    """Raises TwinError unless the true and the final trajectory have a pose for each frame, at increasing times."""
+    """Raises TwinError unless the true and final trajectories that exist have a pose per frame, at increasing times."""
     needed = max((one.index for one in frames), default=-1) + 1
     for name in POSES:
         if (path := run.trajectories.get(name)) is not None:
@@ -187,10 +190,10 @@ def _quality(quality: int | None) -> int | None:
 
 
 def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
-    """Returns the georeference of the options, or of the map files; None if there is neither.
+    """Returns the georeference given by the options, otherwise that of dem.tif; None if there is neither.
 
     Raises:
-        TwinError: only one of the options is given, or one is not valid.
+        TwinError: only one of the options --origin and --crs is given, one of them is not valid, or dem.tif is damaged.
     """
     if options.origin is None and options.crs is None:
         file = folder / "dem.tif"
@@ -220,7 +223,10 @@ def _elevation(run: Run) -> ElevationMap | None:
 
 
 def _colours(mosaic: Raster | None, dem: Raster) -> Image:
-    """Returns the mean colour (rows, cols, 3) of the orthomosaic near the centre of each cell; black without data."""
+    """Returns the mean colour (rows, cols, 3) of the orthomosaic around the centre of each cell; black without data.
+
+    The mean is taken over a square about as large as a cell. Without an orthomosaic, all cells are black.
+    """
     if mosaic is None:
         return np.zeros((*dem.values.shape, 3), np.uint8)
     if mosaic.grid == dem.grid:
@@ -236,7 +242,7 @@ def _colours(mosaic: Raster | None, dem: Raster) -> Image:
 
 
 def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.float32] | None:
-    """Returns a layer of a run; None if the run has no such layer on the grid of the elevation map."""
+    """Returns the layer of a run with a given name; None if the run has none on the grid of its elevation map."""
     raster = run.rasters.get(name)
     if raster is None or elevation is None or raster.grid != elevation.grid:
         return None

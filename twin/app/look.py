@@ -145,13 +145,13 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
     """Computes measures of the quality of the left image.
 
     Returns:
-        Position of the left camera in the world [m] and median depth [m]; exposure time [ms] and gain of a physical
-        sensor; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean, as a
-        fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
-        noise, in windows as wide as `WINDOW_SHARE` of the image. `veil_share`: backscattered fraction of the light.
-        `saturated_share`: fraction of saturated pixels. `snr`: mean / standard deviation of the noise. `texture_snr`:
-        median local standard deviation of the image without noise / standard deviation of the noise; a low value
-        limits matching.
+        Position of the left camera in the world [m] and median depth [m]; with a section [sensor], exposure time [ms]
+        and analogue gain; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean,
+        as a fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
+        noise, in windows of about `WINDOW_SHARE` of the image width. `veil_share`: fraction of the light that is
+        backscatter. `saturated_share`: fraction of saturated pixels. `snr`: mean / standard deviation of the noise.
+        `texture_snr`: median local standard deviation of the image without noise / standard deviation of the noise; a
+        low value limits matching.
     """
     a = view.decomposed
     signal = a.components.total.astype(np.float64) * a.gain if a.linear else a.noise_free / 255

@@ -113,8 +113,8 @@ def _light(
 
     A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
     Any other component is scaled so that its `percentile` is white; the note of the panel then gives the scale factor,
-    or for gain 0 the value that is displayed as white. A component whose `percentile` is zero is displayed as black,
-    with the note "none".
+    or for gain 0 the value that is displayed as white. A component whose `percentile` is not positive is displayed as
+    black, with the note "none".
 
     Args:
         title, unit: name and unit of the component.

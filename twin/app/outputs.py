@@ -47,7 +47,7 @@ def output_file(file: Path, option: str = "--out") -> Path:
 def writing(path: Path, option: str = "--out") -> Iterator[None]:
     """Converts an OSError in this context to a TwinError, which states that the user's `path` cannot be written.
 
-    An error that names a file elsewhere is reported as one of this file.
+    If the OSError names a file outside `path`, the TwinError names that file instead.
     """
     try:
         yield
@@ -59,7 +59,10 @@ def writing(path: Path, option: str = "--out") -> Iterator[None]:
 
 
 def file_stem(name: str) -> str:
-    """Returns the name of a scenario or study for use in a file name: without path separators, at most 100 bytes."""
+    """Returns the name of a scenario or study for use in a file name.
+
+    Path separators and NUL characters are replaced by "_", and the name is cut off after 100 bytes.
+    """
     text = "".join("_" if character in "/\\\0" else character for character in name)
     return text.encode("utf-8", "replace")[:_STEM_BYTES].decode("utf-8", "ignore")
 
@@ -82,7 +85,10 @@ def _check_path(path: Path, option: str, allowed: str) -> None:
 
 
 def _check_writable(path: Path, option: str) -> None:
-    """Raises TwinError unless a file can be created in the folder `path` or in its closest existing parent."""
+    """Raises TwinError unless a file can be created in `path`, if it is an existing folder, or else in its folder.
+
+    If that folder does not exist, its closest existing parent is tested.
+    """
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest
     try:

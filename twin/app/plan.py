@@ -21,10 +21,10 @@ _LEAST_DRAWN_M = 0.005  #: height above the floor at which the outlines of the o
 
 
 def draw(summary: PlanSummary, file: Path) -> Path:
-    """Writes a PNG of the plan from above; returns its path.
+    """Writes a PNG file that shows the plan as seen from above, and returns the path of the file.
 
     The left panel shows sea floor, objects, planned path, footprint of the first image and survey area. The right panel
-    shows the survey area and the overlap over the floor, and marks where the overlap is less than required.
+    shows the survey area and the overlap over the floor, and marks where the overlap is insufficient.
     """
     mission = summary.mission
     with matplotlib.rc_context(FIGURE_STYLE):

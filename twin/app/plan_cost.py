@@ -16,9 +16,12 @@ from twin.world.mission import Mission
 
 
 class ComputingCost(NamedTuple):
-    """Estimated computing cost of a survey: time [s], peak memory and disk [MB].
+    """Estimated computing cost of a survey.
 
-    The time is the processor time on an idle 2-core machine.
+    Args:
+        wall_s: processor time on an idle 2-core machine [s].
+        memory_mb: peak memory [MB].
+        disk_mb: disk space of the run folder [MB].
     """
 
     wall_s: float
@@ -86,7 +89,7 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
 
 
 def _mesh_mb(mission: Mission) -> float:
-    """Returns the memory of the triangles and the textures of a mesh floor [MB]; 0 for another floor."""
+    """Returns the memory of the triangles and the textures of a mesh floor [MB]; 0 for any other floor."""
     if mission.mesh_floor is None:
         return 0.0
     tiles, textures = mission.mesh_floor.tiles

@@ -52,7 +52,8 @@ class PlanSummary:
         error: expected height error of the map.
         cost: computing time, memory and disk space of the simulation.
         require: value, limit and verdict of each required metric that can be predicted.
-        warnings: sentences on missed requirements, insufficient overlap and the validity of the expected error.
+        warnings: sentences on requirements expected to be missed, on insufficient overlap, and on limits of validity
+            of the predictions.
     """
 
     mission: Mission
@@ -137,7 +138,10 @@ def required_overlaps(mission: Mission) -> RequiredOverlap:
 
 
 def _short_overlap(mission: Mission, floor: FloorForecast) -> list[str]:
-    """Returns a sentence for each direction in which the 5th percentile of the overlap is less than required."""
+    """Returns a sentence for each direction in which the 5th percentile of the overlap is insufficient.
+
+    See `OVERLAP_TOLERANCE`.
+    """
     required = required_overlaps(mission)
     found = (
         ("along the swaths", spread(floor.overlap_along).p05, required.along),
@@ -152,7 +156,10 @@ def _short_overlap(mission: Mission, floor: FloorForecast) -> list[str]:
 
 
 def _limits_of_validity(mission: Mission, error: ExpectedError) -> list[str]:
-    """Returns sentences: the expected error is extrapolated; it leaves out effects; the plan leaves out the objects."""
+    """Returns a sentence for each limit of validity of the plan that applies to a mission.
+
+    These are that the expected error is extrapolated, that it leaves out effects, and that the plan leaves out objects.
+    """
     sentences = []
     if error.bound_px > _EXTRAPOLATED * error.fitted_bound_px:
         sentences.append(
@@ -245,11 +252,11 @@ def floor_spreads(summary: PlanSummary) -> dict[str, Spread]:
 
 
 def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
-    """Returns the summary as a JSON object: lengths in metres, shares from 0 to 1, missing values null.
+    """Returns the summary as a JSON object: lengths in metres, fractions from 0 to 1, missing values null.
 
     Args:
         summary: the summary of the plan.
-        picture: path of the drawing of the plan; a value of the object.
+        picture: path of the drawing of the plan, which is the value of "picture".
     """
     mission, error = summary.mission, summary.error
     plane = summary.plane._asdict()

@@ -23,7 +23,8 @@ _LARGEST = 1e9  # largest number and largest time [s] of a frame
 def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
     """Returns the frames of a run whose left image was recorded, in the order of time.
 
-    Without frames.csv, as in a replay, these are keyframes; their times are those of the online or the true trajectory.
+    Without frames.csv, as in a replay, these are the keyframes with a recorded image; their times are those of the
+    online trajectory or, if the run has none, of the true one.
 
     Raises:
         TwinError: frames.csv is damaged or lacks a keyframe.
@@ -63,7 +64,7 @@ def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
 
 
 def _check_order(name: str, values: Sequence[float]) -> None:
-    """Raises ValueError unless the values of a column of a table increase from line to line, from 0 or later on."""
+    """Raises ValueError unless the values of a column of a table are 0 to `_LARGEST` and increase from line to line."""
     column = np.array(values, np.float64)
     wrong = np.flatnonzero(~((np.diff(column, prepend=-1.0) > 0) & (column >= 0) & (column <= _LARGEST)))
     if len(wrong):
@@ -75,7 +76,8 @@ def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readin
     """Returns index, time, exposure and readings of a line of frames.csv.
 
     Raises:
-        ValueError: a column is missing, the line has too few or too many cells, or a cell is not a finite number.
+        ValueError: a column is missing, the line has too few or too many cells, a cell is not a number, or an exposure
+            or a reading is not finite.
     """
     missing = [name for name in ("index", "time_s", *EXPOSURE_COLUMNS, *READING_COLUMNS) if name not in row]
     if missing:
@@ -86,13 +88,13 @@ def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readin
 
 
 def _exposure(row: dict[str, str]) -> Exposure | None:
-    """Returns the exposure of a line of frames.csv; None if its cells are empty."""
+    """Returns the exposure in a line of frames.csv; None if its first cell is empty."""
     red, green, blue = (row[name] for name in EXPOSURE_COLUMNS)
     return (_finite(red), _finite(green), _finite(blue)) if red else None
 
 
 def _readings(row: dict[str, str]) -> Readings:
-    """Returns the readings of a line of frames.csv, which has no detected beacons."""
+    """Returns the readings in a line of frames.csv, which contains neither beacons nor readings of the IMU."""
     cells = [row[name] for name in READING_COLUMNS]
 
     def vector(first: int) -> Array | None:
@@ -102,14 +104,14 @@ def _readings(row: dict[str, str]) -> Readings:
 
 
 def _finite(cell: str) -> float:
-    """Returns the number in a cell; raises ValueError if it is not finite."""
+    """Returns the number in a cell; raises ValueError if the cell is not a finite number."""
     if not math.isfinite(number := float(cell)):
         raise ValueError(f"{cell} is not a finite number")
     return number
 
 
 def missing_files(run: Run, scenario: Scenario, frames: Sequence[RecordedFrame]) -> list[str]:
-    """Returns sentences on files that a finished run of the scenario has and this folder has not."""
+    """Returns a sentence on each kind of file that a finished run of the scenario has but this run folder lacks."""
     if scenario.record == "none" or scenario.imaging.fidelity != "rendered":
         return []
     table, found = run.folder / "frames" / "frames.csv", []
@@ -127,7 +129,7 @@ def missing_files(run: Run, scenario: Scenario, frames: Sequence[RecordedFrame])
 
 
 def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
-    """Returns the readings of the IMU in frames/imu.csv with their rate and noise; None if the run has none.
+    """Returns the readings of the IMU in frames/imu.csv with their rate and noise; None if there is no such file.
 
     Raises:
         TwinError: the file is damaged, or the scenario has no IMU.
@@ -154,7 +156,12 @@ def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
 
 
 def _imu_table(file: Path) -> Array:
-    """Returns the numbers (n, 7) of imu.csv; raises ValueError unless all are finite and their times increase."""
+    """Returns the numbers (n, 7) in imu.csv, in the order of `IMU_COLUMNS`.
+
+    Raises:
+        ValueError: the header is not that of imu.csv, a line has too few or too many cells, a cell is not a finite
+            number, or the times do not increase.
+    """
     header, *lines = file.read_text(encoding="utf-8-sig").splitlines() or [""]
     if header != ",".join(IMU_COLUMNS):
         raise ValueError(f"its first line is {header[:60]!r}")

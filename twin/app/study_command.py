@@ -30,7 +30,7 @@ class StudyOptions(NamedTuple):
         out: folder to write; None: runs/study-NAME or runs/tune-NAME.
         jobs: number of parallel surveys; None: one per core.
         scheduler: where the surveys run (`open_engine`).
-        resume: run only surveys that are missing in the folder or failed.
+        resume: run only the surveys whose results are missing in the folder, and those that failed.
         live: print a line for each finished survey.
         as_json: print only a summary, as JSON.
         verify: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune:

@@ -36,8 +36,9 @@ def true_layers(folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, .
         frames: the recorded frames.
 
     Raises:
-        TwinError: the file of the true poses is damaged, or the scenario can no longer be prepared; or, from the
-            iterator `TrueLayers.frames`, a recorded image cannot be read.
+        TwinError: the file of the true poses is damaged, or the scenario can no longer be prepared. The iterator
+            `TrueLayers.frames` raises it if a recorded image cannot be read or does not have the size of the images
+            of the run.
     """
     poses, twists = _true_motion(folder / "frames" / "truth.npz", max(frame.index for frame in frames))
     mission = prepare(scenario)
@@ -70,7 +71,19 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
 
 
 def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, twists: Array) -> Iterator[FrameTruth]:
-    """Yields the true layers of the frames, each after the next frame was rendered, as the flow needs both."""
+    """Yields the true layers of the frames in their order.
+
+    The layers of a frame are yielded after the next frame has been rendered, because the optical flow needs both.
+
+    Args:
+        mission: the survey as planned.
+        frames: the recorded frames.
+        poses: (n, 4, 4) true poses of the left camera at frames 0 to n - 1.
+        twists: (n, 6) true velocities of the body at these frames [rad/s, m/s].
+
+    Raises:
+        TwinError: a recorded image cannot be read or has the wrong size.
+    """
     sways = np.array([False, *(item.model.sways for item in mission.objects)])
     with RenderedWorld(mission, Stopwatch()) as world:
         clear = _camera_in_clear_water(mission, world)
@@ -133,10 +146,11 @@ def _truth(
 
 
 def _difference(recorded: Image, noise_free: Image) -> float:
-    """Returns the RMS of recorded minus factor times rendered image [grey levels], over values below full scale.
+    """Returns the RMS of the recorded image minus a factor times the image rendered again [grey levels].
 
-    The factor is the one with the smallest RMS. It is needed because auto-exposure follows the light with a delay, and
-    the image rendered again is exposed without this delay. 0 if no value is below full scale in both images.
+    Only values below full scale in both images count; the result is 0 if there are none. The factor is the one with the
+    smallest RMS. It is needed because auto-exposure follows the light with a delay, and the image rendered again is
+    exposed without this delay.
     """
     below = (recorded < 255) & (noise_free < 255)
     seen, rendered = recorded[below].astype(np.float64), noise_free[below].astype(np.float64)
@@ -190,7 +204,7 @@ def floor_normals(
 def optical_flow(
     depth_m: NDArray[np.float32], next_depth_m: NDArray[np.float32], next_from_camera: Array, rig: StereoRig
 ) -> NDArray[np.float32]:
-    """Returns the displacement (H, W, 2), columns and rows [px], of the points of a static scene in the next image.
+    """Returns the displacements of the points of a static scene from this image to the next one.
 
     Args:
         depth_m, next_depth_m: (H, W) depths in this and in the next image; inf where there is nothing.
@@ -198,8 +212,9 @@ def optical_flow(
         rig: calibration of both images.
 
     Returns:
-        Displacements; NaN where there is nothing, where the point is outside the next image, and where it is hidden
-        there: more than 2 % deeper than each of the 3 x 3 pixels around it.
+        (H, W, 2) displacements (columns, rows) [px]; NaN where there is nothing, where the point is outside the next
+        image, and where it is hidden there. A point is hidden if its depth in the next image is more than 2 % larger
+        than the depths of all 3 x 3 pixels around it.
     """
     shape = depth_m.shape
     known = np.isfinite(depth_m).ravel()
@@ -217,7 +232,7 @@ def optical_flow(
 
 
 def _points(depth_m: NDArray[np.floating], rig: StereoRig) -> Array:
-    """Returns the points (H, W, 3) of the pixels in the axes of the camera [m]."""
+    """Returns the points (H, W, 3) at the pixels of a depth image (H, W) in the axes of the camera [m]."""
     rows, cols = np.indices(depth_m.shape)
     pixels = np.stack([cols, rows], -1).reshape(-1, 2).astype(np.float64)
     directions = np.column_stack([rig.normalised(pixels), np.ones(len(pixels))])

@@ -42,7 +42,7 @@ def height_field(height_m: NDArray[np.floating], spacing_m: float, west_m: float
 
 
 def map_height_field(height_m: NDArray[np.floating], grid: MapGrid) -> HeightField:
-    """Returns the height field of a map with heights (rows, cols); its nodes are the centres of the map cells."""
+    """Returns the height field of a map with heights (rows, cols) [m]; its nodes are the centres of the map cells."""
     south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
     return height_field(height_m[::-1], grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)
 
@@ -128,7 +128,7 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 
 @njit(cache=True, nogil=True, inline="always")
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
-    """Returns t in [start, end] at which the ray meets the floor of a cell; inf if it does not, NaN if a corner is NaN.
+    """Returns the least t in [start, end] where the ray meets the floor of a cell; inf if none, NaN if a corner is NaN.
 
     The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell. If it
     is below the floor at `start` already, the result is `start`.

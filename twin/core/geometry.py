@@ -1,7 +1,8 @@
 """Rigid motions: all rotation, quaternion and axis conventions are defined here.
 
-A pose is a 4x4 homogeneous matrix named ``world_from_camera``; in products, adjacent inner names cancel. A small motion
-is a twist ``[rotation, translation]`` (rad, m), ordered as in GTSAM and applied on the right: ``pose @ exp(motion)``.
+A pose is a 4x4 homogeneous matrix, such as ``world_from_camera``; ``a_from_b @ b_from_c`` is ``a_from_c``. A small
+motion is a twist ``[rotation, translation]`` (rad, m), ordered as in GTSAM and applied on the right:
+``pose @ exp(motion)``.
 
 World: x east, y north, z up. Body: x forward, y left, z up. Camera: x right, y down, z forward. Pixel (0, 0) is the
 centre of the top-left pixel.
@@ -77,7 +78,7 @@ def compose(a_from_b: Array, b_from_c: Array) -> Array:
 
 @njit(cache=True, nogil=True)
 def transform_covariance(matrix: Array, cov: Array) -> Array:
-    """Returns matrix @ cov @ matrix.T (6, 6), exactly symmetric, of a matrix (6, 6) and a symmetric cov (6, 6)."""
+    """Returns matrix @ cov @ matrix.T (6, 6), exactly symmetric, for a matrix (6, 6) and a symmetric cov (6, 6)."""
     half, result = np.empty((6, 6)), np.empty((6, 6))
     for i in range(6):
         for k in range(6):
@@ -336,7 +337,7 @@ def quaternion_xyzw(rotation: Array) -> Array:
 def quaternions_xyzw(rotations: Array) -> Array:
     """Returns the quaternions [x, y, z, w] (n, 4) of rotation matrices (n, 3, 3), w >= 0.
 
-    Computed from the component of largest magnitude, for precision (Shepperd 1978).
+    For precision, each is computed from its component of largest magnitude (Shepperd 1978).
     """
     out = np.empty((len(rotations), 4))
     for k in range(len(rotations)):

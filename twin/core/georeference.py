@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 @dataclass(frozen=True)
 class Georeference:
-    """Position of the scene in a horizontal CRS and a vertical datum; the scene axes are parallel to theirs.
+    """Position of the scene in a horizontal CRS and a vertical datum, to whose axes the scene axes are parallel.
 
     With the origin (E0, N0, H0) of the scene and k metres per unit of the CRS, a scene point (x, y, z) [m] lies at
     E = E0 + x / k, N = N0 + y / k and at the elevation H0 + z.

@@ -21,7 +21,7 @@ def bilinear(image, row, col, row_fraction, col_fraction):
 def catmull_rom(a, b, c, e, t):
     """Returns value and derivative of the Catmull-Rom cubic through samples a, b, c, e, at fraction t between b and c.
 
-    This is the cubic convolution of Keys (1981) with his parameter at -1/2.
+    This is the cubic convolution of Keys (1981) with the parameter a = -1/2.
     """
     c1 = 0.5 * (c - a)
     c2 = a - 2.5 * b + 2 * c - 0.5 * e

@@ -14,7 +14,9 @@ T = TypeVar("T")
 
 
 class StageGuard:
-    """Context manager that delivers interrupts only within a stage; one that arrives between two stages waits.
+    """Context manager that delivers interrupts only within a stage.
+
+    An interrupt that arrives between two stages is delivered at the start of the second one.
 
     A delivered signal is passed to the handler of SIGINT or SIGTERM that was installed when the context was entered.
     This handler usually raises KeyboardInterrupt. A signal without a Python handler is not intercepted. Outside the
@@ -71,11 +73,11 @@ class StageGuard:
 
     @property
     def reason(self) -> str:
-        """Returns why the survey is aborted and the skipped stages ("interrupted; map skipped"); "" if it is not."""
+        """Returns why the survey is aborted, and the skipped stages ("interrupted; map skipped"); "" if not aborted."""
         return f"{self.cause or 'interrupted'}; {', '.join(self.skipped)} skipped" if self.skipped else self.cause
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        """Handles a signal: delivers it within a stage, otherwise keeps it for the next stage."""
+        """Handles a signal: delivers the first one that arrives within a stage, keeps any other for the next stage."""
         if self._open:
             self._open = False  # a second signal must not interrupt the handling of the first
             self._deliver(number, frame)

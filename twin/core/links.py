@@ -26,9 +26,9 @@ class Link(NamedTuple):
             for the correlation, `cov` is the covariance of the single measurement times this number.
         closed_form: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as
             exact; None: not computed.
-        floor_share: fraction (0 to 1) of the variance of the measurement that image noise does not explain. It is due
-            to the relief within the matched patches and is therefore correlated between the links that use the same
-            patches. `Links` does not store it.
+        floor_share: fraction (0 to 1) of the variance of the measurement that image noise does not explain. This part
+            of the variance is due to the relief within the matched patches, and is therefore correlated between links
+            that use the same patches. `Links` does not store `floor_share`.
     """
 
     i: int

@@ -62,6 +62,6 @@ def mean_colours(tile: OrthoTile, n: int) -> Image:
 
 
 def window(grid: MapGrid, row: int, col: int, rows: int, cols: int) -> MapGrid:
-    """Returns the part of a grid with the given first pixel and size; it may extend beyond the grid."""
+    """Returns the grid of `rows` x `cols` cells whose first cell is (row, col) of a grid; it may extend beyond it."""
     west_m, north_m = grid.west_m + col * grid.cell_m, grid.north_m - row * grid.cell_m
     return MapGrid(west_m, north_m, grid.cell_m, rows, cols)

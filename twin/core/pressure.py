@@ -1,4 +1,4 @@
-"""Pressure of sea water."""
+"""Increase of the pressure of sea water with depth."""
 
 from __future__ import annotations
 

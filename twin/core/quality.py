@@ -55,8 +55,8 @@ class EstimationQuality(NamedTuple):
         frame_sigma_m: standard deviation (3-D) of the position of a keyframe relative to the previous keyframe, by
             frame-to-frame motion alone; 90th percentile over the keyframes [m]; None if it is not known at any
             keyframe.
-        disparity_offset: offset of all disparities that the links imply; None without images, or if the offset is
-            not observable.
+        disparity_offset: offset common to all disparities, estimated from the links; None without images, or if
+            the offset is not observable.
     """
 
     frames_lost: int = 0

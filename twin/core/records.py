@@ -110,7 +110,7 @@ class StereoRig:
         return replace(self, height_px=height, focal_y_px=None, principal_point_px=centre)
 
     def project(self, points: Array) -> Array:
-        """Returns the projections (n, 2) [px] of points (n, 3) [m] in the left camera; NaN for depths up to 1 mm."""
+        """Returns the pixels (n, 2) of points (n, 3) [m] in the axes of the left camera; NaN for depths up to 1 mm."""
         depth_m = np.where(points[:, 2:] > 1e-3, points[:, 2:], np.nan)
         return points[:, :2] / depth_m * self.focals_px + [self.cx_px, self.cy_px]
 
@@ -178,7 +178,7 @@ class ImuReadings(NamedTuple):
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of the navigation sensors at a frame; None where a sensor is not fitted or has no new reading.
+    """Readings of the navigation sensors at a frame; None for a sensor that is not used or has no new reading.
 
     Args:
         pressure_z_m: height of the left camera above the reference plane z = 0, from pressure [m].
@@ -204,7 +204,7 @@ class Displacement(NamedTuple):
     """Displacement of the body's origin since a node, measured by the DVL, in the axes of the body at that node.
 
     Args:
-        since: number of the node.
+        since: keyframe number of the node.
         displacement_m: (3,) measured displacement [m]: (1 + s) times the true displacement, plus noise. The scale error
             s is constant over the survey.
         cov: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node,
@@ -325,7 +325,7 @@ class StereoObservation(NamedTuple):
         saturated: fraction of the pixel values of the left image at full scale; None without an image.
         row_offset_px: median row difference of the matched points, right minus left [px]; None if not measured.
         row_spread_px: robust standard deviation of the row differences [px]; None if not measured.
-        row_sigma_px: standard deviation of the row differences expected from the texture [px]; None if they are not
+        row_sigma_px: standard deviation of the row differences that is expected from the texture [px]; None if not
             measured.
         repetition: largest autocorrelation of the left image away from its main peak; None without an image.
     """
@@ -341,7 +341,7 @@ class StereoObservation(NamedTuple):
 
     @property
     def row_spread_ratio(self) -> float | None:
-        """Returns row_spread_px / row_sigma_px (1 for the expected matching noise); None if one is not known."""
+        """Returns row_spread_px / row_sigma_px, 1 for the expected noise; None if one is None or row_sigma_px is 0."""
         return self.row_spread_px / self.row_sigma_px if self.row_spread_px is not None and self.row_sigma_px else None
 
 
@@ -416,12 +416,12 @@ class MapGrid:
 
 @dataclass
 class ElevationMap:
-    """Digital elevation model with its uncertainty and orthomosaic.
+    """Digital elevation model with its uncertainty, and an orthomosaic on the same grid.
 
     Args:
         grid: cells in x and y of the map frame.
         height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m]; NaN where unknown.
-        mosaic: (rows, cols, 3) uint8 RGB, black where unknown.
+        mosaic: (rows, cols, 3) uint8 RGB orthomosaic, black where unknown.
         map_from_world: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
     """
 
@@ -448,15 +448,16 @@ class Truth:
         height_m: (rows, cols) float32, true height at the cell centres of the map grid [m].
         seen: (rows, cols) bool, cells that both cameras observed in at least one keyframe.
         asked: (rows, cols) bool, cells whose centre lies in the asked area.
-        reference_yaw: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: the heading at
-            the start.
+        reference_yaw: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: constant, the
+            heading at the start.
         albedo: function that returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from
             above, 255 = white; NaN where there is no floor or an object lies on it. None: not known.
         in_area: function that returns whether points (x, y) [m] lie in the asked area. None: not known.
         objects: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a
-            height grid without objects. `height_m` is that of the highest surface, floor or object.
-        overhung: (rows, cols) bool, cells whose floor is hidden below an overhanging object or part of a mesh floor.
-            Both arrays are given for a mesh floor, also without objects.
+            height grid without objects and for the surrogate. `height_m` is the height of the highest surface, floor
+            or object.
+        overhung: (rows, cols) bool, cells whose floor is hidden below an overhanging object or part of a mesh floor;
+            None where `objects` is None.
     """
 
     trajectory: Trajectory

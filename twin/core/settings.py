@@ -30,9 +30,10 @@ class EstimatorSettings:
         patch_px: side of the matching window, the same for stereo and for motion [px]. Patches have an odd side: for an
             even value, it is one pixel larger.
         keyframe_overlap: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is
-            expected to be below this fraction; used only if the caller does not choose the keyframes.
+            expected to be below this fraction, or if tracking has failed; used only if the caller does not choose the
+            keyframes.
         wide_search: whether features are matched over the whole images where a link cannot be measured from the
-            predicted poses; for large or unpredictable motions between keyframes. Costs time only where links fail.
+            predicted poses; for large or unpredictable motions between keyframes. It costs time only where links fail.
 
     Raises:
         TwinError: a value is out of range.

@@ -36,7 +36,7 @@ class Stopwatch:
         return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]
 
     def summary(self) -> dict[str, dict[str, float | int | None]]:
-        """Returns count, mean, 95th percentile [ms] (None if not measured) and total [s] of each stage in `STAGES`."""
+        """Returns count, total [s], mean and 95th percentile [ms] of all `STAGES`; the last two None for count 0."""
         return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
 
 
@@ -51,7 +51,7 @@ def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> d
 
 
 def _summary(durations_s: list[float]) -> dict[str, float | int | None]:
-    """Returns count, mean, 95th percentile [ms] (None if not measured) and total [s] of one stage."""
+    """Returns count, total [s], mean and 95th percentile [ms] of one stage; the last two are None if the count is 0."""
     if not durations_s:
         return {"count": 0, "mean_ms": None, "p95_ms": None, "total_s": 0.0}
     ms = np.array(durations_s) * 1e3

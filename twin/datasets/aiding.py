@@ -20,10 +20,10 @@ from twin.estimate import Navigator
 #: Largest time between an exposure and a reading of pressure or attitude that belongs to it: as a fraction of the
 #: interval between frames, and absolute [s].
 _SHARE, _MOST_S = 0.25, 0.01
-#: Velocities are interpolated between readings that are at most this many times their median interval apart.
+#: Velocities are interpolated between readings whose interval is at most this many times the median interval.
 _MOST_GAP = 2.5
 _START_FRAMES = 60  # number of frames whose readings determine the start
-#: Prior standard deviations of the first node where readings determine it better: rotation [rad] and height [m].
+#: Prior standard deviations of the first node in directions that readings determine: rotation [rad] and height [m].
 _LOOSE_RAD, _LOOSE_M = 0.1, 1.0
 _EXACT = 1e-12  # variance of the coordinates that the first node defines [m^2]
 _EXACT_RAD2 = 1e-12  # variance of its heading, if it defines that of the world [rad^2]
@@ -51,8 +51,8 @@ class Opening(NamedTuple):
         frames: the frames, from the first one on.
         rig: calibration of the frames.
         settings: settings of the estimators.
-        plane_from_camera: (4, 4) pose of the left camera at the first frame over the plane of the floor; its height is
-            kept.
+        plane_from_camera: (4, 4) pose of the left camera above the floor plane of the first stereo pair; a start from
+            readings has its height above this plane.
     """
 
     frames: Iterable[Frame]
@@ -91,7 +91,7 @@ class Aiding:
         noise: noise of the readings, for the estimators. The noise of the velocity is that of a frame: readings are
             interpolated, so with fewer readings than frames the errors of consecutive frames are correlated, and the
             standard deviation is increased by the root of the number of frames per reading.
-        notes: sentences on readings that are not used.
+        notes: sentences on readings that are not used, and on assumptions about their times.
     """
 
     def __init__(self, readings: RecordedReadings, left_from_rectified: Array, start_s: float, frame_rate_hz: float):
@@ -108,7 +108,7 @@ class Aiding:
 
     @property
     def used(self) -> list[str]:
-        """Returns the names of the sensors that are used."""
+        """Returns the names of the sensors that are used: "pressure", "attitude", "vertical", "dvl"."""
         series = {
             "pressure": self._height, "attitude": self._attitude, "vertical": self._vertical, "dvl": self._velocity
         }  # fmt: skip
@@ -120,7 +120,11 @@ class Aiding:
         return self._attitude is not None or self._vertical is not None
 
     def at(self, time_s: float) -> Readings:
-        """Returns the readings of the frame at a time [s] since the first frame."""
+        """Returns the readings of the frame at a time [s] since the first frame.
+
+        Height and attitude are the readings nearest in time, the velocity is interpolated; None where a sensor is not
+        used or has no reading near this time.
+        """
         height, attitude = (_nearest(series, time_s, self._limit_s) for series in (self._height, self._attitude))
         up = _interpolated(self._vertical, time_s)
         return Readings(
@@ -133,15 +137,19 @@ class Aiding:
     def start(self, opening: Opening, known: Array | None = None) -> Start | None:
         """Returns the start that fits the first readings of gravity and height; None without attitude and vertical.
 
-        The motion over the first frames is estimated from the images alone. Each reading of the attitude then gives a
-        rotation of the first frame, of which the mean is taken; each vertical gives its direction at the first frame,
-        of which the mean is taken, and the heading is that over the plane of the floor. Each height gives an offset of
-        the recorded heights, which `at` adds from now on. Readings that none of the first frames has cannot be related
-        to the start: they are not used from now on, and `notes` says so. Without gravity, heights are not used either.
+        The motion over the first frames is estimated from the images alone. With it, each reading of the attitude gives
+        a rotation of the camera at the first frame, and the start has the mean of these rotations. Without an attitude,
+        each vertical gives its direction at the first frame; the start has their mean, and the heading over the plane
+        of the floor. Each recorded height gives an offset between the recorded heights and those of the world; `at` adds
+        the mean offset from now on.
+
+        If none of the first frames has a height, heights are not used from now on. If none of them has an attitude or a
+        vertical and `known` is None, none of these and no heights are used from now on, and the result is None. In both
+        cases, `notes` says so.
 
         Args:
             opening: the first frames.
-            known: (4, 4) exact pose at the first frame; None: it is found from the readings.
+            known: (4, 4) exact pose at the first frame, which becomes the start; None: it is found from the readings.
         """
         if not self.is_level:
             return None
@@ -194,7 +202,7 @@ class Aiding:
         return np.diag(np.diag(camera_from_body @ variances @ camera_from_body.T)) / n_attitudes
 
     def _leave_out_height(self) -> None:
-        """Leaves out the heights from now on, whose offset from the start is unknown."""
+        """Ends the use of the recorded heights, because their offset is unknown, and adds a note."""
         if self._height is not None:
             self._height = None
             self.notes += (
@@ -217,7 +225,10 @@ class Aiding:
         return found
 
     def _first_motions(self, opening: Opening) -> list[tuple[Array, Readings]]:
-        """Returns the motion (4, 4) since the first frame and the readings, for the first frames with a motion."""
+        """Returns poses (4, 4) in the axes of the camera at the first frame, and the readings at these poses.
+
+        They are those of the first frame and of the frames, among the first `_START_FRAMES`, whose motion was measured.
+        """
         found = []
         settings = replace(opening.settings, use_ga=False, use_f2m=False)
         with Navigator(opening.rig, settings, np.eye(4)) as navigator:
@@ -228,7 +239,7 @@ class Aiding:
         return found
 
     def _noise(self, frame_rate_hz: float) -> SensorNoise:
-        """Returns the noise of the readings; that of sensors which are not used is the default."""
+        """Returns the noise of the readings; sensors that are not used have the default noise."""
         noise = SensorNoise()
         if self._height is not None:
             noise = replace(noise, pressure_m=float(self._height.sigmas[0]))
@@ -243,9 +254,9 @@ class Aiding:
         return noise
 
     def residuals(self, path: Trajectory) -> dict[str, float]:
-        """Returns the RMS of (path - reading) / sigma of heights, attitudes and verticals at the frames of a path.
+        """Returns the RMS of (path - reading) / sigma at the frames of a path: "pressure", "attitude", "vertical".
 
-        About 1 is expected. Velocities are left out.
+        About 1 is expected. A sensor without readings is left out; velocities are not compared.
 
         Args:
             path: poses of the rectified left camera in the world of the replay.
@@ -266,11 +277,11 @@ class Aiding:
 
 
 def _prior_cov(rotation: Array, has_height: bool, has_heading: bool) -> Array:
-    """Returns `Start.prior_cov`: small for the position and for what is not recorded, large for what is.
+    """Returns `Start.prior_cov`: large for tilt and, if they are used, for height and heading; otherwise small.
 
     Args:
-        rotation: (3, 3) world_from_camera.
-        has_height, has_heading: whether heights and headings are recorded.
+        rotation: (3, 3) rotation world_from_camera of the start.
+        has_height, has_heading: whether recorded heights and headings are used.
     """
     axes = np.diag([_LOOSE_RAD**2, _LOOSE_RAD**2, _LOOSE_RAD**2 if has_heading else _EXACT_RAD2])
     world = np.diag([_EXACT, _EXACT, _LOOSE_M**2 if has_height else _EXACT])
@@ -280,7 +291,7 @@ def _prior_cov(rotation: Array, has_height: bool, has_heading: bool) -> Array:
 
 
 def _moved(series: SensorSeries | None, start_s: float) -> SensorSeries | None:
-    """Returns the readings with times relative to `start_s`."""
+    """Returns the readings with times relative to `start_s`; None if there are none."""
     return None if series is None else series._replace(times_s=series.times_s - start_s)
 
 
@@ -290,7 +301,7 @@ def _interval_s(series: SensorSeries) -> float:
 
 
 def _nearest(series: SensorSeries | None, time_s: float, limit_s: float) -> Array | None:
-    """Returns the reading (k,) nearest to a time; None if it is farther away than `limit_s`."""
+    """Returns the reading (k,) nearest to a time; None if it is more than `limit_s` away, or there are no readings."""
     if series is None:
         return None
     k = int(nearest_index(series.times_s, np.array([time_s]))[0])
@@ -298,7 +309,7 @@ def _nearest(series: SensorSeries | None, time_s: float, limit_s: float) -> Arra
 
 
 def _interpolated(series: SensorSeries | None, time_s: float) -> Array | None:
-    """Returns the reading (k,) interpolated at a time; None outside the readings and in gaps between them."""
+    """Returns the reading (k,) interpolated linearly at a time; None before, after and in gaps between the readings."""
     if series is None or not series.times_s[0] - 1e-6 <= time_s <= series.times_s[-1] + 1e-6:
         return None
     last = len(series.times_s) - 1

@@ -42,7 +42,7 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Returns whether a path is an MCAP or SQLite file by its suffix, or the folder of a ROS 2 bag."""
+    """Returns whether a path is a file with the suffix .mcap or .db3 (SQLite), or a folder with metadata.yaml."""
     return (path.is_file() and path.suffix in _SUFFIXES) or (path.is_dir() and (path / "metadata.yaml").is_file())
 
 
@@ -57,8 +57,9 @@ class Bag:
         topics: type of the messages of each topic, for example "sensor_msgs/msg/Image".
 
     Raises:
-        TwinError: the bag is damaged, truncated, too large or compressed by file or by message, or rosbags is not
-            installed.
+        TwinError: the bag is damaged, truncated or too large, it is compressed by file or by message, one of its files
+            is missing, or rosbags is not installed.
+        OSError: an MCAP file cannot be read.
     """
 
     def __init__(self, path: Path):
@@ -92,7 +93,7 @@ class Bag:
             yield message
 
     def timed_messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yields the time of recording [ns] and the decoded message for each message of a topic, in their order.
+        """Yields the time of recording [ns] and the decoded message, for each message of a topic in order of recording.
 
         Raises:
             TwinError: the bag is damaged.
@@ -138,7 +139,7 @@ class Bag:
         return [one for one in self._reader.connections if one.topic in topics]
 
     def _check_sizes(self) -> None:
-        """Raises ValueError if the index of chunks is missing, a chunk is too large, or there are too many messages."""
+        """Raises ValueError if there are too many messages, a chunk is too large, or the index of chunks is missing."""
         if self._reader.message_count > _MOST_MESSAGES:
             raise ValueError(f"{self._reader.message_count} messages; at most {_MOST_MESSAGES}")
         storages = getattr(self._reader.storage, "storages", [self._reader.storage])
@@ -151,7 +152,7 @@ class Bag:
 
     @contextmanager
     def _damage(self) -> Iterator[None]:
-        """Converts every error of the parser to a TwinError that names the bag."""
+        """Converts every `Exception` in this context, except a TwinError, to a TwinError that names the bag."""
         try:
             yield
         except (TwinError, GeneratorExit):
@@ -165,7 +166,8 @@ def _files(path: Path) -> list[Path]:
     """Returns the files of a bag: the path itself, or the files that metadata.yaml lists in the folder of the bag.
 
     Raises:
-        TwinError: metadata.yaml is damaged, the bag is compressed, or a file is missing.
+        TwinError: metadata.yaml is damaged, the bag is compressed, or a file is missing or is a link that leads out of
+            the folder.
     """
     if not path.is_dir():
         return [path]
@@ -184,7 +186,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _check_end(file: Path) -> None:
-    """Raises TwinError unless an MCAP file begins and ends with the magic bytes of the format."""
+    """Raises TwinError if a file with the suffix .mcap does not begin and end with the magic bytes of the format."""
     if file.suffix != ".mcap":
         return
     with file.open("rb") as opened:

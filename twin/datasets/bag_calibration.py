@@ -20,7 +20,7 @@ Transforms = dict[str, tuple[str, Array]]
 def stereo_calibration(
     left: Any, right: Any, rectified: bool, right_from_left: Array | None, file: Path
 ) -> StereoCalibration:
-    """Returns the calibration that two messages CameraInfo state.
+    """Returns the calibration in two messages CameraInfo.
 
     The projection matrices P of a pair refer to rectified axes, x_rectified = R x, and P_right[0, 3] = -fx baseline. A
     point x of the left camera is therefore at R_right^T (R_left x + (t, 0, 0)) in the right one, with t = P[0, 3] /
@@ -29,7 +29,7 @@ def stereo_calibration(
     Args:
         left, right: messages of the two cameras: `k`, `d`, `distortion_model`, `r`, `p`, `width`, `height`.
         rectified: whether the images are rectified, so that P instead of K and D is their calibration.
-        right_from_left: (4, 4) pose of the left camera in the axes of the right one from /tf_static; it is used if the
+        right_from_left: (4, 4) pose of the left camera in the axes of the right one, from /tf_static; used only if the
             projection matrices have no baseline. None: not recorded.
         file: bag and topic, for messages.
 
@@ -90,7 +90,7 @@ def relative_pose(transforms: Transforms, target: str, source: str) -> Array | N
 
 
 def _ancestors(transforms: Transforms, frame: str) -> dict[str, Array]:
-    """Returns the pose of a frame in itself and in each of its ancestors, nearest first."""
+    """Returns the pose (4, 4) of a frame in itself (the identity) and in each of its ancestors, nearest first."""
     found = {frame: np.eye(4)}
     while frame in transforms and transforms[frame][0] not in found:
         parent, pose = transforms[frame]
@@ -103,8 +103,8 @@ def _camera(info: Any, rectified: bool, file: Path) -> RecordedCamera:
     """Returns the camera of a message CameraInfo.
 
     Raises:
-        TwinError: images that are not rectified have a lens model that is not supported, are binned, or show only a
-            region of interest.
+        TwinError: the images are not rectified, and their lens model is not supported, they are binned, or they show
+            only a region of interest.
     """
     size = (int(info.width), int(info.height)) if info.width and info.height else None
     if rectified:
@@ -141,10 +141,10 @@ def _rotation(info: Any, file: Path) -> Array:
 
 
 def _offset_m(info: Any, file: Path) -> float:
-    """Returns P[0, 3] / P[0, 0] [m]: minus the position of a camera along the baseline; 0 if P is not set.
+    """Returns P[0, 3] / P[0, 0] [m]: minus the position of a camera along the baseline; 0 unless P[0, 0] > 0.
 
     Raises:
-        TwinError: P has values that are not finite.
+        TwinError: P[0, 0] or P[0, 3] is not finite.
     """
     fx, shift = float(info.p[0]), float(info.p[3])
     if not np.isfinite([fx, shift]).all():

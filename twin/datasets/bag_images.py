@@ -15,7 +15,7 @@ IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedIm
 
 
 class _Encoding(NamedTuple):
-    """Encoding of sensor_msgs/Image: bytes per value, number of channels, and OpenCV's code of the conversion to BGR.
+    """Encoding of sensor_msgs/Image: bytes per value, number of channels, and OpenCV's code for the conversion to BGR.
 
     The code is None for grey and BGR images, which are not converted.
     """
@@ -47,7 +47,7 @@ _ENCODINGS = {
 
 
 class BagImage:
-    """An image in a bag, which is read from the bag whenever its pixels are needed.
+    """An image in a bag; its message is read from the bag at each call of a method.
 
     Args:
         bag: the open bag.
@@ -59,7 +59,7 @@ class BagImage:
 
     @property
     def name(self) -> str:
-        """Returns topic and time of the image."""
+        """Returns the topic and the time [s] of the image, for messages."""
         return f"{self._position.topic} at {self._position.stamp_ns * 1e-9:.3f} s"
 
     def size_px(self) -> tuple[int, int]:
@@ -104,7 +104,7 @@ def raw_pixels(message: Any, size_px: tuple[int, int]) -> NDArray[Any]:
         size_px: (width, height) that the image must have.
 
     Raises:
-        UnreadableImage: the encoding is unknown, the image has another size or too few bytes.
+        UnreadableImage: the encoding is unknown, or the image has another size or too few bytes.
     """
     encoding = _encoding(message.encoding)
     width, height, step = int(message.width), int(message.height), int(message.step)

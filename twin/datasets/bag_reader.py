@@ -1,4 +1,4 @@
-"""Reader of ROS 2 bags: two image topics with their CameraInfo, and true poses from a topic that the user names."""
+"""Reader of ROS 2 bags: images of two topics, CameraInfo, sensor readings, and true poses of a topic that is named."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class BagReader:
         self._topics = topics or BagTopics()
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a path is an MCAP or SQLite file, or the folder of a ROS 2 bag."""
+        """Returns whether a path is an MCAP or SQLite file by its suffix, or the folder of a ROS 2 bag (`is_bag`)."""
         return is_bag(folder)
 
     def read(self, folder: Path) -> Dataset:
@@ -94,7 +94,8 @@ class BagReader:
         """Returns the image topics of both cameras: those that the user names, or the only pair in the bag.
 
         Raises:
-            TwinError: a named topic is not an image topic, or the bag has no or several stereo pairs.
+            TwinError: a named topic is not an image topic, or, without named topics, the bag has no or several stereo
+            pairs.
         """
         given = self._topics.left, self._topics.right
         images = image_topics(bag.topics)
@@ -113,10 +114,10 @@ def _image_times(bag: Bag, positions: list[BagMessage]) -> list[ImageTime]:
 
 
 def _calibration(bag: Bag, topics: StereoTopics, transforms: Transforms) -> StereoCalibration | None:
-    """Returns the calibration in the messages CameraInfo; None if one of the cameras has none.
+    """Returns the calibration in the first messages CameraInfo of both cameras; None if one of the cameras has none.
 
     Raises:
-        TwinError: the calibration cannot be used.
+        TwinError: the bag is damaged, or the calibration cannot be used.
     """
     if topics.left_info is None or topics.right_info is None:
         return None
@@ -130,10 +131,10 @@ def _calibration(bag: Bag, topics: StereoTopics, transforms: Transforms) -> Ster
 
 
 def _static_transforms(bag: Bag) -> Transforms:
-    """Returns the transforms in /tf_static: frame -> (parent, pose in the parent).
+    """Returns the transforms in /tf_static: frame -> (parent, pose of the frame in its parent).
 
     Raises:
-        TwinError: there are too many transforms, or one of them is not a pose.
+        TwinError: the bag is damaged, there are more than 10,000 frames, or a transform is not a pose.
     """
     found: Transforms = {}
     if bag.topics.get("/tf_static") != "tf2_msgs/msg/TFMessage":
@@ -152,17 +153,19 @@ def _frame(bag: Bag, topic: str) -> str:
 
 
 def _truth(bag: Bag, topic: str, camera: str, transforms: Transforms) -> tuple[Trajectory, str]:
-    """Returns the true poses of the left camera from a topic of poses, and a note on an assumption ("": none).
+    """Returns the true poses of the left camera in the order of time, and a note on an assumption ("" for none).
+
+    If the messages name no body or the images no frame, the recorded poses are taken as those of the left camera.
 
     Args:
         bag: the bag.
         topic: topic of the poses.
-        camera: frame of the left camera.
+        camera: frame of the left camera; "" if the images name none.
         transforms: static transforms, for the pose of the camera in the body whose poses are recorded.
 
     Raises:
-        TwinError: the topic does not exist or has no poses, a pose is damaged, or the transforms do not join body and
-            camera.
+        TwinError: the bag is damaged, the topic does not exist or has no poses, a pose is damaged, or the transforms do
+            not join body and camera.
     """
     kind = bag.topics.get(topic)
     if kind not in _POSES:
@@ -190,7 +193,7 @@ def _truth(bag: Bag, topic: str, camera: str, transforms: Transforms) -> tuple[T
 
 
 def _field(message: Any, path: tuple[str, ...]) -> Any:
-    """Returns the field of a message at a path of field names, from the outermost to the innermost."""
+    """Returns a nested field of a message, given the names of the fields from the outermost to the innermost."""
     for name in path:
         message = getattr(message, name)
     return message

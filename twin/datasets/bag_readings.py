@@ -34,17 +34,17 @@ _TYPES = {
     "sensor_msgs/msg/Imu": ATTITUDE,
     "geometry_msgs/msg/TwistWithCovarianceStamped": VELOCITY,
 }
-_Converter = Callable[[Any, str], tuple[Array, Array]]  # of a message and its place to values and variances
+_Converter = Callable[[Any, str], tuple[Array, Array]]  # from a message and its place to values and variances
 _IMU = "sensor_msgs/msg/Imu"
 _NO_ORIENTATION = "states an orientation."  # end of the note on topics without attitude
 _USUAL_WALK = 1e-4  # random walk of the bias of a gyroscope, which messages do not state [rad/s2/sqrt(Hz)]
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
-_N_FIRST = 100  # number of messages of a topic in which an orientation is looked for
+_N_FIRST = 100  # number of messages of a topic that are searched for an orientation
 _SAME_PLACE_M = 0.01  # largest distance between the origins of two frames that count as one place
 
 
 class _Recorded(NamedTuple):
-    """Readings of a topic and the frame in which they are given."""
+    """A topic, the coordinate frame that its messages name, and its readings."""
 
     topic: str
     frame: str
@@ -52,21 +52,21 @@ class _Recorded(NamedTuple):
 
 
 def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings | None:
-    """Returns the readings in a bag; None without any.
+    """Returns the readings in a bag; None if no topic has the type Imu, FluidPressure or TwistWithCovarianceStamped.
 
     The body is the frame of the attitude or, if there is none, that of the velocity or of the IMU. If /tf_static does
     not join this frame to the left camera, none of them is used. The attitude is that of the only topic of type Imu
     whose messages state an orientation; without one, the only topic with angular rates and specific forces gives the
-    vertical. A sensor is also not used if there are several topics of its type, if one of
-    its messages states no covariance, or if it is not where it must be: the pressure sensor at the left camera, the DVL
-    at the origin of the body (within 1 cm). Readings with a value or a covariance that is not finite are left out. The
-    notes of the result name the readings that are not used. Readings whose headers have no times have those of their
-    recording.
+    vertical. A sensor is also not used if there are several topics of its type, if a finite reading of it has no
+    covariance, or if it is not where it must be: the pressure sensor within 1 cm of the left camera, the DVL within
+    1 cm of the origin of the body. Readings with a value or a covariance that is not finite are left out. If all
+    headers of a topic have the time 0, the times of its readings are those of recording. The notes of the result state
+    which readings are not used and which times are those of recording.
 
     Args:
         bag: the bag.
         camera: frame of the left camera; "" if the images name none.
-        transforms: static transforms.
+        transforms: static transforms (`bag_calibration.Transforms`).
 
     Raises:
         TwinError: the bag is damaged, or a reading is impossible.
@@ -135,7 +135,15 @@ def _same_place(pose: Array | None) -> bool:
 
 
 def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[str]) -> _Recorded | None:
-    """Returns the velocities in the axes of the body; None, with a note, if the sensor is at another place."""
+    """Returns the velocities in body axes; None, with an entry in `notes`, if the DVL is not at the body's origin.
+
+    Each axis gets the largest of the three standard deviations.
+
+    Args:
+        velocity: velocities in the axes of the DVL.
+        body_from_sensor: (4, 4) pose of the DVL in the body; None: unknown, and the result is None.
+        notes: sentences on readings that are not used, to which a sentence may be appended.
+    """
     if body_from_sensor is None or not _same_place(body_from_sensor):
         notes.append(
             f"The readings of {velocity.topic} are not used: the DVL is not at the origin of the attitude's frame."
@@ -149,11 +157,11 @@ def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[st
 def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _Recorded | None:
     """Returns the readings of the only topic of a type; of Imu, the only one whose messages state an orientation.
 
-    The result is None if there is no such topic; also, with an entry in `notes`, if several topics have this type, if a
-    message has no covariance, or if the topic has no finite reading.
+    The result is None if there is no such topic; also, with an entry in `notes`, if there are several such topics, if
+    a finite reading has no covariance, or if no reading is finite.
 
     Raises:
-        TwinError: a reading is impossible.
+        TwinError: the bag is damaged, or a reading is impossible.
     """
     topics = [name for name, one in bag.topics.items() if one == kind]
     if quantity is ATTITUDE:
@@ -186,9 +194,12 @@ def _listed(topics: list[str]) -> str:
 
 
 def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str]:
-    """Returns those of the topics of type Imu that state an orientation, with its covariance if one of them has it.
+    """Returns those of the topics of type Imu that state an orientation, judged by their first `_N_FIRST` messages.
 
-    Topics of rates and specific forces alone are left out; if all are, an entry in `notes` says so.
+    A message states an orientation if it passes `_states_orientation`. If some of these topics have a covariance of the
+    orientation, the topics without one are left out. If no topic states an orientation, the result depends on the
+    messages: if all of them mark their orientation as not measured, it is empty, and an entry is added to `notes`;
+    otherwise it has all topics of type Imu.
 
     Raises:
         TwinError: the bag is damaged.
@@ -213,8 +224,8 @@ class _Messages(NamedTuple):
     """Contents of the messages of a topic.
 
     Args:
-        recorded: times and values; a value is NaN where value or variance of a message is not finite.
-        sigmas: (k,) largest standard deviations of the finite readings.
+        recorded: times and values; all values of a message are NaN if one of them or of its variances is not finite.
+        sigmas: (k,) largest standard deviation of each value over the finite readings.
         frame: frame of the last message; "" without messages.
         unstamped: whether all headers have the time 0, so that the times of `recorded` are those of recording.
     """
@@ -231,7 +242,7 @@ def _messages(bag: Bag, topic: str, convert: _Converter, n: int) -> _Messages | 
     Args:
         bag: the bag.
         topic: the topic.
-        convert: function that returns values (n,) and variances (n,) of a message.
+        convert: function that returns values (n,) and variances (n,) of a message, given the message and its place.
         n: number of values of a message.
 
     Raises:
@@ -258,20 +269,21 @@ def _messages(bag: Bag, topic: str, convert: _Converter, n: int) -> _Messages | 
 
 
 def _place(bag: Bag, topic: str, k: int) -> str:
-    """Returns the place of the message of this number, from 0, for messages."""
+    """Returns a text that names the bag, the topic and message number `k`, from 0, for use in error messages."""
     return f"{bag.path}:{topic}: message {k + 1}"
 
 
 def _height(message: Any, _: str) -> tuple[Array, Array]:
-    """Returns height above the level of zero pressure [m] and variance, each (1,), of a FluidPressure message."""
+    """Returns the height above the level of zero pressure [m] and its variance [m2], each (1,), of a FluidPressure."""
     variance = np.array([message.variance]) / PASCAL_PER_METRE**2
     return -np.array([message.fluid_pressure]) / PASCAL_PER_METRE, variance
 
 
 def _attitude(message: Any, place: str) -> tuple[Array, Array]:
-    """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) of a message Imu.
+    """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) [rad2] of a message Imu.
 
-    The result is zeros without an orientation, and NaN for an orientation that is not finite.
+    Both are zero if the message marks its orientation as not measured or states no variance. The angles are NaN if the
+    orientation is not finite.
 
     Raises:
         TwinError: the orientation is not a unit quaternion.
@@ -290,7 +302,7 @@ def _attitude(message: Any, place: str) -> tuple[Array, Array]:
 
 
 def _velocity(message: Any, _: str) -> tuple[Array, Array]:
-    """Returns the velocity (3,) [m/s] and its variances (3,) of a message TwistWithCovarianceStamped."""
+    """Returns the velocity (3,) [m/s] and its variances (3,) [m2/s2] of a message TwistWithCovarianceStamped."""
     linear = message.twist.twist.linear
     variances = np.array(message.twist.covariance).reshape(6, 6).diagonal()[:3]
     return np.array([linear.x, linear.y, linear.z]), variances.copy()

@@ -11,14 +11,14 @@ from twin.datasets.bag_images import COMPRESSED_IMAGE, IMAGE
 from twin.errors import TwinError
 
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-#: Words in topics that name the side of a camera.
+#: Words in the names of topics that state the side of a camera.
 _LEFT = re.compile(r"(^|[/_])(left|cam0|cam_0|camera0|camera_0|infra1|image_0)([/_]|$)", re.IGNORECASE)
 _RIGHT = re.compile(r"(^|[/_])(right|cam1|cam_1|camera1|camera_1|infra2|image_1)([/_]|$)", re.IGNORECASE)
 _RECTIFIED = re.compile(r"[/_]rect(_|$|/|ified)", re.IGNORECASE)
 
 
 class StereoTopics(NamedTuple):
-    """Image topics of both cameras, and the topics of their calibrations (None: not recorded)."""
+    """Image topics of both cameras, and the topics of their calibrations; None for one that was not recorded."""
 
     left: str
     right: str
@@ -27,17 +27,17 @@ class StereoTopics(NamedTuple):
 
     @property
     def rectified(self) -> bool:
-        """Returns whether the images are rectified, by the names that image_proc gives to topics (`image_rect`)."""
+        """Returns whether both topics are named as image_proc names rectified images, for example `image_rect`."""
         return all(_RECTIFIED.search(topic) is not None for topic in (self.left, self.right))
 
 
 def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
-    """Returns the image topics of a bag, each with the topic of its calibration.
+    """Returns the image topics of a bag, each with the topic of its calibration, or None if this was not recorded.
 
-    The calibration of an image topic NAMESPACE/NAME or NAMESPACE/NAME/compressed is NAMESPACE/camera_info.
+    The topic of the calibration of an image topic NAMESPACE/NAME or NAMESPACE/NAME/compressed is NAMESPACE/camera_info.
 
     Args:
-        topics: type of the messages of each topic.
+        topics: type of the messages of each topic of the bag.
     """
     found = {}
     for topic, kind in topics.items():
@@ -49,15 +49,15 @@ def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
 
 
 def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any], path: Path) -> StereoTopics:
-    """Returns the only stereo pair among image topics.
+    """Returns the only stereo pair among the image topics that have a calibration.
 
     A topic of uncompressed images takes precedence over the topic of the same images in compressed form. Left and
-    right are recognised by words in the topics, such as "left" or "cam0"; if these do not decide and two topics have a
-    calibration, the right camera is the one whose projection matrix has a baseline.
+    right are recognised by words in the topics, such as "left" or "cam0". If these do not decide and there are two
+    topics, the right camera is the one whose projection matrix P has a baseline (P[0, 3] < 0).
 
     Args:
         images: image topics, each with the topic of its calibration (None: not recorded).
-        first: function that returns the first message of a topic, or None.
+        first: function that returns the first message of a topic, or None for a topic without messages.
         path: the bag, for messages.
 
     Raises:
@@ -82,7 +82,7 @@ def _has_uncompressed(topic: str, images: Mapping[str, str | None]) -> bool:
 
 
 def _by_baseline(calibrated: Mapping[str, str | None], first: Callable[[str], Any]) -> list[list[str]]:
-    """Returns the topics of left and of right cameras: P[0, 3] of the CameraInfo is negative only for right ones."""
+    """Returns the image topics of left cameras and those of right ones, whose CameraInfo has P[0, 3] < 0."""
     sides: list[list[str]] = [[], []]
     for topic, info in calibrated.items():
         message = first(info) if info else None

@@ -24,7 +24,7 @@ class RecordedCamera:
 
     Args:
         size_px: (width, height) of the image; None if the calibration file does not state it.
-        matrix: (3, 3) camera matrix; the centre of the first pixel is at (0, 0) [px].
+        matrix: (3, 3) camera matrix [px]; the centre of the first pixel is at (0, 0).
         distortion: (n,) coefficients in the order of OpenCV; empty or zero for images without distortion.
         kind: "radtan" (k1, k2, p1, p2, k3, ...; the pinhole model of OpenCV) or "fisheye" (k1 to k4; the equidistant
             model of Kalibr).
@@ -57,7 +57,7 @@ class StereoCalibration:
         return float(np.linalg.norm(self.right_from_left[:3, 3]))
 
     def for_images(self, width_px: int, height_px: int) -> StereoCalibration:
-        """Returns the calibration with the size of the images, which the calibration file may leave out.
+        """Returns the calibration with the size of the images set, which a calibration file need not state.
 
         Raises:
             TwinError: the calibration does not fit images of this size.
@@ -80,10 +80,10 @@ class StereoCalibration:
 
 
 def checked(calibration: StereoCalibration) -> StereoCalibration:
-    """Returns the calibration, its rotation made exactly orthonormal, if its values are possible.
+    """Returns the calibration after checks of its values, with an exactly orthonormal rotation between the cameras.
 
     Raises:
-        TwinError: there is no baseline, the cameras are swapped or above each other, or a value is impossible; the
+        TwinError: there is no baseline, the cameras are swapped or not side by side, or a value is impossible; the
             message names the file.
     """
     file = str(calibration.file)
@@ -97,13 +97,13 @@ def checked(calibration: StereoCalibration) -> StereoCalibration:
 
 
 def is_rigid(pose: Array) -> bool:
-    """Returns whether the rotation of a pose (4, 4) is a rotation matrix, up to the rounding of calibration files."""
+    """Returns whether a pose (4, 4) is finite and has a rotation matrix, up to the rounding of calibration files."""
     deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
     return bool(deviation < _ORTHONORMAL and np.linalg.det(pose[:3, :3]) > 0)
 
 
 def _check_baseline(file: str, calibration: StereoCalibration) -> None:
-    """Raises TwinError unless the right camera lies to the right of the left one, at a possible distance."""
+    """Raises TwinError unless the right camera is to the right of the left one, at 0.1 mm to 10 m from it."""
     baseline_m = calibration.baseline_m
     # position of the right camera in the axes of the left one
     x, y, z = -(calibration.right_from_left[:3, :3].T @ calibration.right_from_left[:3, 3])

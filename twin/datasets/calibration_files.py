@@ -49,7 +49,9 @@ def read_calibration(file: Path) -> StereoCalibration:
 
 
 def find_calibration(folder: Path) -> Path | None:
-    """Returns the calibration file of a folder: calibration.yaml, its only YAML file, or cameras.txt; None without any.
+    """Returns the calibration file of a folder, or None if it has none.
+
+    It is calibration.yaml (or .yml), otherwise the only YAML file, otherwise cameras.txt.
 
     Raises:
         TwinError: the folder has several YAML files, and not exactly one of them is called calibration.
@@ -67,7 +69,7 @@ def camera_from_kalibr(table: Any, file: Path) -> RecordedCamera:
     """Returns a camera of a Kalibr camchain or of an ASL sensor.yaml (keys `intrinsics`, `distortion_coefficients`).
 
     Raises:
-        TwinError: a key is missing or not valid, or the camera or lens model is not supported.
+        TwinError: a value is missing or not valid, or the camera model or the lens model is not supported.
     """
     table = _table(table, file)
     if (model := table.get("camera_model", "pinhole")) != "pinhole":
@@ -80,7 +82,14 @@ def camera_from_kalibr(table: Any, file: Path) -> RecordedCamera:
 
 
 def pose_of(table: Any, key: str, file: Path) -> Array:
-    """Returns the pose (4, 4) of a table: a list of rows (Kalibr), or `rows`, `cols`, `data` (ASL).
+    """Returns the matrix (4, 4) of a pose in a table: a list of rows (Kalibr), or `rows`, `cols`, `data` (ASL).
+
+    The matrix is not checked to be a rigid motion.
+
+    Args:
+        table: table of a camera.
+        key: key of the pose in the table.
+        file: file of the table, for messages.
 
     Raises:
         TwinError: the pose is missing or not a matrix of 4 x 4 numbers.
@@ -105,10 +114,11 @@ def _kalibr(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 def _opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
     """Returns the calibration of an OpenCV file: M1, D1, M2, D2, R, T and the image size.
 
-    R may be a rotation matrix or a rotation vector; without R, the cameras are parallel.
+    R and T are the pose of the left camera in the axes of the right one. R may be a rotation matrix or a rotation
+    vector; without R, the cameras are parallel. If D1 or D2 is missing, its camera has no distortion.
 
     Raises:
-        TwinError: T is missing, or a value is not of the expected form.
+        TwinError: M1, M2 or T is missing, a value is not of the expected form, or the lens model is not supported.
     """
     keys = {str(key).lower().replace("_", ""): value for key, value in tree.items()}
     size = next((keys[key] for key in _SIZE_KEYS if key in keys), None)
@@ -138,7 +148,10 @@ def _opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 
 
 def _colmap(file: Path) -> StereoCalibration:
-    """Returns the calibration of a COLMAP cameras.txt; the pose of the second camera is in rigs.txt in its folder.
+    """Returns the calibration in COLMAP's cameras.txt and in rigs.txt, which has the pose of the second camera.
+
+    The left camera is the reference camera of the first rig in rigs.txt, in the same folder as cameras.txt; the right
+    camera is the second camera of this rig.
 
     Raises:
         TwinError: there are fewer than two cameras or no rigs.txt, or a line of either file is not valid.
@@ -159,9 +172,15 @@ def _colmap(file: Path) -> StereoCalibration:
 
 
 def _colmap_camera(file: Path, number: int, parts: list[str]) -> tuple[int, RecordedCamera]:
-    """Returns identifier and camera of a line of cameras.txt.
+    """Returns the identifier and the camera in a line of cameras.txt.
 
-    COLMAP has the corner of the first pixel at (0, 0); in the returned camera, its centre is at (0, 0).
+    In COLMAP, the corner of the first pixel is at (0, 0); in the returned camera, the centre of this pixel is at
+    (0, 0).
+
+    Args:
+        file: cameras.txt, for messages.
+        number: number of the line, from 1.
+        parts: columns of the line.
 
     Raises:
         TwinError: the line is not a camera, or its lens model is not supported.
@@ -194,10 +213,11 @@ def _table(value: Any, file: Path) -> Mapping[str, Any]:
 
 
 def _numbers(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Returns a list of numbers as an array, of a shape if it is given.
+    """Returns a list of numbers as an array, reshaped to `shape` if it is given.
 
     Raises:
-        TwinError: the value is not such a list, or has another number of numbers; the message names the key.
+        TwinError: the value is not a list of numbers below 1e12 in absolute value, or their number does not fit
+            `shape`; the message names `key`.
     """
     try:
         array = np.array(value, dtype=np.float64)
@@ -210,7 +230,11 @@ def _numbers(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = N
 
 
 def _size(value: Any, file: Path) -> tuple[int, int] | None:
-    """Returns an image size [width, height] as a tuple [px]; None if the value is None."""
+    """Returns an image size [width, height] as a tuple [px]; None if the value is None.
+
+    Raises:
+        TwinError: the value is not two numbers.
+    """
     if value is None:
         return None
     width, height = _numbers(value, file, "the image size", (2,))

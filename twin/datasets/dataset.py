@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 
 class ImageTime(NamedTuple):
-    """Time of an exposure [s], in the clock of the data set, and its image."""
+    """Time of an exposure [s], in the clock of the data set, and its image (`file`)."""
 
     time_s: float
     file: ImageSource
@@ -56,7 +56,7 @@ class Dataset:
         truth: recorded poses of the left camera (before rectification), in the clock of the data set; None if the data
             set has none; a TwinError if it cannot be read, which is raised unless the user gives another truth. The
             truth is never given to the estimators.
-        n_right_only: number of right images without a left image.
+        n_right_only: number of right images that belong to no left image.
         notes: sentences on the assumptions that the reader made.
         frame_times_s: (n,) times of all frames, with or without a left image [s], in the clock of the data set; None:
             the times of `images`.
@@ -79,7 +79,7 @@ class Dataset:
 
 
 class Reader(Protocol):
-    """Reader of one layout of data sets; other packages register their readers as entry points `twin.readers`.
+    """Reader of one layout of data sets; other packages register readers under the entry points `twin.readers`.
 
     Attributes:
         name: short name of the layout, for messages.
@@ -106,7 +106,11 @@ class Reader(Protocol):
 
 
 def check_times(dataset: Dataset) -> None:
-    """Raises TwinError unless the times of the frames may be seconds."""
+    """Raises TwinError if the times of the frames cannot be in seconds.
+
+    This is so if the absolute value of a time is above 1e11 s or not a number, or if the median of the intervals
+    between frames at different times is below 1e-5 s.
+    """
     times_s = np.array([frame.time_s for frame in dataset.images], np.float64)
     wrong = np.flatnonzero(~(np.abs(times_s) <= _LATEST_S))
     if len(wrong):
@@ -128,10 +132,10 @@ def value_or_error(read: Callable[[], T]) -> T | TwinError:
 
 
 def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple[list[StereoImages], int]:
-    """Returns the frames of two cameras with synchronised clocks, and the number of right images without a left image.
+    """Returns the frames of two cameras with a common clock, and the number of right images that belong to no frame.
 
-    The right image of a frame is the one nearest in time to the left image, if the times differ by at most a quarter of
-    the median interval between left images and by at most 10 ms. The order of the left images is kept.
+    There is one frame per left image, in their order. Its right image is the one nearest in time, if the times differ
+    by at most 10 ms and by at most a quarter of the median interval between left images; otherwise it has none.
     """
     if not left or not right:
         return [StereoImages(*one, None) for one in left], len(right)

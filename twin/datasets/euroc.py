@@ -1,4 +1,4 @@
-"""Reader of EuRoC/ASL folders (Burri et al. 2016): mav0/cam0, mav0/cam1, true poses and readings of the body."""
+"""Reader of EuRoC/ASL folders (Burri et al. 2016): mav0/cam0, mav0/cam1, true poses, readings of sensors."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ _POSITIONS = "leica0"  # folder with true positions of a prism, without attitude
 class EurocReader:
     """Reads folders in the EuRoC/ASL format.
 
-    The files have times in nanoseconds, poses of the sensors relative to the body, and true poses of the body; the data
-    set has times in seconds and true poses of the left camera.
+    In the files, times are in nanoseconds, and true poses are those of the body. In the returned `Dataset`, times are
+    in seconds, and true poses are those of the left camera (cam0).
     """
 
     name = "euroc"
@@ -38,7 +38,11 @@ class EurocReader:
         return all((_root(folder) / camera / "data.csv").is_file() for camera in ("cam0", "cam1"))
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder; raises TwinError if a list of its images is damaged."""
+        """Returns the data set in a folder.
+
+        Raises:
+            TwinError: a list of images is damaged or names a file outside of its folder.
+        """
         root = _root(folder)
         left, right = (_image_times(root / camera) for camera in ("cam0", "cam1"))
         frames, n_right_only = pair_by_time(left, right)
@@ -70,7 +74,7 @@ def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:
         body_from_left: (4, 4) pose of the left camera in the body.
 
     Raises:
-        TwinError: the file is damaged.
+        TwinError: the file is damaged or empty, or a quaternion is not of unit length.
     """
     rows = read_table(file, 8)
     norm = np.linalg.norm(rows[:, 4:8], axis=1)
@@ -99,7 +103,7 @@ def _readings(root: Path, body_from_left: Array) -> RecordedReadings | None:
 
 
 def _root(folder: Path) -> Path:
-    """Returns the folder of the sensors: mav0, or the folder itself."""
+    """Returns the folder of the sensors: the subfolder mav0 or, without it, the folder itself."""
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
@@ -118,7 +122,11 @@ def _image_times(camera: Path) -> list[ImageTime]:
 
 
 def _calibration(root: Path) -> StereoCalibration | None:
-    """Returns the calibration from the files sensor.yaml of both cameras; None if one of the files is missing."""
+    """Returns the calibration from the files sensor.yaml of both cameras; None if one of the files is missing.
+
+    Raises:
+        TwinError: a file is damaged, or the calibration cannot be used.
+    """
     files = [root / camera / "sensor.yaml" for camera in ("cam0", "cam1")]
     if not all(file.is_file() for file in files):
         return None
@@ -130,7 +138,7 @@ def _calibration(root: Path) -> StereoCalibration | None:
 
 
 def _body_from_left(root: Path) -> Array | None:
-    """Returns the pose (4, 4) of cam0 in the body; None without its sensor.yaml.
+    """Returns the pose (4, 4) of cam0 in the body; None if cam0 has no sensor.yaml.
 
     Raises:
         TwinError: the file is damaged, or the pose is not a rigid motion.

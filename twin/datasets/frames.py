@@ -32,9 +32,9 @@ class RecordedFrames:
 
     Attributes:
         rectification: conversion of the recorded images to a rectified pair.
-        start_s: time of the first frame in the clock of the data set [s]; the times of frames are relative to it.
-            Frames out of the order of time are left out (`increasing`).
-        skipped: number of frames or right images that could not be used, by reason, filled while the frames are read.
+        start_s: time of the first frame in the clock of the data set [s]; the times of the yielded frames are relative
+            to it. Frames out of the order of time are skipped (`increasing`).
+        skipped: number of frames or right images that could not be used, by reason, counted while the frames are read.
 
     Raises:
         TwinError: no left image can be read, or the calibration does not fit the images or cannot be rectified.
@@ -57,7 +57,7 @@ class RecordedFrames:
         return len(self.dataset.images)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Yields the usable frames; a frame whose right image cannot be used has only the left image."""
+        """Yields the usable frames, with indices from 0; `right` is None if the right image cannot be used."""
         self.skipped = Counter[str]()
         if self.dataset.n_right_only:
             self.skipped["right image without left image"] = self.dataset.n_right_only
@@ -80,13 +80,13 @@ class RecordedFrames:
 
     @property
     def unused(self) -> int:
-        """Returns the number of frames that could not be used, so far; frames without a right image are used."""
+        """Returns the number of frames skipped so far; a frame without a usable right image is not skipped."""
         return sum(
             count for reason, count in self.skipped.items() if reason == _OUT_OF_ORDER or reason.startswith("left")
         )
 
     def _read(self, image: ImageSource | None, side: str) -> Image | None:
-        """Returns an image; if it cannot be used, counts the reason in `skipped` and returns None."""
+        """Returns an image as RGB; if it cannot be used, adds the reason to `skipped` and returns None."""
         try:
             if image is None:
                 raise UnreadableImage("missing")
@@ -111,7 +111,7 @@ class RecordedFrames:
 def increasing(times_s: Array) -> NDArray[np.bool_]:
     """Returns a mask (n,) of a largest set of frames whose times increase in the order of the data set.
 
-    It is a longest increasing subsequence (Schensted 1961): one wrong time loses one frame, wherever it is.
+    The set is a longest increasing subsequence (Schensted 1961), so a single wrong time excludes a single frame.
 
     Args:
         times_s: (n,) times of the frames [s].
@@ -133,10 +133,10 @@ def increasing(times_s: Array) -> NDArray[np.bool_]:
 
 
 def _usual_size(dataset: Dataset) -> tuple[int, int]:
-    """Returns the most frequent (width, height) of the first readable left images [px].
+    """Returns the most frequent (width, height) of the first `_N_SIZES` readable left images [px].
 
     Raises:
-        TwinError: no image is readable.
+        TwinError: no left image is readable.
     """
     sizes, problem = Counter[tuple[int, int]](), ""
     for frame in dataset.images:
@@ -153,7 +153,7 @@ def _usual_size(dataset: Dataset) -> tuple[int, int]:
 
 
 def _frame_rate_hz(dataset: Dataset) -> float:
-    """Returns the frame rate [Hz] from the median of the positive intervals between the frames; 1 Hz without any."""
+    """Returns the frame rate [Hz] from the median of the positive intervals between frames; 1 Hz if there are none."""
     intervals = np.diff([frame.time_s for frame in dataset.images])
     intervals = intervals[intervals > 0]
     return 1 / float(np.median(intervals)) if len(intervals) else _NOMINAL_HZ

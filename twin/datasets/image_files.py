@@ -32,11 +32,12 @@ class UnreadableImage(Exception):  # noqa: N818 (the frame is skipped)
 
 
 class ImageFormat(NamedTuple):
-    """Format of the values in image files, for the conversion to 8-bit RGB.
+    """Format of the values of images, for the conversion to 8-bit RGB.
 
     Args:
         bits: number of bits in use in 16-bit images; 8 for 8-bit images.
-        bayer: pattern of the first two rows of raw images; None: grey or colour images.
+        bayer: pattern of raw images: the colours of the first two pixels of the first row, then of the second row;
+            None: grey or colour images.
     """
 
     bits: int = 8
@@ -44,7 +45,7 @@ class ImageFormat(NamedTuple):
 
 
 class StoredImage(Protocol):
-    """Image that is not a file of its own, for example a message of a bag."""
+    """Image that is not stored in a separate file, for example a message of a bag."""
 
     @property
     def name(self) -> str:
@@ -79,7 +80,7 @@ def image_size(image: ImageSource) -> tuple[int, int]:
     """Returns (width, height) of an image [px], from its header.
 
     Raises:
-        UnreadableImage: the image is missing, damaged, too large or of an unknown encoding.
+        UnreadableImage: the image is missing, damaged, too large or of an unknown encoding or file format.
     """
     width, height = encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
     if width * height > _MOST_PIXELS:
@@ -91,7 +92,7 @@ def encoded_size(data: bytes) -> tuple[int, int]:
     """Returns (width, height) [px] of the contents of a PNG, JPEG or TIFF file, from its header.
 
     Raises:
-        UnreadableImage: the data are no image.
+        UnreadableImage: the data are not a PNG, JPEG or TIFF image, or the image is too large.
     """
     return _header(data)[:2]
 
@@ -102,10 +103,10 @@ def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) ->
     Args:
         image: PNG, JPEG or TIFF file, or an image that is stored in another way.
         size_px: (width, height) that the image must have.
-        form: number of bits and Bayer pattern.
+        form: number of bits and Bayer pattern. The pattern is ignored for an image that has colours already.
 
     Raises:
-        UnreadableImage: the file is missing, damaged, no image, of an unknown format of values, or has another size.
+        UnreadableImage: the image is missing, damaged, too large, not in a supported format, or has another size.
     """
     pixels = _pixels(image, size_px)
     if pixels.dtype == np.uint16:
@@ -117,11 +118,16 @@ def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) ->
 
 
 def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer: Bayer | None) -> ImageFormat:
-    """Returns the format of the images of a data set, from a sample of them.
+    """Returns the format of the images of a data set, from a sample of up to `_N_SAMPLES` of them.
 
     Cameras with 10, 12 or 14 bits store 16-bit images in which only the lower bits are used. The number of bits in use
-    is the smallest one, at least 8, that holds the largest value in the sample. It is the same for all images of a
-    data set, of both cameras, so that grey levels stay comparable.
+    is the smallest one, at least 8, that holds the largest value in the 16-bit images of the sample. It is the same for
+    all images of both cameras, so that grey levels stay comparable.
+
+    Args:
+        images: all images of the data set.
+        size_px: (width, height) of the images; images of another size are left out.
+        bayer: pattern of raw images, which is copied to the result.
     """
     largest = 0
     for k in np.unique(np.linspace(0, len(images) - 1, _N_SAMPLES).astype(int)):
@@ -167,7 +173,7 @@ def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
     """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
 
     Raises:
-        UnreadableImage: the image cannot be used; also if a stored image of another package has another size.
+        UnreadableImage: the image cannot be used, or its size is not `size_px`.
     """
     pixels = decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
     if pixels.shape[1::-1] != size_px:
@@ -186,8 +192,8 @@ def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
         (H, W) or (H, W, channels) in the order BGR or BGRA, uint8 or uint16.
 
     Raises:
-        UnreadableImage: the data are damaged, no image, of an unknown format of values, or have another size or too
-            many pixels.
+        UnreadableImage: the data are damaged, not a PNG, JPEG or TIFF image, or not grey or RGB with 8 or 16 bits, or
+            the image has another size or too many pixels.
     """
     width, height, kind = _header(data)
     if (width, height) != size_px:

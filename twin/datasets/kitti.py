@@ -17,7 +17,7 @@ from twin.errors import TwinError
 
 
 class KittiReader:
-    """Reads a sequence of KITTI odometry, in colour (image_2, image_3) if it has colour images."""
+    """Reads a sequence of KITTI odometry: the colour images (image_2, image_3) or, without them, the grey ones."""
 
     name = "kitti"
     layout = "image_0 and image_1 (or image_2 and image_3), calib.txt and times.txt"
@@ -30,8 +30,8 @@ class KittiReader:
         """Returns the data set in a folder.
 
         Raises:
-            TwinError: the list of times is missing or damaged, an image has no time in it, or an image folder is not
-                valid (`image_files`).
+            TwinError: times.txt is missing or damaged or has no time for an image, or an image folder is not valid
+                (`image_files`).
         """
         number = 2 if (folder / "image_2").is_dir() else 0
         left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))
@@ -56,15 +56,15 @@ class KittiReader:
 
 
 def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Trajectory:
-    """Returns the poses of the left camera from a file with the pose (3, 4) of camera 0 in each line.
+    """Returns the poses of the left camera from a file with the first three rows of a pose of camera 0 in each line.
 
     Args:
         file: file of the poses.
-        times_s: (n,) times of the poses [s].
+        times_s: (n,) times of the frames [s]; line k of the file is the pose at the k-th time.
         body_from_left: (4, 4) pose of the left camera in the axes of camera 0; None: the left camera is camera 0.
 
     Raises:
-        TwinError: the file is damaged, or has more lines than there are times.
+        TwinError: the file is damaged, or has more poses than there are times.
     """
     rows = read_table(file, 12)
     if len(rows) > len(times_s):
@@ -83,7 +83,7 @@ def _calibration(file: Path, number: int) -> tuple[StereoCalibration, Array]:
     Both follow from the projection matrices (3, 4) of the cameras.
 
     Raises:
-        TwinError: the file has no such matrices, or their values are impossible.
+        TwinError: the file cannot be read or has no such matrices, or their values are impossible.
     """
     projections = {parts[0].rstrip(":"): parts[1:13] for _, parts in text_rows(file) if len(parts) >= 13}
     try:

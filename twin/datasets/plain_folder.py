@@ -14,12 +14,15 @@ from twin.datasets.text_files import inside, read_table
 from twin.errors import TwinError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff")
-_UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # unit of a time by its number of digits, as counted since 1970 [s]
+_UNITS = {19: 1e-9, 16: 1e-6, 13: 1e-3}  # unit [s] of a time since 1970, by its number of digits
 _ASSUMED_HZ = 1.0
 
 
 class PlainFolderReader:
-    """Reads left/ and right/ with images of equal names; the times are in times.txt or in the names of the images."""
+    """Reads left/ and right/ with images of equal names.
+
+    Times are those in times.txt or in the names of the images; without both, 1 frame per second is assumed.
+    """
 
     name = "folder"
     layout = "left/ and right/ with images of equal names, and a calibration (OpenCV, Kalibr or COLMAP)"
@@ -32,8 +35,7 @@ class PlainFolderReader:
         """Returns the data set in a folder.
 
         Raises:
-            TwinError: there are no images, the list of times is damaged, or an image folder is not valid
-                (`image_files`).
+            TwinError: there are no images, times.txt is damaged, or an image folder is not valid (`image_files`).
         """
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
@@ -51,17 +53,19 @@ class PlainFolderReader:
 
 
 def _calibration(folder: Path) -> StereoCalibration | None:
-    """Returns the calibration of a folder; None if it has no calibration file.
+    """Returns the calibration in a folder; None if the folder has no calibration file.
 
     Raises:
-        TwinError: the calibration file is damaged, or the folder has several (`find_calibration`).
+        TwinError: the calibration file is damaged, or there are several (`find_calibration`).
     """
     file = find_calibration(folder)
     return None if file is None else read_calibration(file)
 
 
 def image_files(folder: Path) -> dict[str, Path]:
-    """Returns the image files of a folder, by file name without suffix; hidden files (".NAME") are ignored.
+    """Returns the image files of a folder, by file name without suffix; empty if the folder does not exist.
+
+    Hidden files (".NAME") and files with other suffixes than `SUFFIXES` are ignored.
 
     Raises:
         TwinError: an image is a symbolic link that leads out of the folder, or two images have the same name without
@@ -84,7 +88,14 @@ def _natural_order(name: str) -> list[tuple[int, int | str]]:
 
 
 def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
-    """Returns the times of the images [s], from times.txt or the names of the images, and notes on assumptions made.
+    """Returns the times of the images [s], and notes on assumptions about them.
+
+    The times are those in times.txt, otherwise those in the names: seconds with a decimal point, or an integer number
+    of milliseconds, microseconds or nanoseconds since 1970 (`_UNITS`). Without both, 1 frame per second is assumed.
+
+    Args:
+        file: times.txt, one time [s] per line, in the order of `names`.
+        names: names of the images without suffix.
 
     Raises:
         TwinError: times.txt is damaged or does not have one time per image.

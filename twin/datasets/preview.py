@@ -1,4 +1,4 @@
-"""Preview of a data set: its first stereo pair with epipolar lines, matches and disparity, as one sheet."""
+"""Preview of a data set: one figure of its first stereo pair with epipolar lines, matched points and disparity."""
 
 from __future__ import annotations
 
@@ -16,10 +16,14 @@ _WIDTH_IN = 12.0
 
 
 def draw(opened: OpenedDataset, file: Path) -> Path:
-    """Writes the sheet as PNG and returns its path.
+    """Writes the figure as PNG and returns `file`.
 
     Upper row: the rectified pair with some epipolar lines, which are image rows, and the matched points, coloured by
     disparity. Lower row: dense disparity, and a histogram of the row differences of the matched points.
+
+    Args:
+        opened: the data set.
+        file: file to write, with the suffix .png.
 
     Raises:
         OSError: the file cannot be written.
@@ -49,7 +53,7 @@ def draw(opened: OpenedDataset, file: Path) -> Path:
 
 
 def rows(opened: OpenedDataset) -> list[tuple[str, ...]]:
-    """Returns the properties of the data set and of its first pair as the rows of a table."""
+    """Returns the rows of a table of the properties of a data set and its first pair: name, value, remark."""
     pair, rig = opened.pair, opened.pair.rig
     found = opened.frames
     depth_m = pair.points.xyz[:, 2]
@@ -67,12 +71,12 @@ def rows(opened: OpenedDataset) -> list[tuple[str, ...]]:
 
 
 def _known_share(opened: OpenedDataset) -> float:
-    """Returns the fraction of the pixels of the first left image that have a disparity."""
+    """Returns the fraction of the pixels of the left image of the first pair that have a disparity."""
     return float(np.isfinite(opened.pair.disparity.disparity_px).mean())
 
 
 def _draw_image(axes: Axes, image: np.ndarray, title: str) -> None:
-    """Draws an image with epipolar lines."""
+    """Draws an image with `_N_LINES` epipolar lines and a title, without axes."""
     axes.imshow(image)
     for row in np.linspace(0, image.shape[0], _N_LINES + 2)[1:-1]:
         axes.axhline(row, color="w", linewidth=0.5, alpha=0.6)

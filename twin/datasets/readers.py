@@ -29,7 +29,7 @@ def all_readers(topics: BagTopics | None = None) -> list[Reader]:
 
 
 def _registered() -> list[Reader]:
-    """Returns the readers that other packages register."""
+    """Returns the readers that other packages register; raises TwinError if one cannot be imported or created."""
     return [_created(plugin) for plugin in loading.registered(loading.READERS)]
 
 
@@ -41,11 +41,11 @@ def _created(plugin: loading.Registered) -> Reader:
 
 
 class _ForeignReader:
-    """Reader of another package; errors of the reader become a TwinError that names it.
+    """Reader of another package; every exception that it raises becomes a TwinError that names the reader.
 
     Args:
         reader: the reader.
-        value: module and class of the reader, for messages.
+        value: module and class of the reader ("module:Class"), for messages.
 
     Raises:
         AttributeError: the reader has no name, layout, recognises or read.
@@ -68,7 +68,7 @@ class _ForeignReader:
         return found
 
     def _call(self, function: Callable[[Path], Any], folder: Path) -> Any:
-        """Returns the result of a function of the reader; converts any error of the function to TwinError."""
+        """Returns the result of a function of the reader; any exception in the function becomes a TwinError."""
         try:
             return function(folder)
         except TwinError:
@@ -86,8 +86,9 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
         topics: topics of a ROS 2 bag that the user names.
 
     Raises:
-        TwinError: the folder does not exist, is empty, or has no known layout or no images of the left camera, or a
-            file of the data set is damaged.
+        TwinError: the folder does not exist, is empty, or has no known layout or no images of the left camera; a file
+            of the data set is damaged, or its times cannot be in seconds; or a reader of another package cannot be
+            loaded.
     """
     if problem := path_problem(folder):
         raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder or the bag of a data set")

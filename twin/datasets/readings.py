@@ -12,7 +12,7 @@ from twin.core.geometry import Array
 from twin.datasets.text_files import read_numbered_table, read_yaml
 from twin.errors import TwinError
 
-#: Smallest and largest standard deviation of a reading, as fractions of the largest value.
+#: Smallest and largest allowed standard deviation of a reading, as fractions of the largest allowed value.
 _SIGMA_SHARES = 1e-12, 1e6
 
 
@@ -58,12 +58,12 @@ class RecordedReadings(NamedTuple):
 
     Args:
         body_from_left: (4, 4) pose of the left camera, before rectification, in the body that the sensors refer to.
-        height: heights of the left camera above a horizontal plane, whose level may be unknown [m].
-        attitude: roll, pitch and yaw of the body in a world whose z axis points up [rad].
-        velocity: velocities of the origin of the body over ground, in body axes [m/s].
+        height: heights [m] of the left camera above a horizontal plane, whose level may be unknown.
+        attitude: roll, pitch and yaw [rad] of the body in a world whose z axis points up.
+        velocity: velocities [m/s] of the origin of the body over ground, in body axes.
         vertical: unit vectors that point upwards, in body axes, with one standard deviation [rad]
             (`inertial.vertical_series`); None if there is an attitude.
-        notes: sentences on readings that are not used.
+        notes: sentences on readings that are not used, and on assumptions about their times.
     """
 
     body_from_left: Array
@@ -80,8 +80,9 @@ class UncheckedReadings(NamedTuple):
     Args:
         source: topic or folder of the readings, for notes.
         times_s: (n,) times [s].
-        values: (n, k) readings; not finite where the sensor had none, as a DVL without bottom lock.
-        place: function that returns the place of a reading (file and line, or topic and message) for its number from 0.
+        values: (n, k) readings; NaN or infinite where the sensor measured nothing, such as a DVL without bottom lock.
+        place: function that returns the place of a reading (file and line, or topic and message), given its number,
+            from 0.
     """
 
     source: str
@@ -93,18 +94,18 @@ class UncheckedReadings(NamedTuple):
 def checked_series(
     quantity: SensorQuantity, recorded: UncheckedReadings, sigmas: Array, notes: list[str]
 ) -> SensorSeries | None:
-    """Returns the finite readings of a sensor after checking them; None without any.
+    """Returns the finite readings of a sensor after checks of them; None if there are none.
 
-    Readings that are not finite are left out; an entry in `notes` counts them.
+    Readings that are not finite are left out; an entry in `notes` states their number.
 
     Args:
         quantity: the measured quantity.
         recorded: the readings.
         sigmas: (k,) standard deviations.
-        notes: sentences on readings that are not used, to which sentences are appended.
+        notes: sentences on readings that are not used, to which a sentence may be appended.
 
     Raises:
-        TwinError: a time is not after the previous one, a value is too large, or a standard deviation is not positive.
+        TwinError: a time is not after the previous one, or a value or a standard deviation is outside its limits.
     """
     if not len(recorded.values):
         notes.append(f"There are no readings in {recorded.source}.")
@@ -136,11 +137,11 @@ def checked_series(
 
 
 def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
-    """Returns the readings in the folders pressure0, ahrs0 and dvl0 of an EuRoC-like data set; None without any.
+    """Returns the readings in the folders pressure0, ahrs0 and dvl0 of an EuRoC-like data set; None if none is there.
 
-    `data.csv` has the time [ns] and the values, `sensor.yaml` their standard deviations as `sigma` (one number or one
-    per value). Readings without a standard deviation are not used, nor are readings with an empty value or one that is
-    not finite.
+    In each folder, `data.csv` has the time [ns] and the values, and `sensor.yaml` their standard deviations as `sigma`
+    (one number, or one per value). A sensor without standard deviations is not used, nor are readings with a value that
+    is empty or not finite.
 
     Args:
         root: folder of the sensors.
@@ -164,7 +165,9 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
 
 
 def read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
-    """Returns the finite readings in a file data.csv; None without any. Sentences on the others go to `notes`.
+    """Returns the finite readings in a file data.csv; None if there are none.
+
+    A sentence on the readings that are left out is appended to `notes`.
 
     Raises:
         TwinError: a line is not a time and numbers, or a value is impossible.
@@ -177,12 +180,12 @@ def read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[st
 
 
 def _number(text: str) -> float:
-    """Returns the number in a column; NaN for an empty column. Raises ValueError for another text."""
+    """Returns the number that a text states; NaN for an empty text. Raises ValueError if it is not a number."""
     return float(text) if text.strip() else np.nan
 
 
 def _sigmas(file: Path, n: int) -> Array | None:
-    """Returns the standard deviations (n,) that a file sensor.yaml states as `sigma`; None if it states none.
+    """Returns the standard deviations (n,) in a file sensor.yaml (`sigma`); None if the file or `sigma` is missing.
 
     Raises:
         TwinError: the file is damaged, or `sigma` is neither a number nor n numbers.

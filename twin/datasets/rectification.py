@@ -1,4 +1,4 @@
-"""Rectification of recorded stereo pairs: removes lens distortion and turns both cameras to parallel axes."""
+"""Rectification of recorded stereo pairs: removes lens distortion and rotates both cameras to parallel axes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from twin.core.records import Image, StereoRig
 from twin.datasets.calibration import RecordedCamera, StereoCalibration
 from twin.errors import TwinError
 
-#: Largest differences of a pair that counts as rectified: rotation [rad], offset of the right camera across the
-#: baseline as a fraction of it, focal lengths and principal points [px].
+#: Largest deviations of a pair that counts as rectified: relative rotation [rad], y and z of the right camera as
+#: fractions of the baseline, differences of focal lengths and principal points [px].
 _PARALLEL_RAD, _ACROSS, _EQUAL_PX = 1e-6, 1e-6, 1e-3
 
 _Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -27,8 +27,8 @@ class Rectification(NamedTuple):
     Args:
         rig: calibration of the rectified pair.
         left_from_rectified: (4, 4) pose of the rectified left camera in the axes of the recorded one (a rotation).
-        maps: for each camera, column and row (H, W) of every rectified pixel in the recorded image; None if its
-            recorded images are used unchanged.
+        maps: for each camera (left, right), the columns (H, W) and the rows (H, W) at which the recorded image is
+            sampled for the pixels of the rectified image; None if its recorded images are used unchanged.
     """
 
     rig: StereoRig
@@ -41,23 +41,25 @@ class Rectification(NamedTuple):
         return "rectified as recorded" if self.maps == (None, None) else "rectified by `twin replay`"
 
     def left(self, image: Image) -> Image:
-        """Returns the rectified image of the left camera."""
+        """Returns the rectified image for a recorded image of the left camera."""
         return _resampled(image, self.maps[0])
 
     def right(self, image: Image) -> Image:
-        """Returns the rectified image of the right camera."""
+        """Returns the rectified image for a recorded image of the right camera."""
         return _resampled(image, self.maps[1])
 
 
 def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Rectification:
     """Returns the rectification for a calibration that states the size of the images.
 
-    A pair that was recorded rectified keeps the camera matrix of its left camera. Otherwise the rotations and the
-    common camera matrix are those of `cv2.stereoRectify` (Bouguet's method, alpha = 0: all pixels of a rectified image
-    lie in the recorded image), or of `cv2.fisheye.stereoRectify` with balance = 0.
+    For a pair that was recorded rectified (`is_rectified`), the camera matrix is that of its left camera. Otherwise,
+    the rotations and the common camera matrix are those of `cv2.stereoRectify` (Bouguet's method, alpha = 0: all pixels
+    of a rectified image lie in the recorded image) or, for fisheye lenses, of `cv2.fisheye.stereoRectify` with
+    balance = 0.
 
     Raises:
-        TwinError: the cameras have different lens models, or their views do not overlap.
+        TwinError: the images have to be rectified, and the cameras have different lens models or views that do not
+            overlap.
     """
     left, right = calibration.left, calibration.right
     assert left.size_px is not None
@@ -88,9 +90,11 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Recti
 
 
 def is_rectified(calibration: StereoCalibration) -> bool:
-    """Returns whether the recorded images are a rectified pair: no distortion, parallel axes, equal intrinsics.
+    """Returns whether the recorded images are a rectified pair.
 
-    The columns of the principal points may differ, as in the Middlebury data sets; the right image is then shifted.
+    Such a pair has no distortion, parallel axes, a baseline along the image rows, and equal focal lengths and rows of
+    the principal points. The columns of the principal points may differ, as in the Middlebury data sets; then
+    `rectification` shifts the right image.
     """
     left, right = calibration.left, calibration.right
     offset = calibration.right_from_left[:3, 3]
@@ -114,16 +118,16 @@ def _rig(matrix: Array, baseline_m: float, size_px: tuple[int, int], frame_rate_
 
 
 def _four(camera: RecordedCamera) -> Array:
-    """Returns the four distortion coefficients of a fisheye camera."""
+    """Returns the four distortion coefficients of a fisheye camera; zeros if it has none."""
     return camera.distortion if len(camera.distortion) == 4 else np.zeros(4)
 
 
 def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
-    """Returns column and row (H, W) [px] in the recorded image for each pixel of the rectified image.
+    """Returns the columns (H, W) and the rows (H, W) [px] in the recorded image of the pixels of the rectified image.
 
     Args:
         camera: the recorded camera.
-        turn: (3, 3) rotation from the axes of the recorded camera to those of the rectified one.
+        turn: (3, 3) rotation rectified_from_recorded between the axes of the camera.
         rig: calibration of the rectified pair.
     """
     size = rig.width_px, rig.height_px
@@ -135,9 +139,9 @@ def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
 
 
 def _resampled(image: Image, maps: _Maps | None) -> Image:
-    """Returns the image resampled at the positions of the maps by cubic interpolation, black outside the image.
+    """Returns the image resampled by cubic interpolation at the columns and rows in `maps`; black outside the image.
 
-    Without maps, returns the image unchanged.
+    If `maps` is None, the image is returned unchanged.
     """
     if maps is None:
         return image

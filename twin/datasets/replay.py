@@ -68,7 +68,8 @@ class ReplayOptions:
         settings: settings of the estimators, of which `window_tracks` and `wide_search` are replaced; None: the
             defaults.
         start: (4, 4) pose world_from_camera of the rectified left camera at the first frame; None: z is up by the
-            recorded attitude or, without one, the plane z = 0 of the world is fitted to the floor in the first pair.
+            recorded attitude or, without one, the plane z = 0 of the world is the floor plane of the first pair
+            (`floor_plane`).
         outputs: outputs in addition to metrics, trajectories and maps: "report", "recording".
         topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
         estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
@@ -118,7 +119,7 @@ class OpenedDataset(NamedTuple):
         frames: its rectified frames.
         truth: true poses of the rectified left camera, at times relative to the first frame; None without a truth.
         pair: the first stereo pair.
-        plane: plane of the floor in the axes of the left camera at the first pair.
+        plane: floor plane of the first pair, in the axes of the left camera (`floor_plane`).
         aiding: readings of the navigation sensors; None if none were recorded or they are not wanted.
         true_map: true heights in the frame of `truth`; None if they are not known.
     """
@@ -135,7 +136,7 @@ class OpenedDataset(NamedTuple):
 
     @property
     def plane_text(self) -> str:
-        """Returns a phrase that states how the plane of the map was chosen."""
+        """Returns a phrase that states how the plane of the map was chosen; a start in the options is ignored."""
         if self.aiding is not None and "attitude" in self.aiding.used:
             return "plane of the map horizontal by the recorded attitude"
         if self.aiding is not None and "vertical" in self.aiding.used:
@@ -148,7 +149,7 @@ def replay(
 ) -> ReplayResult:
     """Runs the estimators on a recorded data set and writes a run folder.
 
-    An interrupt (Ctrl-C) ends the current stage; the other stages are completed.
+    An interrupt (Ctrl-C) ends the current stage; the stages after it are completed.
 
     Args:
         folder: folder of the data set, or a ROS 2 bag.
@@ -157,8 +158,8 @@ def replay(
         progress: called with the stage ("replay", "map" or "report") and its completed fraction.
 
     Raises:
-        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder cannot be
-            written.
+        TwinError: the data set, one of its files or the estimator cannot be used (nothing was written), or the run
+            folder cannot be written.
     """
     chosen = options or ReplayOptions()
     check_loadable(ESTIMATOR_OPTION, ESTIMATORS, chosen.estimator)
@@ -215,7 +216,11 @@ class _Prepared(NamedTuple):
 
 
 def _prepared(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSettings) -> _Prepared:
-    """Returns rig, start and sensor noise; a start in the options precedes one from the readings."""
+    """Returns the rig, the start and the noise of the readings (the default noise without readings).
+
+    The start is that of the options; without one, that from the readings; without either, the camera above the floor
+    plane of the first pair.
+    """
     rig, over_plane, aiding = opened.frames.rectification.rig, opened.plane.world_from_camera, opened.aiding
     start = Start(over_plane if options.start is None else options.start)
     if aiding is None:
@@ -236,7 +241,7 @@ def _navigator(
         prepared: rig, start and sensor noise.
         settings: settings of the estimators.
         folder: folder of the keyframe images.
-        timer: timer of the stages.
+        timer: stopwatch of the stages.
     """
     rig, start, noise = prepared
     if estimator is None:
@@ -254,7 +259,7 @@ def _navigator(
 
 
 def alignment_name(name: str) -> AlignmentName:
-    """Returns `name` if it is the name of an alignment; raises TwinError otherwise."""
+    """Returns `name` if it is the name of an alignment (`AlignmentName`); raises TwinError otherwise."""
     for allowed in recorded.ALIGNMENTS:
         if name == allowed:
             return allowed
@@ -288,11 +293,12 @@ def image_topics(text: str | None) -> tuple[str, str] | None:
 
 
 def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
-    """Reads a data set and checks all that can be checked before the estimators run.
+    """Returns a data set with its calibration, truth and readings, after checks of these and of its first stereo pair.
 
     Raises:
-        TwinError: there is no calibration or no usable pair, the cameras are swapped, the calibration or the truth does
-            not fit the images, or a file is damaged.
+        TwinError: the folder has no known layout, there is no calibration or no usable pair, fewer than 30 points of
+            the first pair are matched, the cameras are swapped, the calibration or the truth does not fit the images, a
+            file is damaged, or topics are named for a data set that is not a bag.
     """
     in_bag = options.truth is not None and is_bag(folder) and not is_file(options.truth)
     left, right = options.topics or (None, None)
@@ -335,7 +341,7 @@ def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions
 
 
 def _aiding(dataset: Dataset, frames: RecordedFrames) -> Aiding | None:
-    """Returns the readings of a data set for its rectified frames; None without any.
+    """Returns the aiding by the recorded readings for the rectified frames; None if no readings were recorded.
 
     Raises:
         TwinError: the readings are damaged.
@@ -352,7 +358,8 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
     """Returns the true poses of the rectified left camera, at times relative to the first frame; None without a truth.
 
     Raises:
-        TwinError: the file of the truth is damaged, or none of its poses belongs to a frame (`associate`).
+        TwinError: the truth is damaged, a true position is impossible, or there are several frames and none of them has
+            a true pose at its time (`associate`).
     """
     truth = dataset.truth if file is None else read_truth(file, dataset)
     if isinstance(truth, TwinError):
@@ -373,10 +380,14 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
 
 
 def _ordered(truth: Trajectory, source: str) -> Trajectory:
-    """Returns true poses in the order of time, the first one where several have the same time.
+    """Returns the true poses in the order of time; of several poses at the same time, only the first one is kept.
+
+    Args:
+        truth: the true poses.
+        source: file or folder of the truth, for the message.
 
     Raises:
-        TwinError: a position is impossible.
+        TwinError: a coordinate of a position is larger than 1e8 m or not a number.
     """
     largest_m = float(np.abs(truth.positions).max(initial=0.0))
     if not largest_m <= _FARTHEST_M:
@@ -386,7 +397,7 @@ def _ordered(truth: Trajectory, source: str) -> Trajectory:
 
 
 def _estimate(opened: OpenedDataset, navigator: Navigator, progress: Progress) -> None:
-    """Passes all frames, with their readings, to the estimators; aligns the network after each segment of keyframes."""
+    """Passes all frames, with their readings, to the estimators, and aligns the network after each segment."""
     track, aligned, frames = 1, 0, opened.frames
     for k, frame in enumerate(frames):
         if opened.aiding is not None:
@@ -460,14 +471,14 @@ def _true_heights(
 
 
 def _unused(frames: RecordedFrames) -> list[str]:
-    """Returns a sentence if more than a tenth of the frames of the data set could not be used."""
+    """Returns one sentence if more than a tenth of the frames could not be used, otherwise an empty list."""
     if frames.unused <= _MOST_UNUSED * len(frames):
         return []
     return [f"{frames.unused} of {len(frames)} frames of the data set could not be used, see replay.skipped"]
 
 
 def _notes(opened: OpenedDataset, options: ReplayOptions, result: SurveyResult) -> tuple[str, ...]:
-    """Returns sentences on the assumptions of the reader, a plug-in, and readings that are not used or do not fit."""
+    """Returns the notes of the reader and the readings, and sentences on a plug-in and on readings that do not fit."""
     notes = list(opened.dataset.notes)
     if options.estimator is not None:
         notes.append(NOTE.format(options.estimator))
@@ -483,7 +494,7 @@ def _notes(opened: OpenedDataset, options: ReplayOptions, result: SurveyResult) 
 
 
 def _source(opened: OpenedDataset) -> dict[str, Any]:
-    """Returns texts on the data set (name, reader, images, plane of the map) for metrics.json and the run folder."""
+    """Returns texts on the replay for metrics.json and scenario.resolved.toml, by key."""
     return {
         "dataset": opened.name,
         "reader": opened.reader,
@@ -494,7 +505,7 @@ def _source(opened: OpenedDataset) -> dict[str, Any]:
 
 
 def _truth_of_frames(opened: OpenedDataset, options: ReplayOptions, result: SurveyResult) -> Trajectory | None:
-    """Returns the true poses of all frames in the world of the final trajectory; None if any frame has none."""
+    """Returns the true poses of all frames of the final trajectory, in its world; None unless every frame has one."""
     if opened.truth is None or not len(result.final):
         return None
     rows = associate(result.final.times_s, opened.truth.times_s)

@@ -38,7 +38,7 @@ def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
 
     Args:
         node: the node.
-        known: numbers of nodes that were counted before, by identity; it is extended.
+        known: number of values in each node that was counted before, by `id` of the node; new counts are added.
     """
     if id(node) not in known:
         known[id(node)] = math.inf  # while its children are counted
@@ -52,7 +52,7 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows.
 
     Raises:
-        YAMLError: the matrix is empty or too large, or the number of values is not rows times columns.
+        YAMLError: the matrix is empty or has more than 64 values, or their number is not rows times columns.
     """
     assert isinstance(node, yaml.MappingNode)
     matrix = loader.construct_mapping(node, deep=True)
@@ -66,7 +66,7 @@ def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list.
 
     Raises:
-        YAMLError: the array is empty or too large.
+        YAMLError: the array is empty or has more than 64 values.
     """
     assert isinstance(node, yaml.MappingNode)
     array = loader.construct_mapping(node, deep=True)
@@ -97,10 +97,10 @@ def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
-    """Returns the contents of a YAML file, also of one that OpenCV wrote (`%YAML:1.0`, matrices).
+    """Returns the contents of a YAML file; files written by OpenCV (`%YAML:1.0`, matrices) are accepted.
 
     Raises:
-        TwinError: the file is missing, too large or not a YAML table.
+        TwinError: the file is missing, too large, not valid YAML, or not a table (keys and values).
     """
     text = re.sub(r"\A%YAML[: ][^\n]*\n", "", read_text(file, _MOST_YAML_BYTES))
     try:
@@ -120,7 +120,7 @@ def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[flo
     Args:
         file: the file.
         columns: number of columns to read.
-        convert: function that converts the texts of one line to numbers; by default, float.
+        convert: function that converts the texts of one line to `columns` numbers; by default, float.
 
     Raises:
         TwinError: the file cannot be read, or a line has too few columns or a value that is not a finite number.
@@ -129,10 +129,10 @@ def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[flo
 
 
 class NumberedTable(NamedTuple):
-    """Numbers of a text file with their lines.
+    """Numbers of a text file with their line numbers.
 
     Args:
-        lines: (n,) numbers of the lines, from 1.
+        lines: (n,) line number of each row of `values`, from 1.
         values: (n, columns) numbers.
     """
 
@@ -143,13 +143,13 @@ class NumberedTable(NamedTuple):
 def read_numbered_table(
     file: Path, columns: int, n_finite: int, convert: Callable[[list[str]], list[float]] | None = None
 ) -> NumberedTable:
-    """Returns the numbers of a text file and the numbers of their lines, as `read_table` does.
+    """Returns the numbers of a text file with their line numbers; the format of the file is that of `read_table`.
 
     Args:
         file: the file.
         columns: number of columns to read.
         n_finite: number of columns, from the first one on, whose values must be finite.
-        convert: function that converts the texts of one line to numbers; by default, float.
+        convert: function that converts the texts of one line to `columns` numbers; by default, float.
 
     Raises:
         TwinError: the file cannot be read, a line has too few columns, or one of its values is not a number or, in the
@@ -174,7 +174,7 @@ def text_rows(file: Path) -> list[tuple[int, list[str]]]:
     Columns are separated by commas or white space.
 
     Raises:
-        TwinError: the file cannot be read, or a column is longer than 131072 characters.
+        TwinError: the file cannot be read, or a column of a line with commas is longer than 131072 characters.
     """
     lines = read_text(file).splitlines()
     try:
@@ -188,7 +188,7 @@ def text_rows(file: Path) -> list[tuple[int, list[str]]]:
 
 
 def inside(folder: Path, name: str, source: Path) -> Path:
-    """Returns the path of a file, given its name in a data set; the file must lie in `folder`.
+    """Returns the path of a file in `folder`, given its name in a data set; the file need not exist.
 
     Args:
         folder: the folder; a symbolic link that leads out of it is rejected as well.
@@ -196,7 +196,7 @@ def inside(folder: Path, name: str, source: Path) -> Path:
         source: file or folder that contains the name, for the message.
 
     Raises:
-        TwinError: the path leads out of the folder.
+        TwinError: the path leads out of the folder, or the name contains a null byte.
     """
     base = resolved(folder)
     if "\0" not in name and name == Path(name).name != ".." and not (base / name).is_symlink():

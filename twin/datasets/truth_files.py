@@ -49,14 +49,14 @@ def read_truth(file: Path, dataset: Dataset) -> Trajectory:
     """Returns the true poses of the left camera, in the clock of the data set.
 
     Args:
-        file: EuRoC/ASL data.csv (poses of the body), KITTI poses (camera 0, one line per frame), or TUM (poses of the
-            left camera: time x y z qx qy qz qw).
-        dataset: data set, for the times of a KITTI file (those of all frames, also of frames without a left image) and
-            for the pose of the left camera in the body or in camera 0. If this pose is unknown, the left camera is
-            taken to coincide with the body or with camera 0.
+        file: EuRoC/ASL data.csv (poses of the body), KITTI poses (of camera 0, one line per frame), or TUM (poses of
+            the left camera: time x y z qx qy qz qw).
+        dataset: data set, for the times of a KITTI file (those of all frames, with or without a left image) and for the
+            pose of the left camera in the body or in camera 0. If this pose is unknown, the left camera is assumed to
+            coincide with the body or with camera 0.
 
     Raises:
-        TwinError: the file cannot be read or is of another kind.
+        TwinError: the file cannot be read, is damaged, or is of none of these kinds.
     """
     rows = text_rows(file)
     if not rows:

@@ -56,13 +56,13 @@ def align(
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
 ) -> AlignmentResult:
-    """Computes the maximum-likelihood poses of a window of nodes.
+    """Returns the maximum-likelihood poses of a window of nodes, their covariances, and the links removed as outliers.
 
     Args:
         nodes: nodes of the window; their poses are the initial values.
         links: motions between nodes of the window.
-        anchors: prior covariance (6, 6) [rotation, translation] of each anchored node (rad, m), by node number; the
-            prior mean is the node's initial pose.
+        anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
+            prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
         rig: believed calibration of the stereo camera.
         noise: believed noise of the navigation sensors.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
@@ -120,8 +120,8 @@ class _Window(NamedTuple):
     def outliers(self, chi2: Array) -> Mask:
         """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
 
-        A link whose chi2 is far below the largest one is not removed in this round, because the link with the largest
-        chi2 may have distorted its residual. Links between consecutive nodes are never removed.
+        A link whose chi2 is below 1 % of the largest one is not removed in this round, because the link with the
+        largest chi2 may have distorted its residual. Links between consecutive nodes of the window are never removed.
         """
         motions = self.graph.binary[0]
         chi2 = np.where(motions.j - motions.i == 1, 0.0, chi2)
@@ -154,7 +154,10 @@ def _factor_graph(
 
 
 def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
-    """Returns the marginal covariances (n, 6, 6) of the nodes with the given numbers (None: all); zeros for others."""
+    """Returns the marginal covariances (n, 6, 6) of the n nodes, in the order of `index_of`.
+
+    They are zero for nodes that are not in `numbers`; None computes all of them.
+    """
     if numbers is None:
         return solution.marginals_in_place()
     covs = np.zeros((len(index_of), 6, 6))

@@ -30,7 +30,7 @@ class PairInspection(NamedTuple):
         rig: calibration of these images.
         disparity: dense disparity of the left image.
         points: matched points.
-        swapped: whether the matches show that the left and the right image are exchanged.
+        swapped: whether the left and the right image seem to be exchanged (`inspect_pair`).
     """
 
     left: Image
@@ -48,8 +48,8 @@ class FloorPlane(NamedTuple):
         normal: (3,) unit normal that points from the floor to the side of the camera.
         distance_m: distance of the camera from the plane [m].
         scatter_m: robust standard deviation of the points about the plane [m].
-        fitted: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis at their
-            median depth.
+        fitted: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis, at the
+            median depth of the points.
     """
 
     normal: Array
@@ -61,8 +61,8 @@ class FloorPlane(NamedTuple):
     def world_from_camera(self) -> Array:
         """Returns the pose (4, 4) of the camera in a world whose plane z = 0 is the floor plane.
 
-        The origin is the foot of the perpendicular from the camera; x is the direction of the image rows, projected
-        onto the plane.
+        The origin is the foot of the perpendicular from the camera to the plane; x is the x axis of the camera,
+        projected onto the plane.
         """
         along = np.array([1.0, 0, 0]) - self.normal[0] * self.normal
         x = along / np.linalg.norm(along)
@@ -73,8 +73,9 @@ class FloorPlane(NamedTuple):
 def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | None = None) -> PairInspection:
     """Matches the stereo pair of a frame over the widest range of disparities, and again with the two images exchanged.
 
-    If left and right image were swapped in the recording, disparities are negative, so almost no point is matched in
-    the given order, and many points are matched in the other order.
+    If the left and the right image were swapped in the recording, disparities are negative, so that almost no point is
+    matched in the given order, and many are in the other order. The images count as swapped if at least 30 points are
+    matched with the images exchanged, and at least three times as many as in the given order.
 
     Args:
         frame: frame with both images.
@@ -91,7 +92,7 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
 
 
 def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> tuple[Disparity, StereoPoints]:
-    """Returns the dense disparity and the matched points of a stereo pair."""
+    """Returns the dense disparity and the matched points of a stereo pair, over the widest range of disparities."""
     grays = matching.gray(left, 1), matching.gray(right, 1)
     widest_px = disparity.SearchRange(rig).max_disparity_px
     bytes_left, bytes_right = (np.round(gray).astype(np.uint8) for gray in grays)
@@ -101,13 +102,13 @@ def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSetti
 
 
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
-    """Returns the plane of the floor through the matched points of a pair; None for fewer than 30 points.
+    """Returns the plane of the floor, fitted to the matched points of a pair; None for fewer than 30 points.
 
     Of the planes through 300 random triples of points, that with the smallest median distance of all points (least
     median of squares, Rousseeuw 1984) is refined by least squares over the points within 2.5 robust standard
-    deviations. Where the points scatter by more than 15 % of their median depth, or the optical axis is more than 45
-    degrees from the normal of the plane (a wall, a horizon), the plane perpendicular to the optical axis at the median
-    depth is returned instead.
+    deviations of the best plane. The plane perpendicular to the optical axis at the median depth is returned instead if
+    the points scatter by more than 15 % of their median depth, or if the optical axis is inclined by more than 45
+    degrees to the perpendicular of the plane (a wall, a horizon).
 
     Args:
         points: matched points (`PairInspection.points`).
@@ -124,7 +125,12 @@ def floor_plane(points: StereoPoints) -> FloorPlane | None:
 
 
 def _fitted_plane(xyz: Array) -> tuple[Array, float, float]:
-    """Returns normal (towards the camera), distance and scatter [m] of the plane through points (n, 3)."""
+    """Returns the plane fitted to points (n, 3) [m] in camera axes.
+
+    Returns:
+        Unit normal (3,) towards the camera, distance of the camera from the plane, and scatter of the points about it
+        [m].
+    """
     rng, best = np.random.default_rng(_SEED), (np.inf, np.array([0.0, 0.0, -1.0]), 0.0)
     for _ in range(_TRIALS):
         a, b, c = xyz[rng.choice(len(xyz), 3, replace=False)]

@@ -1,4 +1,4 @@
-"""Selection of the earlier nodes to which a new node is linked, by predicted overlap."""
+"""Selection of the earlier nodes to which a new node is linked, by predicted overlap, and covariances of the links."""
 
 from __future__ import annotations
 
@@ -47,11 +47,12 @@ class _View(NamedTuple):
 
 
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
-    """Returns the overlap (n,) of a node with the left image at each of the poses (n, 4, 4), 0 to 1.
+    """Returns the overlap (n,), 0 to 1, of a node with the left image at each of the poses (n, 4, 4).
 
     The overlap is the fraction of the node's matched points that project into the other image, at least half a patch
     from its border. It is predicted from poses and depths, without the assumption of a flat floor. It is 0 for a node
-    without points, and for a camera farther away than the diagonal of the footprint at the largest depth.
+    without points, and for an image whose camera is farther from the node's camera than the diagonal of the node's
+    footprint at the largest depth of its points.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
@@ -74,15 +75,16 @@ def choose_links(
 
     Up to `max_links` candidates with sufficient overlap are selected, in this order of priority: the two previous
     nodes; the oldest node of the same swath, for the greatest distance along the path; the oldest node of all other
-    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap. Of these remaining nodes, a node
-    that is a neighbour of one selected before it (no node lies between them) comes last.
+    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap. The same swath is the unbroken
+    series of candidates with sufficient overlap before the two previous nodes. Among the remaining nodes, those that
+    directly precede or follow one selected from them earlier come last.
 
     Args:
         node: the new node.
         earlier: candidate nodes in chronological order.
         poses: (n, 4, 4) world_from_camera of the candidates.
         rig: believed calibration.
-        min_overlap: smallest overlap of a link, 0 to 1.
+        min_overlap: smallest sufficient overlap, 0 to 1.
         max_links: largest number of links.
         patch_px: side of the matching window [px].
 
@@ -124,10 +126,12 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
 
 
 def _links_over_a_footprint(links: Sequence[Link]) -> float:
-    """Returns the number m = 1 / (1 - overlap) of consecutive links during which a patch of floor stays in view.
+    """Returns the number m = 1 / (1 - q) of consecutive links during which a patch of floor stays in view.
+
+    q is the overlap of the link from the latest earlier node, limited to `_LARGEST_OVERLAP`; 0 without links.
 
     Args:
-        links: links of one node; the overlap is that of the link from the latest earlier node.
+        links: links of one node.
     """
     overlap = max(links, key=lambda link: link.i).overlap if links else 0.0
     return 1 / (1 - min(overlap, _LARGEST_OVERLAP))
@@ -136,9 +140,10 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 def floor_share(motion: Motion) -> float:
     """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
 
-    With r the standard deviation of the residuals divided by the expected one, the fraction is 1 - 1 / r^2, or 0 if r
-    does not exceed 1 by two standard errors. For n normally distributed residuals with three coordinates, r is the
-    median of n chi-distributed values divided by its expectation, and has a standard error of 0.56 / sqrt(n).
+    With r the robust standard deviation of the residuals divided by the expected one (`Motion.residual`), the fraction
+    is 1 - 1 / r^2, or 0 if r does not exceed 1 by two standard errors. For n normally distributed residuals with three
+    coordinates, r is the median of n chi-distributed values divided by its expectation, and has a standard error of
+    0.56 / sqrt(n).
 
     Args:
         motion: motion from `two_view_motion.pair_motion`.
@@ -148,18 +153,18 @@ def floor_share(motion: Motion) -> float:
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the run of consecutive indices newest, newest - 1, ... at the start of `linked` (descending).
+    """Returns the consecutive indices newest, newest - 1, ... with which the descending list `linked` begins.
 
-    These nodes lie on one swath. The run is empty if `linked` does not start with `newest`.
+    These nodes lie on one swath. The result is empty if `linked` does not start with `newest`.
     """
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
 def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """Returns up to `count` of the indices `others` in their order, except that neighbours of chosen nodes come last.
+    """Returns up to `count` of the indices `others`, in their order, but neighbours of nodes chosen before come last.
 
-    Neighbours are nodes between which there is no other node: their keyframe numbers differ by `node_stride`, the
-    smallest difference between consecutive nodes.
+    Neighbours are nodes between which there is no other node: their keyframe numbers differ by the smallest difference
+    between consecutive candidates (`EstimatorSettings.node_stride`).
 
     Args:
         others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
@@ -176,16 +181,16 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:
-    """Returns the camera displacement [m] at which the overlap is taken as zero.
+    """Returns the distance between two cameras [m] from which on their overlap is taken as zero.
 
-    It is the diagonal of the image footprint at the largest depth of the points (n, 3) [m].
+    It is the diagonal of the footprint at the largest depth of the points (n, 3), which are in camera axes [m].
     """
     return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 
 @njit(cache=True, nogil=True)
 def _overlaps(world, position, poses, reach, view):
-    """Compiled kernel of `overlaps`.
+    """Compiled kernel of `overlaps`; returns the overlaps (n,).
 
     Args:
         world: (m, 3) matched points of the node in the world [m].
@@ -213,7 +218,13 @@ def _overlaps(world, position, poses, reach, view):
 
 
 def to_link(node: Keyframe, other: Keyframe, overlap: float, result: Motion) -> Link:
-    """Returns the link from the earlier node `other` to the new `node`, given the measured motion."""
+    """Returns the link from the earlier node `other` to the new `node`.
+
+    Args:
+        node, other: the two nodes.
+        overlap: predicted overlap of the two, 0 to 1.
+        result: measured motion, the pose of `node` in the camera axes of `other`.
+    """
     return Link(
         other.number, node.number, result.a_from_b, result.cov, overlap, result.n_points,
         closed_form=result.closed_form, floor_share=floor_share(result),

@@ -35,7 +35,7 @@ class LinkQueue:
     """Queue of link measurements, one entry per node, in chronological order.
 
     Args:
-        background: true to measure links in a separate thread, which is faster with images; otherwise `collect`
+        background: whether links are measured in a separate thread, which is faster with images; otherwise `collect`
             measures them.
     """
 
@@ -44,7 +44,7 @@ class LinkQueue:
         self._pending: deque[Callable[[], list[Link]]] = deque()
 
     def submit(self, measure: Callable[[], list[Link]]) -> None:
-        """Adds one node; `measure` is a function that measures and returns its links."""
+        """Adds the measurement of the links of one node; `measure` is a function that measures and returns them."""
         self._pending.append(self._executor.submit(measure).result if self._executor else measure)
 
     def collect(self, all_but: int = 0) -> Iterator[list[Link]]:
@@ -64,11 +64,11 @@ class LinkQueue:
             yield links
 
     def drop(self) -> None:
-        """Drops the pending measurements."""
+        """Drops the pending measurements; those submitted to the thread may still run, but their links are not used."""
         self._pending.clear()
 
     def close(self) -> None:
-        """Ends the thread; pending measurements are dropped."""
+        """Drops the pending measurements and ends the thread, after the measurement in progress."""
         self.drop()
         if self._executor is not None:
             self._executor.shutdown(cancel_futures=True)
@@ -85,12 +85,12 @@ class AlignmentHistory:
         after_ga: for each alignment at the end of a track, positions (n, 3) of the keyframes just after it [m].
         link_residuals: for each attempted link measurement, the residual of the points divided by the expected one;
             NaN where the measurement failed.
-        disparity_offsets: for each measured link, the offset of all disparities that its points imply; links that do
-            not determine an offset are left out.
-        frame_sigmas_m: for each keyframe at which it is known, the standard deviation (3-D) of the translation since
-            the previous keyframe, from frame-to-frame motion alone [m].
-        nodes_bridged: number of nodes linked to the previous node only by the F2F motion (predicted where tracking
-            failed), because the link could not be measured.
+        disparity_offsets: for each measured link, the offset of all disparities, estimated from the points of the link;
+            links that do not determine an offset are left out.
+        frame_sigmas_m: the standard deviation (3-D) of the position of each keyframe relative to the previous keyframe,
+            from frame-to-frame motion alone [m]; keyframes at which it is not known are left out.
+        nodes_bridged: number of nodes linked to the previous node by the F2F motion (predicted where tracking failed),
+            because this link could not be measured.
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -104,7 +104,7 @@ class AlignmentHistory:
 
 
 class KeyframeNetwork:
-    """Keyframes of a survey, the nodes among them, and the measured motions that link the nodes.
+    """Keyframes of a survey, those of them that are nodes, and the measured motions that link the nodes.
 
     Args:
         vision: source of the visual measurements, including the links.
@@ -132,7 +132,7 @@ class KeyframeNetwork:
         self.reference_cov = _REFERENCE_COV
 
     def close(self) -> None:
-        """Ends the background thread."""
+        """Drops the pending link measurements and ends the background thread."""
         self._queue.close()
 
     @property
@@ -151,7 +151,10 @@ class KeyframeNetwork:
         return keyframe.number % self.settings.node_stride == 0
 
     def overlap_with_last(self, world_from_camera: Array) -> float:
-        """Returns the predicted overlap, 0 to 1, of the last keyframe with the image at a pose (4, 4)."""
+        """Returns the predicted overlap, 0 to 1, of the last keyframe with the left image at a pose (4, 4).
+
+        This is the fraction of the keyframe's matched points that project into that image (`link_selection.overlaps`).
+        """
         last = self.keyframes[-1]
         poses = np.ascontiguousarray(world_from_camera[None])
         return float(link_selection.overlaps(last, poses, self.rig, self.settings.patch_px)[0])
@@ -173,13 +176,13 @@ class KeyframeNetwork:
     def connect(
         self, node: Keyframe, chain: Link | None, bridge: Link | None, displacement: Displacement | None
     ) -> None:
-        """Adds a node and queues the measurement of its links to earlier nodes.
+        """Adds a node and queues the measurement of its links to earlier nodes other than the last one.
 
         Args:
             node: the new node.
             chain: measured link from the last node; None if the measurement failed or this is the first node.
-            bridge: link from the last node that consists of the F2F motion, to replace a `chain` that could not be
-                measured; otherwise None.
+            bridge: link from the last node that consists of the F2F motion, fused with the DVL; it replaces a `chain`
+                that could not be measured; otherwise None.
             displacement: displacement since the last node, measured by the DVL; None if it was not measured.
 
         Raises:
@@ -204,12 +207,12 @@ class KeyframeNetwork:
         self._node_poses[len(self.nodes) - 1] = node.world_from_camera
 
     def align_window(self, track: int) -> Array | None:
-        """Aligns the window of tracks that ends with `track`, and rebuilds the mosaic from the keyframes of `track`.
+        """Aligns the nodes of the window of tracks that ends with `track`, and rebuilds the mosaic from this track.
 
         Returns:
             (6, 6) marginal covariance of the pose of the last node [rotation, translation] (rad, m), in its camera
-            axes; None if the global alignment is switched off, there are fewer than two nodes, or none of them lies in
-            the window.
+            axes; None if the global alignment is switched off, there are fewer than two nodes, or none of the nodes
+            lies in the window.
 
         Raises:
             SurveyAborted: the alignment failed.
@@ -231,12 +234,12 @@ class KeyframeNetwork:
         return aligned.covs[-1]
 
     def align_all(self) -> Array | None:
-        """Aligns all nodes by the links measured so far; `truncate` waits for those in progress.
+        """Aligns all nodes by the links in the network. Call `truncate` first, which adds the links in progress.
 
         Returns:
             (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the pose of the latest node up to this
-            keyframe. None if the global alignment is switched off, if an earlier alignment or link measurement failed,
-            if `abandon_alignment` was called, or if there are fewer than two nodes.
+            keyframe. None if the global alignment is switched off, if an earlier alignment failed or a queued link
+            measurement raised an error, if `abandon_alignment` was called, or if there are fewer than two nodes.
 
         Raises:
             SurveyAborted: the alignment failed; a second call returns None.
@@ -256,8 +259,11 @@ class KeyframeNetwork:
     def truncate(self, n_frames: int) -> None:
         """Removes the keyframes, nodes and links of all frames after the first `n_frames`.
 
-        Waits for the link measurements in progress. Keyframes of later frames exist if an interrupt stopped the
-        processing of a frame.
+        First waits for the link measurements in progress and adds their links. Keyframes of later frames exist if an
+        interrupt stopped the processing of a frame.
+
+        Args:
+            n_frames: number of frames to keep.
 
         Raises:
             OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
@@ -270,14 +276,19 @@ class KeyframeNetwork:
     def _links_of(
         self, node: Keyframe, others: list[tuple[Keyframe, float]], chain: Link | None, bridge: Link | None
     ) -> list[Link]:
-        """Returns all links of one new node; the covariances of its measured links are inflated for shared noise."""
+        """Returns all links of one new node; the covariances of the measured links are inflated for shared noise."""
         measured = self._measure(node, others)
         return link_selection.inflate_for_shared_noise([*measured, chain] if chain else measured) + (
             [bridge] if bridge else []
         )
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """Returns the links from earlier nodes (given as pairs of node and overlap) that could be measured."""
+        """Returns the links from earlier nodes that could be measured, and adds the results to the history.
+
+        Args:
+            node: the new node.
+            others: earlier nodes with their predicted overlaps, 0 to 1.
+        """
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         self.history.link_residuals += [np.nan if motion is None else motion.residual for motion in motions]
         offsets = [motion.disparity_offset for motion in motions if motion is not None]
@@ -306,13 +317,16 @@ class KeyframeNetwork:
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
         """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
 
-        Older nodes that are linked to the given nodes are fixed. Keyframes between nodes keep their pose relative to
-        the preceding node. Links rejected as outliers are removed from the network.
+        Older nodes that are linked to the given nodes are held fixed. Keyframes that are not nodes keep their pose
+        relative to the preceding node. Links rejected as outliers are removed from the network.
 
         Args:
-            nodes: nodes to align, in the order of time, up to the newest node.
-            track: number of the track, for the record.
+            nodes: nodes to align, in chronological order, up to the newest node.
+            track: number of the track, stored in the history.
             marginals: numbers of the nodes whose marginal covariances are computed; None for all nodes.
+
+        Returns:
+            The result for the fixed nodes followed by the given ones.
 
         Raises:
             SurveyAborted: the alignment failed.
@@ -341,7 +355,10 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets the poses of nodes, by number; other keyframes keep their pose relative to the preceding node."""
+        """Sets the poses (4, 4) of nodes, given by number.
+
+        Later keyframes that are not nodes keep their pose relative to the preceding node.
+        """
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

@@ -1,7 +1,7 @@
 """Navigation pipeline, after Negahdaripour & Madjidi 2003.
 
 Frame-to-frame motion (F2F) is estimated at every frame. Stereo matching, registration with the mosaic (F2M) and the
-measurement of links are done at keyframes, and the global alignment (GA) at the end of each track.
+measurement of links are done at keyframes, and the global alignment (GA) at the end of each track and of the survey.
 """
 
 from __future__ import annotations
@@ -57,12 +57,12 @@ _SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equa
 
 
 class MotionSinceNode(NamedTuple):
-    """Motion since the last node of the network.
+    """Motion since the last node of the network, from frame-to-frame motion fused with the DVL.
 
     Args:
         motion: (4, 4) pose of the camera at the current frame in the camera at the node.
-        cov: (6, 6) covariance of `motion` [rotation, translation] (rad, m).
-        cov_at_node: (6, 6) covariance of the online pose at the node.
+        cov: (6, 6) covariance of `motion` [rotation, translation] (rad, m), in the axes of the current camera.
+        cov_at_node: (6, 6) covariance of the online pose at the node, in the camera axes of the node.
     """
 
     motion: Array
@@ -71,7 +71,7 @@ class MotionSinceNode(NamedTuple):
 
 
 class Navigator:
-    """Estimates the trajectory of a stereo camera from its frames. Use as a context manager, or call `close`.
+    """Estimates the trajectory of a stereo camera and the map from frames. Use as a context manager, or call `close`.
 
     Args:
         rig: believed calibration.
@@ -83,7 +83,7 @@ class Navigator:
         vision: source of the visual measurements, closed by the caller; by default, they are computed from the images
             of the frames.
         folder: folder for keyframe images and the mosaic while the survey runs; by default a temporary folder.
-        stopwatch: returns the context manager that times the stage of a given name.
+        stopwatch: function that returns a context manager which times the stage of a given name.
     """
 
     def __init__(
@@ -117,16 +117,17 @@ class Navigator:
         self.close()
 
     def close(self) -> None:
-        """Ends the threads and removes the temporary folder."""
+        """Ends the threads and removes the temporary folder, if one was created."""
         self._resources.close()
 
     def set_start_cov(self, cov: Array, prior_cov: Array) -> None:
-        """Sets how well the start is known; by default it is nearly exact. Call it before the first frame.
+        """Sets the covariances of the pose at the start, which is nearly exact by default. Call before the first frame.
 
         Args:
             cov: (6, 6) covariance of the start [rotation, translation] in camera axes (rad, m), for the online pose.
-            prior_cov: (6, 6) covariance with which the alignments hold the first node at the start. It is larger than
-                `cov` where readings at all nodes determine the pose of the network, so that they count once.
+            prior_cov: (6, 6) the same for the prior of the first node in the alignments. It should be large in the
+                directions that the readings at all nodes determine: these readings are factors of the alignment, and a
+                prior computed from them would count them twice.
         """
         self.filter.cov = cov
         self.network.reference_cov = prior_cov
@@ -134,14 +135,14 @@ class Navigator:
     def update(self, frame: Frame, track: int = 1) -> Estimate:
         """Processes one frame and returns its online estimate.
 
-        A frame with a stereo pair becomes a keyframe if `frame.keyframe` is True. If that is None, it becomes one if
-        there is no keyframe yet, if tracking failed, or if the next pair is expected to overlap with the last keyframe
-        by less than `settings.keyframe_overlap`. In both cases, a pair with too few matched points does not become a
-        keyframe.
+        A frame with a stereo pair becomes a keyframe if `frame.keyframe` is True. If `frame.keyframe` is None, it
+        becomes one if there is no keyframe yet, if tracking failed, or if the next pair is expected to overlap with the
+        last keyframe by less than `settings.keyframe_overlap`. In no case does a pair with too few matched points
+        become a keyframe.
 
         Args:
             frame: images and sensor readings of the frame; later than all previous frames.
-            track: number of the track, from 1; `align_track` aligns a window of tracks.
+            track: number of the track to which the frame belongs, from 1 (see `align_track`).
 
         Raises:
             ValueError: the frame is not later than the last one, or an image is not of the size that the calibration
@@ -294,16 +295,17 @@ class Navigator:
         restore: Restore | None = None,
         progress: Callable[[float], None] | None = None,
     ) -> Iterator[OrthoTile] | None:
-        """Returns the orthomosaic of the keyframe images, tile by tile; None without such images.
+        """Returns an iterator over the tiles of the orthomosaic of the keyframe images; None if there are no images.
 
         Args:
             result: result of the survey (`finish`).
             elevation: map of the survey (`build_map`).
-            restore: removes the effects of lamps and water from an image; None: colours as seen, at equal exposure.
+            restore: function that removes the effects of lamps and water from an image; None: colours as seen, at equal
+                exposure.
             progress: called with the finished fraction, 0 to 1.
 
         Raises:
-            OSError: an image could not be read; also while the tiles are computed.
+            OSError: an image could not be read. The iterator raises it too.
         """
         rows = result.keyframe_rows
         if len(rows) == 0 or self.vision.left_image(int(rows[0])) is None:
@@ -348,19 +350,19 @@ class Navigator:
         return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
 
     def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the error models of the sensors for a given interval between frames [s], and the DVL state."""
+        """Returns the sensors' error models for the interval since the last frame [s], and the DVL state."""
         return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
 
     def set_dead_reckoning(self, state: DeadReckoningState) -> None:
-        """Replaces the poses and covariances by those of a dead-reckoning state."""
+        """Replaces the F2F pose, the online pose and the motion since the last node by those of a given state."""
         self.f2f_pose = state.f2f
         self.since_node = self.since_node._replace(motion=state.since_node, cov=state.since_node_cov)
         self.filter.world_from_camera, self.filter.cov = state.online, state.cov
 
     def _image_vision(self, folder: Path | None) -> StereoVision:
-        """Creates the source of visual measurements from images, in `folder` or, if it is None, in a temporary folder.
+        """Returns a source of visual measurements from images, which stores them in `folder`.
 
-        `Navigator.close` closes the source and removes the temporary folder.
+        If `folder` is None, a temporary folder is created. `close` closes the source and removes the temporary folder.
         """
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
@@ -369,8 +371,8 @@ class Navigator:
     def _interval_s(self, time_s: float) -> float:
         """Returns the time since the last frame [s].
 
-        This is the nominal interval at the first frame, and where the time since the last frame differs from it only by
-        rounding.
+        The nominal interval is returned at the first frame, and where the time since the last frame differs from the
+        nominal interval only by rounding.
 
         Raises:
             ValueError: the frame is not later than the last one.
@@ -382,11 +384,12 @@ class Navigator:
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
 
     def _is_keyframe(self, frame: Frame, status: str) -> bool:
-        """Returns whether a frame becomes a keyframe, as far as this does not depend on its matched points.
+        """Returns whether a frame is to become a keyframe by the rules of `update`, before its points are matched.
 
-        The next stereo pair is expected after the same motion as that since the last pair. If it overlapped with the
-        last keyframe by less than `settings.keyframe_overlap`, the present pair becomes a keyframe. Without this
-        prediction, consecutive keyframes would overlap by less than this fraction where pairs are far apart.
+        The motion from this stereo pair to the next is expected to equal the motion since the last pair. If, after this
+        motion, the next pair would overlap with the last keyframe by less than `settings.keyframe_overlap`, this pair
+        becomes a keyframe. Without this prediction, consecutive keyframes would overlap by less than this fraction
+        where pairs are far apart.
         """
         if frame.right is None or frame.keyframe is not None:
             return bool(frame.keyframe) and frame.right is not None
@@ -400,9 +403,16 @@ class Navigator:
     def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
         """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
 
+        If too few points are matched in stereo, the frame does not become a keyframe and only position fixes are fused.
+
+        Args:
+            frame: frame with both images.
+            track: number of its track.
+            status: "ok", or the reason why tracking failed at this frame.
+
         Returns:
             `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
-            motion of a frame that tracking has lost is measured by the link from the last node.
+            link from the last node measures the motion of a frame at which tracking failed.
         """
         row = len(self.log)
         points = self.vision.observe_stereo(frame, row)
@@ -434,8 +444,8 @@ class Navigator:
         """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
 
         The motion from two stereo pairs is more accurate than the motion accumulated over the frames between them, and
-        gives the global alignment better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections by
-        navigation sensors since the last node are kept.
+        gives the global alignment better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections of
+        the pose since the last node, by navigation sensors and by F2M, are kept.
 
         Returns:
             The link from the last node, or None if it could not be measured.
@@ -475,7 +485,7 @@ class Navigator:
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
         """Adds a node to the network, linked to the last node by `chain`, or by the F2F motion if `chain` is None.
 
-        The motion since the last node then restarts at this node.
+        The motion since the last node is then counted from this node.
         """
         bridge = None
         if self.network.nodes and chain is None:
@@ -489,7 +499,7 @@ class Navigator:
 
         Args:
             before: (4, 4) pose of the last keyframe before the alignment.
-            node_cov: (6, 6) covariance of the pose of the last node [rotation, translation] (rad, m).
+            node_cov: (6, 6) covariance of the aligned pose of the last node [rotation, translation] (rad, m).
         """
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(before) @ self.filter.world_from_camera
@@ -508,7 +518,8 @@ def _in_map(result: SurveyResult) -> tuple[SurveyResult, Array]:
 def finish_in_stage(navigator: Navigator, guard: StageGuard) -> SurveyResult:
     """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted.
 
-    The alignment is the stage "alignment" of the guard, which records why it failed.
+    The alignment is the stage "alignment" of the guard. Why it failed is stored in `guard.cause`, unless a cause is set
+    already; an interrupt adds the stage to `guard.skipped`.
     """
     try:
         if (result := guard.attempt("alignment", navigator.finish)) is not None:

@@ -7,7 +7,7 @@ from twin.core.growing_array import GrowingArray
 
 
 class PoseLog:
-    """Times and estimated poses of all frames; memory grows by 264 bytes per frame.
+    """Times and estimated poses of all frames; each frame takes 264 bytes of memory.
 
     Attributes:
         n_lost: number of frames whose motion was not measured but predicted.
@@ -36,7 +36,7 @@ class PoseLog:
         return self._online.array
 
     def append(self, times_s: float | Array, f2f: Array, online: Array) -> None:
-        """Appends one frame or several: times () or (n,) [s], poses (4, 4) or (n, 4, 4)."""
+        """Appends one frame, with a time [s] and poses (4, 4), or n frames, with times (n,) and poses (n, 4, 4)."""
         self._times_s.append(times_s)
         self._f2f.append(f2f)
         self._online.append(online)

@@ -45,7 +45,7 @@ def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields a finding for lost frames, one for nodes not linked to the previous node, and one for failed links."""
+    """Yields findings for many lost frames, for nodes not linked to the previous node, and for many failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
@@ -61,7 +61,7 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:
-    """Yields a finding if stereo pairs have too few matched points, and one if the texture repeats."""
+    """Yields a finding if many stereo pairs have too few matched points, and one if the texture repeats."""
     pairs = result.stereo_observations
     if not pairs:
         return
@@ -76,7 +76,7 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
-    """Yields a finding for each rectification error that remains in the images: row offset, yaw, other patterns.
+    """Yields a finding for each rectification error above its limit: row offset, yaw, pattern of row differences.
 
     The scatter of row differences within a region of the image is not a finding: the covariances of matches include it
     (`stereo.row_noise_ratio`).
@@ -104,10 +104,10 @@ def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
 
 
 def _consistency(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
-    """Yields a finding for each sign of inconsistent links or large uncertainty.
+    """Yields a finding for each quantity that shows inconsistent links or a large uncertainty.
 
-    These are large residuals of matched points, a significant offset of all disparities, a large chi-square of the
-    links, and large standard deviations of positions.
+    These are the residuals of the matched points, the offset of all disparities, the chi-square of the links, and the
+    standard deviations of keyframe positions, both relative to the previous keyframe and in the world.
     """
     quality = result.quality
     if quality.link_residual is not None and quality.link_residual > MAX_LINK_RESIDUAL:

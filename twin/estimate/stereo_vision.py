@@ -36,10 +36,10 @@ _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern
 
 
 class _MatchedPair(NamedTuple):
-    """Matched stereo pair: right image without the known rectification errors, its grey levels, disparity and points.
+    """Result of the matching of one stereo pair.
 
     Args:
-        right_image: right image at full size.
+        right_image: (H, W, 3) right image at full size, without the known rectification errors.
         right: grey levels of the right image at the image scale.
         dense_px: (H, W) disparity by semi-global matching [px], NaN where unknown.
         points: matched points.
@@ -52,7 +52,7 @@ class _MatchedPair(NamedTuple):
 
 
 class StereoVision:
-    """Visual measurements from images, at an image scale chosen from the texture of the first keyframe.
+    """Visual measurements from images. Their binning is chosen from the texture at the first keyframe (`image_scale`).
 
     Use as a context manager, or call `close`.
 
@@ -61,8 +61,8 @@ class StereoVision:
         settings: settings of the estimators.
         folder: folder for the images of keyframes and the tiles of the mosaic.
         cell_m: cell size of the mosaic for images of full size [m]; for binned images it is multiplied by the binning.
-            By default the ground sample distance of the first keyframe.
-        stopwatch: returns the context manager that times the stage of a given name.
+            By default, it is the ground sample distance of the first keyframe at full size.
+        stopwatch: function that returns a context manager which times the stage of a given name.
     """
 
     runs_in_background = True  # matching takes long enough to justify a separate thread
@@ -98,7 +98,7 @@ class StereoVision:
         self.matcher.close()
 
     def _configure(self, binning: int) -> None:
-        """Creates the image spool, the tracker and the matcher for images of this binning."""
+        """Creates the image spool, the tracker, the matcher and the search range for images of this binning."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self._pattern_fits: dict[int, Array] = {}  # by frame index
@@ -111,7 +111,7 @@ class StereoVision:
 
     @cached_property
     def mosaic(self) -> Mosaic:
-        """The mosaic, created when first used; requires a keyframe."""
+        """The mosaic; it is created at the first access, which requires a keyframe."""
         assert self._points is not None
         cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
@@ -126,13 +126,16 @@ class StereoVision:
         return time_s - last if time_s > last else None
 
     def _on_plane(self, world_from_camera: Array) -> Array:
-        """Returns the pose (4, 4) in the axes of the mosaic, which are chosen at the first keyframe."""
+        """Returns the pose (4, 4) of a camera in the axes of the mosaic, which are chosen at the first call."""
         if self._plane_from_world is None:
             self._plane_from_world = viewing_plane(world_from_camera)
         return self._plane_from_world @ world_from_camera
 
     def _choose_scale(self, left: Image, right: Image) -> None:
-        """Sets the image scale from a stereo pair, before the first keyframe is stored."""
+        """Chooses the binning from a stereo pair, before the first keyframe is stored, and applies it if it changed.
+
+        The current left image is then processed again at the new binning.
+        """
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
@@ -141,7 +144,7 @@ class StereoVision:
             self.f2f.step(self._image)
 
     def _set_image(self, left: Image) -> None:
-        """Computes the grey levels and the normalised image of the current left image."""
+        """Makes an image (H, W, 3) the current left image: computes its grey levels and its normalised image."""
         self._gray = matching.gray(left, self.binning)
         self._image = matching.normalise(self._gray)
 
@@ -171,7 +174,7 @@ class StereoVision:
         return pair.points
 
     def _match_pair(self, right_image: Image) -> _MatchedPair:
-        """Matches the current left image with a right image, after removal of the known rectification errors."""
+        """Matches the current left image with a right image, from which known rectification errors are removed."""
         right_image = self.calibration.rectify(right_image, self.full_rig)
         right = matching.gray(right_image, self.binning)
         dense_px = disparity.search(self._image, matching.normalise(right), self.search_range.max_disparity_px)
@@ -182,7 +185,15 @@ class StereoVision:
         return _MatchedPair(right_image, right, dense_px, points)
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
-        """Returns the number of matched points, image quality and row differences [px of the full image] of a pair."""
+        """Returns the number of matched points, the image quality and the row differences of a stereo pair.
+
+        Row differences are in pixels of the full image with square pixels.
+
+        Args:
+            row: index of the frame in the trajectories.
+            left: (H, W, 3) left image of the frame, not resampled.
+            points: matched points.
+        """
         contrast, saturated = matching.contrast(self._gray), matching.saturated_fraction(left)
         repeated = repetition(self._image, self.settings.patch_px)
         if not len(points.xyz):
@@ -237,9 +248,9 @@ class StereoVision:
         return motions
 
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
-        """Returns the motion between two nodes, predicted by features of the whole images and then measured.
+        """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
 
-        None if the node has no points, if the features do not give a prediction, or if the measurement fails.
+        None if `node` has no points, if the features do not give a prediction, or if the measurement fails.
         """
         if node.points is None:
             return None
@@ -272,7 +283,11 @@ class StereoVision:
         )
 
     def _light_pattern(self, rows: NDArray[np.int64]) -> LightPattern | None:
-        """Returns the light pattern of keyframes at these frame indices, from at most `_PATTERN_PAIRS` of them."""
+        """Returns the light pattern of the images; None if it is not needed or not known (`light_pattern`).
+
+        Args:
+            rows: frame indices of the keyframes, of which at most `_PATTERN_PAIRS` are used.
+        """
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
         return light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
 
@@ -289,20 +304,28 @@ class StereoVision:
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
     """Returns half the side of the square of the mosaic that is used for registration [m].
 
-    This is 0.6 times the width of the footprint at the 90th percentile of depth. The largest depth is not used: one
-    mismatch with a disparity of 0.5 px would make the square so large that it needs 20 GB of memory.
+    This is 0.6 times the width of the footprint at the 90th percentile of the depths of the points. The largest depth
+    is not used: one mismatch with a disparity of 0.5 px would make the square so large that it needs 20 GB of memory.
     """
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 
 
 def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
-    """Returns the depth (H, W) [m]; NaN where the disparity is unknown or not above one pixel."""
+    """Returns the depth (H, W) [m] of a disparity (H, W) [px]; NaN where this is unknown or not above one pixel."""
     usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
     return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)
 
 
 def _check_size(frame: Frame, size_px: tuple[int, int]) -> None:
-    """Raises ValueError if an image of a frame is not of the size (width, height) that the calibration states [px]."""
+    """Checks the sizes of the images of a frame.
+
+    Args:
+        frame: frame to check; a missing image passes.
+        size_px: width and height that the calibration states [px].
+
+    Raises:
+        ValueError: an image has another size.
+    """
     for side, image in (("left", frame.left), ("right", frame.right)):
         if image is not None and image.shape[1::-1] != size_px:
             found, expected = (" x ".join(str(n) for n in size) for size in (image.shape[1::-1], size_px))

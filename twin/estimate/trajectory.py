@@ -13,8 +13,8 @@ from twin.core.geometry import Array
 def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
     """Interpolates the poses of keyframes to all frames along the frame-to-frame motion.
 
-    From each keyframe, the poses follow the frame-to-frame motion to the next keyframe. The misclosure there, i.e. the
-    motion from the pose thus computed to the pose of that keyframe, is distributed linearly over the frames in between.
+    From each keyframe, the poses follow the frame-to-frame motion to the next keyframe. The misclosure, i.e. the motion
+    from the pose so reached to the given pose of the next keyframe, is distributed linearly over the frames in between.
 
     Args:
         f2f: (n, 4, 4) poses from frame-to-frame motion alone.
@@ -43,9 +43,9 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
 
 @njit(cache=True, nogil=True)
 def _distribute(world_from_start, f2f, misclosure, out):
-    """Writes the poses `world_from_start` @ `f2f`, corrected for the misclosure (6,), to `out` (n, 4, 4).
+    """Writes the poses `world_from_start` @ `f2f`, corrected for the twist `misclosure` (6,), to `out` (n, 4, 4).
 
-    Pose k receives the fraction k / n of the misclosure; pose n, the next keyframe, would receive all of it.
+    Pose k of the n poses is moved by the fraction k / n of the misclosure; pose n would be that of the next keyframe.
     """
     step = 1 / len(f2f)
     for k in range(len(f2f)):

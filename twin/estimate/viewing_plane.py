@@ -1,4 +1,4 @@
-"""Choice of the axes of a mosaic or an elevation map: heights are measured along their z axis, towards the camera."""
+"""Choice of the axes of a mosaic or an elevation map, whose z axis points from the floor towards the cameras."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MAX_TILT_RAD = np.deg2rad(45.0)
 
 
 def viewing_plane(world_from_camera: Array) -> Array:
-    """Returns plane_from_world (4, 4), the transformation to axes in which a camera looks down on the plane z = 0.
+    """Returns plane_from_world (4, 4), the transformation from the world to axes in which heights are measured along z.
 
     This is the identity if the optical axis of the camera is within 45 degrees of straight down; otherwise it is the
     smallest rotation about the origin that turns the optical axis to -z.

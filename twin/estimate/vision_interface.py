@@ -64,19 +64,23 @@ class Vision(Protocol):
         ...
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
-        """Returns the correction of the latest keyframe's predicted pose by F2M, or None if the registration fails."""
+        """Returns the correction of the latest keyframe's pose by F2M, or None if the registration fails.
+
+        Args:
+            world_from_camera: (4, 4) predicted pose of the keyframe.
+        """
         ...
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
-        """Adds the latest keyframe, with this keyframe number, to the mosaic at the given pose."""
+        """Adds the latest keyframe, whose number is `number`, to the mosaic at the given pose."""
         ...
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
-        """Clears the mosaic and rebuilds it from these keyframes, which are the most recent, at their current poses."""
+        """Clears the mosaic and rebuilds it from the given keyframes, the most recent ones, at their current poses."""
         ...
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Returns the motion from each of the other nodes to this node; None where it cannot be measured.
+        """Returns, for each of the other nodes, the motion from it to `node`; None where it cannot be measured.
 
         May be called from another thread.
         """
@@ -87,7 +91,7 @@ class Vision(Protocol):
         ...
 
     def discard(self, numbers: range) -> None:
-        """Frees the memory of the keyframes with these numbers; they must not be linked afterwards."""
+        """Frees the memory of the keyframes with these numbers; `measure_motions` must not be called for them later."""
         ...
 
     def build_map(
@@ -99,7 +103,7 @@ class Vision(Protocol):
             result: result of the survey, with the final trajectory.
             grid: grid of the map.
             step_cov: (n_keyframes, 6, 6) covariance of the pose of each keyframe relative to the previous keyframe.
-            progress: called with the number of keyframes that are done.
+            progress: called with the number of keyframes processed so far.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Yaw, pitch and roll of a camera that looks down, as photogrammetry and marine imaging define them."""
+"""Yaw, pitch and roll of a camera as photogrammetry and marine imaging define them: zero for one that looks down."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ import numpy as np
 
 from twin.core.records import Array
 
-#: Axes (top of the image, right, line of sight) in those of the camera (right, down, line of sight).
+#: Rotation from the axes (top of the image, right, line of sight) to those of the camera (right, down, line of sight).
 _CAMERA_FROM_TOP_RIGHT_SIGHT = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-#: Axes east, north, up in those of north, east, down.
+#: Rotation from the axes (east, north, up) to (north, east, down).
 _NED_FROM_ENU = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 

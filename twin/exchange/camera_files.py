@@ -14,11 +14,12 @@ from twin.exchange.run_contents import CameraIntrinsics, RecordedImu, RigCalibra
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the calibration in the forms of OpenCV, Kalibr and COLMAP; returns the folders `believed` and `true`.
+    """Writes the calibration in the formats of OpenCV, Kalibr and COLMAP; returns the folders `believed` and `true`.
 
     The believed calibration is that of the estimators, with which the images were rectified. The true calibration
-    describes the same rectified images: if the believed one has errors, the rectified images still have some distortion
-    and a relative rotation. Without a known true calibration, only `believed` is written.
+    describes the same rectified images: if the believed one has errors, these images still have some distortion and
+    the cameras some relative rotation. If the true calibration is not known, only `believed` is written. Runs with an
+    IMU also get imu.yaml (Kalibr).
     """
     written = []
     for name, rig in (("believed", contents.believed), ("true", contents.true)):
@@ -35,7 +36,10 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def write_opencv(file: Path, rig: RigCalibration) -> None:
-    """Writes an OpenCV file: M1, D1, M2, D2, R, T (right from left), image_width, image_height, residual_px."""
+    """Writes an OpenCV file: M1, D1, M2, D2, R, T, image_width, image_height, residual_px.
+
+    1 is the left camera, 2 the right one; R and T [m] are the pose of the left camera in the axes of the right one.
+    """
     right_from_left = geometry.inverse(rig.left_from_right)
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     try:
@@ -57,9 +61,10 @@ def write_opencv(file: Path, rig: RigCalibration) -> None:
 
 
 def write_kalibr(file: Path, rig: RigCalibration, with_imu: bool = False) -> None:
-    """Writes a Kalibr camchain: cam0 left, cam1 right with T_cn_cnm1; k3 is left out, as the model radtan has none.
+    """Writes a Kalibr camchain: cam0 is the left camera, cam1 the right one, with T_cn_cnm1.
 
-    With an IMU, whose axes are those of the body, each camera also has T_cam_imu.
+    The coefficient k3 is left out, because Kalibr's model radtan has none. With an IMU, whose axes are those of the
+    body, each camera also has T_cam_imu.
     """
     right_from_left = geometry.inverse(rig.left_from_right)
     left_from_body = geometry.inverse(rig.body_from_left)
@@ -72,7 +77,7 @@ def write_kalibr(file: Path, rig: RigCalibration, with_imu: bool = False) -> Non
 
 
 def write_kalibr_imu(file: Path, imu: RecordedImu) -> None:
-    """Writes the imu.yaml of Kalibr: noise densities, random walks, rate and topic (that of --to mcap)."""
+    """Writes the imu.yaml of Kalibr: noise densities, random walks, rate, and topic (as in the ROS 2 bag of `ros2`)."""
     tree = {"rostopic": "/imu/data_raw", "update_rate": float(imu.rate_hz), **imu.noise._asdict()}
     file.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")
 
@@ -91,7 +96,7 @@ def _kalibr_camera(camera: CameraIntrinsics, name: str) -> dict[str, Any]:
 
 
 def write_colmap_cameras(folder: Path, rig: RigCalibration) -> None:
-    """Writes cameras.txt and rigs.txt of COLMAP: camera 1 left, camera 2 right; rig 1 has camera 1 as its reference."""
+    """Writes cameras.txt and rigs.txt of COLMAP: camera 1 (left) is the reference of rig 1, camera 2 is the right."""
     lines = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     lines += [f"{k} {_colmap_camera(camera)}" for k, camera in ((1, rig.left), (2, rig.right))]
     (folder / "cameras.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -101,13 +106,13 @@ def write_colmap_cameras(folder: Path, rig: RigCalibration) -> None:
 
 
 def colmap_pose(camera_from_world: np.ndarray) -> str:
-    """Returns a pose (4, 4) in the form of COLMAP: QW QX QY QZ TX TY TZ."""
+    """Returns a pose (4, 4) as text in the order of COLMAP: QW QX QY QZ TX TY TZ."""
     values = [*geometry.quaternion_wxyz(camera_from_world[:3, :3]), *camera_from_world[:3, 3]]
     return " ".join(f"{value:.17g}" for value in values)
 
 
 def _colmap_camera(camera: CameraIntrinsics) -> str:
-    """Returns model, size and parameters of a camera as text; COLMAP has the corner of the first pixel at (0, 0)."""
+    """Returns model, size and parameters of a camera as text; in COLMAP, the corner of the first pixel is at (0, 0)."""
     (width, height), matrix, distortion = camera.size_px, camera.matrix, camera.distortion
     values = [matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5]
     model = "PINHOLE"

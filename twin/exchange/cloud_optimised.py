@@ -1,6 +1,6 @@
-"""Maps as cloud-optimised GeoTIFF (COG): tiled, compressed, with overviews, in the CRS of the scene or in local metres.
+"""Maps as cloud-optimised GeoTIFF (COG): tiled, compressed, with overviews, in a CRS or in scene coordinates.
 
-Cells and pixels have the same scene coordinates as in the files of a run (`geotiff`), so all layers overlay exactly.
+Cells and pixels have the same scene coordinates as in the files of a run (`geotiff`), so all layers coincide exactly.
 """
 
 from __future__ import annotations
@@ -24,11 +24,12 @@ _OPTIONS = {"compress": "DEFLATE", "bigtiff": "IF_SAFER"}
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes dem.tif, dem_sigma.tif, dem_error.tif and orthomosaic.tif, and returns these files.
 
-    dem_error.tif is written only if the truth is known. Without a file of the orthomosaic, orthomosaic.tif has one
-    pixel per map cell, with the colours of `ElevationMap.mosaic`.
+    dem_error.tif is written only if the true elevations are known. Without a file of the orthomosaic, orthomosaic.tif
+    has one pixel per map cell, with the colours of `ElevationMap.mosaic`.
 
     Raises:
         OSError: the folder cannot be written.
+        ValueError: a georeference is given, and the orthomosaic is rotated or its pixels are not square.
     """
     elevation, origin = contents.elevation, contents.georeference
     assert elevation is not None  # by `ExportFormat.needs`
@@ -52,7 +53,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def write_elevations(path: Path, height_m: Layer, grid: MapGrid, georeference: Georeference | None) -> None:
-    """Writes heights (rows, cols) as `geotiff.write_elevations` does, but cloud-optimised."""
+    """Writes heights (rows, cols) [m] as `geotiff.write_elevations` does, but cloud-optimised."""
     with TemporaryDirectory(dir=path.parent) as temporary:
         source = Path(temporary) / "layer.tif"
         geotiff.write_elevations(source, height_m, grid, "elevation [m]", georeference)
@@ -68,15 +69,15 @@ def write_layer(path: Path, values: Layer, grid: MapGrid, description: str, geor
 
 
 def write_orthomosaic(path: Path, source: Path, georeference: Georeference | None) -> None:
-    """Writes the orthomosaic of a run cloud-optimised, in the CRS of `georeference`.
+    """Writes the orthomosaic of a run as cloud-optimised GeoTIFF, in the CRS of `georeference`.
 
     Args:
         path: file to write.
         source: orthomosaic as GeoTIFF, RGB or RGBA, in scene coordinates or in the CRS of a measured DEM (`geotiff`).
-        georeference: position of the scene in the CRS; None: as in `source`.
+        georeference: position of the scene in the CRS; None: the coordinates are those of `source`.
 
     Raises:
-        ValueError: the orthomosaic is rotated or its pixels are not square.
+        ValueError: a georeference is given, and the orthomosaic is rotated or its pixels are not square.
     """
     if georeference is None:
         return _optimise(source, path)
@@ -92,5 +93,5 @@ def write_orthomosaic(path: Path, source: Path, georeference: Georeference | Non
 
 
 def _optimise(source: Path, path: Path, **options: str) -> None:
-    """Copies a GeoTIFF to a cloud-optimised one with GDAL's COG driver; `options` are its creation options."""
+    """Copies a GeoTIFF as a cloud-optimised one with GDAL's COG driver; `options` are further options of the driver."""
     rasterio.shutil.copy(source, path, driver="COG", **_OPTIONS, **options)

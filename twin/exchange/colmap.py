@@ -14,7 +14,7 @@ from twin.exchange.camera_files import colmap_pose, write_colmap_cameras
 from twin.exchange.image_copy import copy_image
 from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RigCalibration, RunContents, project
 
-MOST_POINTS = 20_000  # cells of the elevation map are subsampled to about this number of points
+MOST_POINTS = 20_000  # a map with more mapped cells is subsampled to about this number of points
 
 
 class _View(NamedTuple):
@@ -37,14 +37,16 @@ class _View(NamedTuple):
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the stereo pairs of the keyframes as `images`, and the model as `sparse/0`.
+    """Writes the model to `sparse/0` and the stereo pairs of the keyframes to `images`; returns both folders.
 
-    The poses are the true ones if they are known, otherwise those of the final trajectory. The calibration is the
-    true one if it is known (it is not for recorded data), otherwise the believed one. The 3D points are cells of
-    the elevation map with the colours of the orthomosaic; without a map there are none. Their observations are
-    their projections without error: an image observes a cell unless a cell that is nearer by more than 2 % is
-    projected to the same pixel. COLMAP has the corner of the first pixel at (0, 0), so pixel coordinates are larger
-    by 0.5 than in OpenCV. If no keyframe has a stereo pair, all stereo pairs are written.
+    If no keyframe has a stereo pair, all stereo pairs are written. The poses are the true ones if they are known,
+    otherwise those of the final trajectory. The calibration is the true one if it is known (it is not for recorded
+    data), otherwise the believed one.
+
+    The 3D points are cells of the elevation map with the colours of the orthomosaic; without a map there are none.
+    Their observations are exact projections: an image observes a cell that is projected into it, unless another cell
+    that is projected to the same pixel is nearer by more than 2 %. In COLMAP, the corner of the first pixel is at
+    (0, 0), so pixel coordinates are larger by 0.5 than in OpenCV.
 
     Raises:
         TwinError: an image is truncated or not a PNG image.
@@ -68,7 +70,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _points(elevation: ElevationMap | None) -> tuple[Array, NDArray[np.uint8]]:
-    """Returns points (n, 3) in the world [m] at mapped cells, at most about `MOST_POINTS`, and their colours (n, 3)."""
+    """Returns points (n, 3) [m] of mapped cells in the world, about `MOST_POINTS` at most, and their colours (n, 3)."""
     if elevation is None:
         return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
     stride = max(1, int(np.ceil(np.sqrt(np.isfinite(elevation.height_m).sum() / MOST_POINTS))))
@@ -82,9 +84,14 @@ def _points(elevation: ElevationMap | None) -> tuple[Array, NDArray[np.uint8]]:
 def _views(
     contents: RunContents, rig: RigCalibration, frame: RecordedFrame, k: int, target: tuple[Array, Path]
 ) -> list[_View]:
-    """Copies the images of stereo pair number `k`, from 0, and returns their views: left, right.
+    """Copies the images of a stereo pair and returns their views: left, right.
 
-    `target` holds the points (n, 3) in the world [m] and the folder of the export.
+    Args:
+        contents: poses, and quality of JPEG images.
+        rig: calibration of the cameras.
+        frame: frame of the stereo pair.
+        k: number of the stereo pair in the model, from 0.
+        target: points (n, 3) in the world [m], and folder of the export.
     """
     points, folder = target
     world_from_left = contents.poses.world_from_camera[frame.index]
@@ -100,9 +107,13 @@ def _views(
 
 
 def _observed(points_m: Array, camera: CameraIntrinsics) -> tuple[Array, NDArray[np.int64]]:
-    """Returns pixels (m, 2) and indices (m,) of the points (n, 3) [m], given in camera axes, that a camera observes.
+    """Returns the pixels (m, 2) and the indices (m,) of those points that a camera observes.
 
-    Of the points projected to the same pixel, the nearest one is observed, and those whose depth is at most 2 % larger.
+    Of the points projected to the same pixel, it observes the nearest one and those whose depth is at most 2 % larger.
+
+    Args:
+        points_m: (n, 3) points in camera axes.
+        camera: camera model.
     """
     ahead = points_m[:, 2] > 1e-3
     pixels = project(np.where(ahead[:, None], points_m, 1.0), camera)
@@ -117,7 +128,7 @@ def _observed(points_m: Array, camera: CameraIntrinsics) -> tuple[Array, NDArray
 
 
 def _write_frames(file: Path, views: list[_View]) -> None:
-    """Writes frames.txt: for each stereo pair the pose of the rig, which is that of the left camera, and its images."""
+    """Writes frames.txt: for each stereo pair the pose of the world in the left camera, and the image identifiers."""
     header = "# FRAME_ID, RIG_ID, RIG_FROM_WORLD, NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)"
     lines = [
         f"{k} 1 {colmap_pose(left.camera_from_world)} 2 CAMERA 1 {left.image} CAMERA 2 {right.image}"
@@ -127,7 +138,7 @@ def _write_frames(file: Path, views: list[_View]) -> None:
 
 
 def _write_images(file: Path, views: list[_View]) -> None:
-    """Writes images.txt: for each image one line with its pose and one with its observations."""
+    """Writes images.txt: for each image a line with the pose of the world in its camera, and a line of observations."""
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for view in views:
         lines.append(f"{view.image} {colmap_pose(view.camera_from_world)} {view.camera} {view.name}")
@@ -139,7 +150,7 @@ def _write_images(file: Path, views: list[_View]) -> None:
 
 
 def _write_points(file: Path, points: Array, colours: NDArray[np.uint8], views: list[_View]) -> None:
-    """Writes points3D.txt: the points that at least one image observes, with their tracks."""
+    """Writes points3D.txt: the points that at least one image observes, each with its observations (track)."""
     tracks: list[list[str]] = [[] for _ in points]
     for view in views:
         for row, point in enumerate(view.points):

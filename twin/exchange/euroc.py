@@ -1,4 +1,4 @@
-"""Writer of EuRoC/ASL folders: stereo images, calibration and truth in a layout that other programs read."""
+"""Writer of EuRoC/ASL folders: stereo images, calibration, sensor readings and true poses."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ _IMU_HEADER = (
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
 )
 _TRUTH = "state_groundtruth_estimate0"  # folder of the truth
-_FIRST_NS = 1_000_000_000  # time of a frame at 0 s: EuRoC has no times of zero
+_FIRST_NS = 1_000_000_000  # timestamp of a frame at 0 s; times in EuRoC data sets are never 0
 
 
 class EurocWriter:
-    """Writes the frames of a survey to an EuRoC/ASL folder, one by one, and finally the truth.
+    """Writes an EuRoC/ASL folder: the calibration when the writer is created, then frames one by one, and the truth.
 
     Args:
         folder: folder to write; `mav0` is created in it.
@@ -45,7 +45,7 @@ class EurocWriter:
             (self.root / camera / "data.csv").write_text("#timestamp [ns],filename\n", encoding="utf-8")
 
     def add(self, frame: Frame) -> None:
-        """Writes the images of a frame; the right one may be missing.
+        """Writes the images of a frame and adds them to the lists of images; the right image may be missing.
 
         Raises:
             OSError: an image cannot be written.
@@ -60,7 +60,7 @@ class EurocWriter:
                     file.write(f"{timestamp_ns(frame.time_s)},{name}\n")
 
     def add_recorded(self, frame: RecordedFrame) -> None:
-        """Adds the image files of a recorded frame; the right one may be missing.
+        """Copies the image files of a recorded frame and adds them to the lists; the right image may be missing.
 
         Raises:
             TwinError: an image is truncated or not a PNG image.
@@ -74,7 +74,7 @@ class EurocWriter:
                     lines.write(f"{stamp},{name}\n")
 
     def add_truth(self, truth: Trajectory) -> None:
-        """Writes a true trajectory of the left camera as poses of the body."""
+        """Writes the poses of the body, given the true trajectory of the left camera."""
         folder = self.root / _TRUTH
         folder.mkdir(exist_ok=True)
         world_from_body = truth.world_from_camera @ geometry.inverse(self.rig.body_from_camera)
@@ -102,13 +102,15 @@ class EurocWriter:
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes images, calibration, sensor readings and the truth, if known, into `folder`/mav0.
+    """Writes images, calibration, readings and the truth, if known, to `folder`/mav0, and returns [`folder`/mav0].
 
-    Returns the path of mav0, as a list of one.
+    The readings are those of pressure sensor, AHRS, DVL and USBL at the recorded frames, and all readings of the IMU,
+    as far as they were recorded. The truth consists of the poses of the body at all frames of the survey, including
+    those without a recorded image, and of the true heights (dem_truth.tif), if the run has them.
 
-    The readings are those of the pressure sensor, AHRS, DVL, USBL and IMU that were recorded. The truth consists of the
-    poses of the body at all frames of the survey, including those without a recorded image, and of the true heights
-    (dem_truth.tif), if the run has them.
+    Raises:
+        TwinError: an image is truncated or not a PNG image.
+        OSError: a file cannot be read or written.
     """
     writer = EurocWriter(folder, contents.rig, contents.jpeg_quality)
     for k, frame in enumerate(contents.frames):
@@ -125,10 +127,10 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _write_readings(root: Path, contents: RunContents) -> None:
-    """Writes the readings of each sensor that was recorded: pressure0, ahrs0, dvl0, usbl0, each with data.csv.
+    """Writes the readings of each recorded sensor to the folder pressure0, ahrs0, dvl0 or usbl0 in `root`.
 
-    `sensor.yaml` has the standard deviations of the readings (`sigma`) from the section [navigation] of the scenario;
-    it is left out if the scenario states none or if one of them is 0.
+    `data.csv` has the times [ns] and the readings. `sensor.yaml` has their standard deviations (`sigma`) from the
+    section [navigation] of the scenario; it is not written if the scenario states none or if one of them is 0.
     """
     navigation = contents.scenario.get("navigation", {})
     level_rad, heading_rad = (
@@ -169,7 +171,7 @@ def _write_readings(root: Path, contents: RunContents) -> None:
 
 
 def _write_imu(folder: Path, imu: RecordedImu) -> None:
-    """Writes data.csv, without loss, and sensor.yaml of the IMU, whose axes are those of the body."""
+    """Writes data.csv, with full precision, and sensor.yaml of the IMU, whose axes are those of the body."""
     folder.mkdir()
     values = np.hstack([imu.readings.rates_radps, imu.readings.specific_forces_mps2])
     with (folder / "data.csv").open("w", encoding="utf-8") as lines:
@@ -184,10 +186,10 @@ def _write_imu(folder: Path, imu: RecordedImu) -> None:
 
 
 def _matrix(pose: np.ndarray) -> dict[str, Any]:
-    """Returns a pose (4, 4) in the form of EuRoC's sensor.yaml."""
+    """Returns a pose (4, 4) in the form in which EuRoC's sensor.yaml states T_BS."""
     return {"cols": 4, "rows": 4, "data": [float(value) for value in pose.ravel()]}
 
 
 def timestamp_ns(time_s: float) -> int:
-    """Returns the EuRoC timestamp of a frame [ns]: its time after the start of the survey, plus one second."""
+    """Returns the timestamp [ns] of a time since the start of the survey: this time plus one second."""
     return _FIRST_NS + round(time_s * 1e9)

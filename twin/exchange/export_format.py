@@ -8,8 +8,8 @@ from typing import Literal, NamedTuple
 
 from twin.exchange.run_contents import RunContents
 
-#: Contents that a format may need: images (left), pairs (images of both cameras), poses (a true or a final trajectory),
-#: map, truth, world (rendered again).
+#: Contents that a format may need: images (of the left camera), pairs (images of both cameras), poses (a true or a
+#: final trajectory), map, truth (a true trajectory), world (true layers, for which the world is rendered again).
 Need = Literal["images", "pairs", "poses", "map", "truth", "world"]
 
 
@@ -19,8 +19,8 @@ class ExportFormat(NamedTuple):
     Args:
         description: one line for the list of formats.
         needs: contents without which the format cannot be written.
-        write: writes the contents to a folder that exists, and returns the files written, or the folders that are
-            filled with many files. The function imports the libraries that it needs when it is called.
+        write: function that writes the contents to an existing folder and returns the written files, or the folders
+            with many written files. It imports the libraries that it needs only when it is called.
     """
 
     description: str

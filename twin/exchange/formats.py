@@ -11,7 +11,7 @@ from twin.exchange.image_formats import IMAGE_FORMATS
 from twin.exchange.map_formats import MAP_FORMATS
 from twin.exchange.run_contents import POSES, RunContents
 
-#: All formats by name, in the order of the list.
+#: All formats by name, in the order in which `twin export --list` shows them.
 FORMATS: dict[str, ExportFormat] = IMAGE_FORMATS | MAP_FORMATS
 
 _MISSING = {
@@ -47,7 +47,7 @@ def chosen_formats(names: Sequence[str]) -> list[str]:
 
 
 def check_needs(name: str, contents: RunContents) -> None:
-    """Raises TwinError if the run lacks contents that the format needs."""
+    """Raises TwinError if the run lacks contents that the format called `name` needs."""
     has = {
         "images": bool(contents.frames),
         "pairs": bool(contents.pairs),

@@ -1,8 +1,8 @@
 """GeoTIFF files of maps. Row 0 is the northernmost row; the nodata value of float layers is NaN.
 
-Without a georeference, files are in the local metric coordinates of the scene. With the georeference of a measured DEM,
-they are in the CRS of the DEM, and elevations are metres above its vertical datum, positive upwards. Tags then hold the
-scene origin, from which `scene_placement` computes scene coordinates.
+Without a georeference, files are in scene coordinates [m]. With a georeference (that of a measured DEM, or one given by
+the user), they are in its coordinate reference system (CRS), and elevations are metres above its vertical datum,
+positive upwards. Tags then hold the scene origin, from which `scene_placement` computes scene coordinates.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ _ORIGIN_TAGS = ("SCENE_ORIGIN_EASTING", "SCENE_ORIGIN_NORTHING", "SCENE_ORIGIN_E
 _UNIT_TAG = "SCENE_METRES_PER_UNIT"
 _UNKNOWN_DATUM = "same as the source DEM"  # tag of a vertical datum that the source does not name
 _ELEVATION_TAG = {"QUANTITY": "elevation"}  # tag of bands whose values include the elevation of the scene origin
-_LARGEST_COORDINATE = 1e8  # of the origin of a scene, in the unit of its CRS
-_DECIMALS = 6  # to which scene coordinates [m] are rounded; CRS coordinates have up to seven digits before the point
+_LARGEST_COORDINATE = 1e8  # largest coordinate of the origin of a scene, in the unit of its CRS
+_DECIMALS = 6  # decimals of scene coordinates [m]; CRS coordinates have up to seven digits before the decimal point
 
 
 def write_map(
     folder: Path, elevation_map: ElevationMap, georeference: Georeference | None = None, mosaic: bool = True
 ) -> None:
-    """Writes dem.tif and dem_sigma.tif into a folder, and mosaic.tif with the colours of the cells if `mosaic`."""
+    """Writes dem.tif and dem_sigma.tif to a folder and, if `mosaic` is true, mosaic.tif with the colours of cells."""
     grid = elevation_map.grid
     write_elevations(folder / "dem.tif", elevation_map.height_m, grid, "elevation [m]", georeference)
     write_layer(folder / "dem_sigma.tif", elevation_map.sigma_m, grid, "standard deviation [m]", georeference)
@@ -53,10 +53,17 @@ def write_map(
 def write_elevations(
     path: Path, height_m: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
-    """Writes heights (rows, cols) above the plane z = 0 of the scene.
+    """Writes the heights (rows, cols) [m] of map cells, as float32 without a georeference.
 
     With a georeference, elevations in its vertical datum are written as float64, because float32 would round the
-    elevations of a deep site to steps of more than 0.1 mm.
+    elevations of a site deeper than about 1 km to steps of 0.1 mm or more.
+
+    Args:
+        path: file to write.
+        height_m: heights above the plane z = 0; NaN where unknown.
+        grid: cells of the map.
+        description: description of the band.
+        georeference: position of the scene in the CRS; None: scene coordinates.
     """
     if georeference is None:
         return write_layer(path, height_m, grid, description)
@@ -81,7 +88,7 @@ def write_layer(
 def write_masks(
     path: Path, masks: dict[str, NDArray[Any]], grid: MapGrid, georeference: Georeference | None = None
 ) -> None:
-    """Writes layers (rows, cols) of integers or flags as uint16, one band each; the keys describe the bands."""
+    """Writes layers (rows, cols) of integers or Booleans as uint16, one band each; the keys describe the bands."""
     with rasterio.open(path, "w", **profile(grid, len(masks), "uint16", georeference)) as file:
         for band, (description, values) in enumerate(masks.items(), start=1):
             file.write(values.astype(np.uint16), band)
@@ -100,12 +107,12 @@ def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georefe
 class OrthomosaicFile:
     """GeoTIFF of an orthomosaic, written tile by tile: R, G, B and alpha, in the CRS of the map files.
 
-    Use as a context manager. An exception within it removes the incomplete file.
+    Use as a context manager. If an exception leaves the context, the incomplete file is removed.
 
     Args:
         path: path of the file.
         grid: pixels of the orthomosaic.
-        georeference: position of the scene in the CRS of the DEM; None: local coordinates.
+        georeference: position of the scene in the CRS; None: scene coordinates.
     """
 
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
@@ -124,16 +131,16 @@ class OrthomosaicFile:
             self._path.unlink(missing_ok=True)
 
     def write(self, tile: OrthoTile) -> None:
-        """Writes a tile."""
+        """Writes the pixels of a tile at its row and column of the file."""
         rows, cols = tile.rgba.shape[:2]
         window = (tile.row, tile.row + rows), (tile.col, tile.col + cols)
         self._file.write(np.moveaxis(tile.rgba, 2, 0), window=window)
 
 
 def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
-    """Returns the grid of an open raster in scene coordinates, and the offset to subtract from its values [m].
+    """Returns the grid of an open raster in scene coordinates, and the offset [m] to subtract from its values.
 
-    The offset is the elevation of the scene origin if the tags of the raster state that its values include it,
+    The offset is the elevation of the scene origin if the tags of the raster state that its values are elevations,
     otherwise 0.
 
     Raises:
@@ -153,7 +160,7 @@ def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
 
 
 def read_georeference(path: Path) -> Georeference | None:
-    """Returns the position of the scene in the CRS of a map file; None if the file is in local coordinates.
+    """Returns the position of the scene in the CRS of a map file; None if the file is in scene coordinates.
 
     Raises:
         TwinError: the file cannot be read, or its tags are damaged.
@@ -175,11 +182,11 @@ def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeferenc
     """Returns the georeference of a scene, given the coordinates of its origin in a projected CRS.
 
     Args:
-        crs: CRS as `EPSG:CODE`, WKT or PROJ text, with metres or another unit of length.
-        origin: easting and northing in the unit of the CRS, and elevation [m] of the scene origin.
+        crs: projected CRS as `EPSG:CODE`, WKT or PROJ text; its unit may be the metre or another unit of length.
+        origin: easting and northing of the scene origin in the unit of the CRS, and its elevation [m].
 
     Raises:
-        TwinError: the CRS is unknown or not projected, or the origin is outside of it.
+        TwinError: the CRS is unknown or not projected, or the origin is outside the area in which it is defined.
     """
     try:
         known = CRS.from_user_input(crs)
@@ -193,7 +200,7 @@ def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeferenc
 
 
 def _is_on_earth(crs: CRS, origin: tuple[float, float, float]) -> bool:
-    """Returns whether a position in a projected CRS has a latitude and a longitude."""
+    """Returns whether the position (easting, northing, elevation) in a projected CRS has a latitude and a longitude."""
     try:
         (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [origin[0]], [origin[1]])[:2]
     except Exception:  # rasterio raises errors of GDAL, which it does not export
@@ -202,7 +209,7 @@ def _is_on_earth(crs: CRS, origin: tuple[float, float, float]) -> bool:
 
 
 def crs_of(georeference: Georeference | None) -> CRS:
-    """Returns the CRS of a georeference; `LOCAL_METRES` if there is no georeference or it does not name a CRS."""
+    """Returns the CRS of a georeference; `LOCAL_METRES` if there is no georeference or its CRS is not known."""
     wkt = None if georeference is None else georeference.crs_wkt
     return LOCAL_METRES if wkt is None else CRS.from_wkt(wkt)
 
@@ -210,7 +217,7 @@ def crs_of(georeference: Georeference | None) -> CRS:
 def profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
     """Returns the rasterio profile of a GeoTIFF file with `bands` bands of type `dtype` on a grid.
 
-    Without a georeference, the file is in local metres.
+    Without a georeference, the file is in scene coordinates (`LOCAL_METRES`).
     """
     origin = georeference or Georeference(0.0, 0.0)
     west, north = (float(value) for value in origin.from_scene(grid.west_m, grid.north_m))

@@ -24,13 +24,18 @@ _UNKNOWN = "unknown"
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the images and ifdo.json, with position, attitude, calibration and hash of each image.
+    """Writes ifdo.json and the folder of the images, and returns both.
 
-    Positions and attitudes are those of the final trajectory or, without one, the true ones. Latitude and longitude
-    (EPSG:4326), which iFDO requires, are written if the export has a CRS; otherwise, the file has only poses in local
-    coordinates. Times count from 1970-01-01, because a run has no date.
+    The file has the calibration of the left camera, and position, attitude and hash of each image. Positions and
+    attitudes are those of the final trajectory or, without one, the true ones. Latitude and longitude (EPSG:4326),
+    which iFDO requires, are written if the export has a CRS; otherwise, the file has only poses in scene coordinates.
+    Times count from 1970-01-01, because a run has no date.
 
-    The file calls the images of a replay recorded; their platform, sensor, licence and copyright are "unknown".
+    For a replay, the file states that the images are recorded; their platform, licence and copyright are "unknown".
+
+    Raises:
+        TwinError: an image is truncated or not a PNG image.
+        OSError: a file cannot be read or written.
     """
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
     items: dict[str, Any] = {}
@@ -44,7 +49,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _header(contents: RunContents) -> dict[str, Any]:
-    """Returns the fields of the whole image set."""
+    """Returns the fields that hold for the whole image set."""
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
     origin = contents.georeference
     named = {"image-project": contents.name, "image-event": contents.name}
@@ -70,13 +75,13 @@ def _header(contents: RunContents) -> dict[str, Any]:
 
 
 def _illumination(scenario: Mapping[str, Any]) -> str:
-    """Returns the kind of light of a scenario in the words of iFDO."""
+    """Returns iFDO's term for the light of a scenario: "mixed light", "artificial light" or "sunlight"."""
     lamps, sun = bool(scenario.get("lamps")), scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
     return "mixed light" if lamps and sun else "artificial light" if lamps else "sunlight"
 
 
 def _simulated(illumination: str) -> dict[str, Any]:
-    """Returns the fields on the origin of simulated images, whose light is of the kind `illumination`."""
+    """Returns the iFDO fields that describe the origin of simulated images and their light (`illumination`)."""
     return {
         "image-context": {"name": "simulated survey"},
         "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
@@ -92,8 +97,8 @@ def _simulated(illumination: str) -> dict[str, Any]:
 def _recorded() -> dict[str, Any]:
     """Returns the iFDO fields that describe the origin of the images of a replay.
 
-    The images are rectified copies of recorded images; a run folder contains nothing else about their origin. The
-    optional field on the light is left out.
+    The images are rectified copies of recorded images; the run folder has no further information on their origin. The
+    optional field that describes the light is left out.
     """
     return {
         "image-context": {"name": "replay of a recorded survey"},
@@ -107,7 +112,10 @@ def _recorded() -> dict[str, Any]:
 
 
 def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:
-    """Returns the calibration as iFDO defines it [px, degrees]; the centre of the first pixel is at (0, 0)."""
+    """Returns the fields of a camera model as iFDO defines them [px, degrees].
+
+    The centre of the first pixel is at (0, 0).
+    """
     matrix = camera.matrix
     field = np.rad2deg(2 * np.arctan([camera.size_px[k] / 2 / matrix[k, k] for k in (0, 1)]))
     return {
@@ -120,7 +128,7 @@ def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:
 
 
 def _item(contents: RunContents, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
-    """Returns the fields of one image, given its file and the pose (4, 4) of its camera in the world."""
+    """Returns the fields of one image, given its frame, its file and the pose (4, 4) of its camera in the world."""
     digest = hashlib.sha256(image.read_bytes()).hexdigest()
     time = _START + timedelta(seconds=frame.time_s)
     yaw, pitch, roll = yaw_pitch_roll_deg(pose)
@@ -138,7 +146,7 @@ def _item(contents: RunContents, frame: RecordedFrame, image: Path, pose: Array)
 def _position(origin: Georeference | None, pose: Array) -> dict[str, Any]:
     """Returns the fields of the position for the pose (4, 4) of a camera in the world.
 
-    They are in the CRS of `origin` and in EPSG:4326, or in local coordinates [m] without a CRS.
+    The position is in the CRS of `origin` and in EPSG:4326; without a CRS, it is in scene coordinates [m].
     """
     x, y, z = (float(value) for value in pose[:3, 3])
     rotation = [float(value) for value in pose[:3, :3].ravel()]

@@ -33,11 +33,14 @@ class CopiedImage(NamedTuple):
 
 
 def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> Iterator[CopiedImage]:
-    """Copies all images to `folder`, which is created, as CAMERA_FRAME, and yields each; missing images are left out.
+    """Copies all recorded images to a folder and yields each copy.
+
+    The names are CAMERA_FRAME with the number of the frame, for example left_000012.png. Frames without a right image
+    have only the left one.
 
     Args:
-        contents: recorded frames, quality of JPEG images, and progress, which is reported.
-        folder: folder of the copies.
+        contents: recorded frames, quality of JPEG images, and the function to which progress is reported.
+        folder: folder of the copies, which is created if it does not exist.
         left_from_right: (4, 4) pose of the right camera in the axes of the left camera [m].
 
     Raises:
@@ -54,12 +57,12 @@ def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> 
 
 
 def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Path:
-    """Copies an image file, or writes it as JPEG, and returns the path of the new file.
+    """Copies an image file, or converts it to JPEG, and returns the path of the new file.
 
     Args:
         source: PNG file.
         stem: path of the new file without its suffix.
-        jpeg_quality: quality of the JPEG, 1 to 100; None: the bytes of the file are copied.
+        jpeg_quality: quality of the JPEG, 1 to 100; None: the file is copied unchanged.
 
     Raises:
         TwinError: the source is truncated or not a PNG image.
@@ -76,7 +79,8 @@ def encoded_image(source: Path, jpeg_quality: int | None = None) -> tuple[str, b
 
     Args:
         source: PNG file.
-        jpeg_quality: quality with which the image is encoded as JPEG, 1 to 100; None: the bytes of the file.
+        jpeg_quality: quality with which the image is encoded as JPEG, 1 to 100; None: the bytes of the PNG file are
+            returned.
 
     Raises:
         TwinError: the file is truncated or not a PNG image.

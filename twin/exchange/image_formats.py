@@ -1,4 +1,4 @@
-"""Formats of images, poses and calibrations. Each function imports its writer when it is called."""
+"""Formats of images, poses and calibrations. Each function imports its writer only when it is called."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def _tum(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _colmap(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes a COLMAP text model."""
+    """Writes a COLMAP text model and its images."""
     from twin.exchange import colmap
 
     return colmap.export(contents, folder)
@@ -44,28 +44,28 @@ def _nerfstudio(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _calibration(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the calibration, true and believed."""
+    """Writes the believed calibration and, if known, the true one."""
     from twin.exchange import camera_files
 
     return camera_files.export(contents, folder)
 
 
 def _ifdo(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the iFDO image metadata."""
+    """Writes the images and their metadata in iFDO format."""
     from twin.exchange import ifdo
 
     return ifdo.export(contents, folder)
 
 
 def _metashape(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the reference CSV of Metashape."""
+    """Writes the images and the reference CSV files of Metashape."""
     from twin.exchange import metashape
 
     return metashape.export(contents, folder)
 
 
 def _truth(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the exact truth of the recorded images."""
+    """Writes the true layers of the recorded left images."""
     from twin.exchange import truth_images
 
     return truth_images.export(contents, folder)

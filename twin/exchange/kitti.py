@@ -15,11 +15,18 @@ SEQUENCE = "00"
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the stereo pairs as sequence 00, and its poses if there is a truth.
+    """Writes the stereo pairs as sequence 00 and, if the truth is known, its true poses.
 
-    The layout is that of the odometry benchmark: `sequences/00/image_2` (left) and `image_3` (right) with numbers from
-    000000, `calib.txt`, `times.txt` [s], and `poses/00.txt` with the first three rows of each pose. As in the
-    benchmark, poses are relative to the first left camera, in its axes (x right, y down, z forward).
+    The layout is that of the odometry benchmark: `sequences/00` with `image_2` (left) and `image_3` (right), numbered
+    from 000000, `calib.txt` and `times.txt` [s], and `poses/00.txt` with the first three rows of each pose of the left
+    camera. As in the benchmark, poses are relative to the first one, in its axes (x right, y down, z forward).
+
+    Returns:
+        The folder of the sequence and, if written, the file of the poses.
+
+    Raises:
+        TwinError: an image is truncated or not a PNG image.
+        OSError: a file cannot be read or written.
     """
     sequence = folder / "sequences" / SEQUENCE
     pairs = contents.pairs
@@ -40,7 +47,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def write_poses(file: Path, world_from_camera: np.ndarray) -> Path:
-    """Writes poses (n, 4, 4) relative to the first one, 12 numbers per line, and returns the file."""
+    """Writes poses (n, 4, 4), n > 0, relative to the first one, 12 numbers per line, and returns the file."""
     file.parent.mkdir(parents=True, exist_ok=True)
     relative = geometry.inverse(world_from_camera[0]) @ world_from_camera
     np.savetxt(file, relative[:, :3].reshape(-1, 12), fmt="%.12e")
@@ -48,7 +55,7 @@ def write_poses(file: Path, world_from_camera: np.ndarray) -> Path:
 
 
 def _calibration(rig: StereoRig) -> str:
-    """Returns the text of calib.txt: projection matrices P0 to P3; P0 and P2 are left, P1 and P3 are right."""
+    """Returns the text of calib.txt: P0 and P2 are the projection matrix of the left camera, P1 and P3 of the right."""
     left = np.column_stack([rig.matrix, np.zeros(3)])
     right = np.column_stack([rig.matrix, [-rig.fx_px * rig.baseline_m, 0.0, 0.0]])
     rows = [left, right, left, right]

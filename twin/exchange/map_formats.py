@@ -1,4 +1,4 @@
-"""Formats of maps, and of recordings with maps and images. Each function imports its writer when it is called."""
+"""Formats of maps, and the ROS 2 bag. Each function imports its writer only when it is called."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from twin.exchange.run_contents import RunContents
 
 
 def _mcap(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the ROS 2 bag ros2_bag."""
+    """Writes the ROS 2 bag with the name ros2_bag."""
     from twin.exchange import ros2
 
     return ros2.export(contents, folder)
 
 
 def _cog(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes dem.tif, dem_sigma.tif, dem_error.tif and orthomosaic.tif."""
+    """Writes dem.tif, dem_sigma.tif, orthomosaic.tif and, if the true elevations are known, dem_error.tif."""
     from twin.exchange import cloud_optimised
 
     return cloud_optimised.export(contents, folder)

@@ -11,21 +11,21 @@ from trimesh.exchange.gltf import export_glb
 from twin.core.grid_triangles import raster_triangles
 from twin.core.records import ElevationMap
 
-#: glTF is y-up: east is x, up is y, north is -z.
+#: Rotation from the axes of the world to those of glTF, which is y-up: x is east, y is up, z is south.
 GLB_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 #: Maps with more cells are subsampled to about this number of vertices, which common viewers display smoothly.
 MAX_VERTICES = 400_000
 
 
 def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> None:
-    """Writes the mapped cells as a surface in the orthomosaic's colours; without triangles, an empty scene."""
+    """Writes the mesh of a map (`map_mesh`) as GLB; a mesh without triangles is written as an empty scene."""
     mesh = map_mesh(elevation_map, max_vertices)
     scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
     path.write_bytes(export_glb(scene))
 
 
 def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
-    """Returns the triangle mesh of a map in the world, in glTF axes, with the colours of the orthomosaic.
+    """Returns the triangle mesh of a map with its colours, in scene coordinates in glTF axes (`GLB_FROM_WORLD`).
 
     Vertices are the centres of the mapped cells, subsampled to about `max_vertices`. Triangles connect neighbouring
     vertices and face up in the frame of the map; cells that belong to no triangle are omitted.

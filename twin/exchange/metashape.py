@@ -14,10 +14,17 @@ _HEADER = "#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll"
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the images, and `reference_NAME.csv` for the true and the final trajectory, whichever exist.
+    """Writes the images to `images`, and reference_truth.csv and reference_final.csv if these trajectories exist.
 
-    The label is the name of the image file. Positions are in the CRS of the export, or in local coordinates [m]; angles
-    are in degrees (`yaw_pitch_roll_deg`).
+    The label of an image is the name of its file. Positions are in the CRS of the export or, without one, in scene
+    coordinates [m]; angles are in degrees (`yaw_pitch_roll_deg`).
+
+    Returns:
+        The folder of the images and the CSV files.
+
+    Raises:
+        TwinError: an image is truncated or not a PNG image.
+        OSError: a file cannot be read or written.
     """
     origin = contents.georeference or Georeference(0.0, 0.0)
     images = list(copy_images(contents, folder / "images", contents.rig.left_from_right))
@@ -36,8 +43,8 @@ def _line(image: CopiedImage, path: Trajectory, origin: Georeference) -> str:
 
     Args:
         image: the image; its name is the label.
-        path: trajectory of the left camera.
-        origin: position of the scene in the CRS.
+        path: trajectory of the left camera in the world.
+        origin: position of the scene in the CRS; the zero position for scene coordinates.
     """
     pose = path.world_from_camera[image.frame.index] @ image.left_from_camera
     x, y, z = pose[:3, 3]

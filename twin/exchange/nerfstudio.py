@@ -10,17 +10,21 @@ import numpy as np
 from twin.exchange.image_copy import copy_images
 from twin.exchange.run_contents import RunContents
 
-#: OpenGL camera axes (x right, y up, z backward) in those of OpenCV (x right, y down, z forward).
+#: Pose of OpenGL camera axes (x right, y up, z backward) in those of OpenCV (x right, y down, z forward).
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes transforms.json and `images`, and returns the paths of both.
 
-    The poses are the true ones, or the final ones without a truth.
-    Images of both cameras are listed with their own intrinsics. If the true calibration is known, the intrinsics and
-    the pose of the right camera relative to the left one are the true ones, otherwise the believed ones. nerfstudio has
-    the corner of the first pixel at (0, 0), so the principal point is larger by 0.5 px than in OpenCV.
+    The poses are the true ones if they are known, otherwise those of the final trajectory. Images of both cameras are
+    listed, each with the intrinsics of its camera. If the true calibration is known, the intrinsics and the pose of the
+    right camera relative to the left one are the true ones, otherwise the believed ones. In nerfstudio, the corner of
+    the first pixel is at (0, 0), so the coordinates of the principal point are larger by 0.5 px than in OpenCV.
+
+    Raises:
+        TwinError: an image is truncated or not a PNG image.
+        OSError: a file cannot be read or written.
     """
     rig = contents.true or contents.believed
     poses = contents.poses.world_from_camera

@@ -1,6 +1,7 @@
 """The elevation map as a point cloud with colour and standard deviation: PLY (binary) and LAZ (LAS 1.4).
 
-Points are the centres of the mapped cells, in the CRS of the scene, or in local metres (x east, y north, z up).
+Points are the centres of the mapped cells, in the coordinate reference system (CRS) of the georeference or, without
+one, in scene coordinates [m] (x east, y north, z up).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from twin.core.records import ElevationMap, Image
 from twin.exchange import geotiff
 from twin.exchange.run_contents import RunContents
 
-_FINEST, _STEPS = 1e-6, 2**30  # resolution of LAS coordinates [unit of the CRS], and largest integer for an extent
+_FINEST, _STEPS = 1e-6, 2**30  # finest resolution of LAS coordinates [unit of the CRS], and largest extent in steps
 _POINT_FORMAT = 7  # LAS 1.4 with RGB
 _EIGHT_TO_SIXTEEN_BITS = 257  # 255 * 257 = 65535
 
@@ -27,7 +28,7 @@ class PointCloud(NamedTuple):
     """Points of a map.
 
     Args:
-        points: (n, 3) coordinates: easting and northing in the unit of the CRS, elevation [m].
+        points: (n, 3) easting and northing in the unit of the CRS, and elevation [m]; or scene coordinates [m].
         colours: (n, 3) uint8 RGB.
         sigma_m: (n,) float32 standard deviations of the elevations [m].
     """
@@ -56,7 +57,7 @@ def export_laz(contents: RunContents, folder: Path) -> list[Path]:
 def point_cloud(elevation: ElevationMap, georeference: Georeference | None = None) -> PointCloud:
     """Returns the centres of the mapped cells, row by row from the north-west.
 
-    They are in the CRS of `georeference`, or in local metres without a georeference.
+    They are in the CRS of `georeference` or, without one, in scene coordinates [m].
     """
     known = np.isfinite(elevation.height_m)
     x, y = np.meshgrid(*elevation.grid.centres())
@@ -71,7 +72,7 @@ def point_cloud(elevation: ElevationMap, georeference: Georeference | None = Non
 def write_ply(path: Path, cloud: PointCloud, georeference: Georeference | None = None) -> None:
     """Writes a binary PLY file with x, y, z (double), red, green, blue (uchar) and sigma (float) [m].
 
-    A comment in the header has the CRS as WKT.
+    A comment in the header has the CRS as WKT (`geotiff.crs_of`).
     """
     fields = [("x", "<f8", "double"), ("y", "<f8", "double"), ("z", "<f8", "double"), ("red", "u1", "uchar"),
               ("green", "u1", "uchar"), ("blue", "u1", "uchar"), ("sigma", "<f4", "float")]  # fmt: skip
@@ -90,8 +91,8 @@ def write_ply(path: Path, cloud: PointCloud, georeference: Georeference | None =
 def write_laz(path: Path, cloud: PointCloud, georeference: Georeference | None = None) -> None:
     """Writes LAZ (LAS 1.4, point format 7) with the extra dimension `sigma` and the CRS as WKT.
 
-    Coordinates are integers: their resolution is 1e-6 units of the CRS, or coarser by powers of ten for extents above
-    1074 units.
+    LAS stores coordinates as integer multiples of a resolution. This is 1e-6 units of the CRS, or coarser by a power of
+    ten for clouds of more than about 1074 units extent.
 
     Raises:
         TwinError: the package laspy is not installed.

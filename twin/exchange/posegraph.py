@@ -1,8 +1,8 @@
 """Pose graph files: writes the keyframe network as g2o, and reads g2o and TORO files.
 
 In g2o files, as read and written here and by GTSAM, the information of a rotation refers to the rotation vector
-[1/rad^2]. In g2o itself it refers to the vector part of the quaternion (half the rotation vector), so its values are
-four times as large.
+[1/rad^2]. In g2o itself it refers to the vector part of the quaternion (for small rotations half the rotation vector),
+so its values are four times as large.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class PoseGraph(NamedTuple):
     Args:
         poses: pose (4, 4) of each vertex, by its number; empty if the file has only edges.
         links: one link per edge; overlap is NaN and the number of matched points 0, as the formats contain neither.
-        ignored: the ignored lines, per unknown tag.
+        ignored: the ignored lines, one entry per unknown tag.
         warnings: sentences, with file and line, on unknown tags, nodes without an edge, nodes without a vertex, and
             separate connected components of the graph.
     """
@@ -46,7 +46,8 @@ class PoseGraph(NamedTuple):
 def write(path: Path, result: SurveyResult) -> None:
     """Writes the final keyframe poses and the links as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines (g2o).
 
-    Quaternions are ordered xyzw. The information matrices are written as upper triangles.
+    Quaternions are ordered xyzw. Information matrices are those of [translation, rotation vector] and are written as
+    upper triangles, row by row.
     """
     poses = result.final.world_from_camera[result.keyframe_rows]
     vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_pose_texts(poses)))
@@ -61,15 +62,15 @@ def write(path: Path, result: SurveyResult) -> None:
 
 
 def read(path: Path) -> PoseGraph:
-    """Reads VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines (g2o) or VERTEX3 and EDGE3 lines (TORO: x y z roll pitch yaw).
+    """Returns the graph in the lines VERTEX_SE3:QUAT and EDGE_SE3:QUAT (g2o), VERTEX3 and EDGE3 (TORO) of a file.
 
-    The warnings of the result report ignored lines, nodes without an edge, nodes without a vertex, and separate
-    connected components of the graph.
+    Poses in TORO lines are x y z roll pitch yaw. Other lines are ignored; a warning in the result reports them.
 
     Raises:
-        TwinError: the file cannot be read or has no such line; a line has the wrong number of values, a value that is
-            not a finite number, a quaternion that is not of unit length, a pitch of +-90 deg or an information matrix
-            that is not positive definite; a node is defined twice, or an edge joins a node with itself.
+        TwinError: the file cannot be read or has no such line; a line has the wrong number of values, a node number
+            that is not an integer, a value that is not a finite number, a quaternion that is not of unit length, a
+            pitch of +-90 deg or an information matrix that is not positive definite; a node is defined twice, or an
+            edge joins a node with itself.
     """
     rows, ignored = read_rows(path, _LAYOUTS)
     vertices = [(rows[tag], *_poses(path, rows[tag], convert)) for tag, convert in _VERTICES.items()]
@@ -92,7 +93,7 @@ def read(path: Path) -> PoseGraph:
 
 
 def ignored_warning(path: Path, lines: IgnoredLines) -> str:
-    """Returns a sentence that reports the ignored lines of an unknown tag."""
+    """Returns a sentence, with file and line, that reports the ignored lines of an unknown tag."""
     tag = f"with the unknown tag {lines.tag[:40]!r}"
     ignored = f"1 line {tag} is ignored" if lines.n_lines == 1 else f"{lines.n_lines} lines {tag} are ignored"
     return f"{path}:{lines.first_line}: {ignored}"
@@ -111,8 +112,15 @@ def _check_once(path: Path, part: Rows, poses: Mapping[int, Array]) -> None:
 def _poses(path: Path, part: Rows, convert: _Convert) -> tuple[Array, Array]:
     """Returns the poses (n, 4, 4) of all lines of a tag, and the Jacobians (n, 3, 3) of their rotation parameters.
 
-    A Jacobian is the derivative of the file's rotation parameters with respect to the rotation vector. Raises TwinError
-    if a rotation is invalid.
+    A Jacobian is the derivative of the rotation parameters in the file with respect to the rotation vector.
+
+    Args:
+        path: the file, for messages.
+        part: lines of one tag, whose values begin with a pose.
+        convert: function that converts the values to rotations.
+
+    Raises:
+        TwinError: a rotation is invalid.
     """
     if not len(part.line):
         return np.zeros((0, 4, 4)), np.zeros((0, 3, 3))
@@ -126,7 +134,7 @@ def _poses(path: Path, part: Rows, convert: _Convert) -> tuple[Array, Array]:
 
 
 def _links(path: Path, part: Rows, i_from_j: Array, jacobian: Array) -> list[Link]:
-    """Returns the links of all edges of a tag, with the covariances of [rotation vector, translation] in vertex j.
+    """Returns the links of all edges of a tag; covariances are of [rotation vector, translation] in the axes of node j.
 
     Args:
         path: the file, for messages.
@@ -169,7 +177,7 @@ def _check_definite(path: Path, part: Rows, information: Array) -> None:
 
 
 class _Problem(NamedTuple):
-    """A problem in some lines: mask (n,) of the lines, description ("" = no problem), and allowed values."""
+    """A problem in some lines: mask (n,) of these lines, description ("" for no problem), and the allowed values."""
 
     rows: NDArray[np.bool_]
     text: str
@@ -180,10 +188,11 @@ _Convert = Callable[[Array], tuple[Array, Array, _Problem]]
 
 
 def _from_quaternions(values: Array) -> tuple[Array, Array, _Problem]:
-    """Converts values x y z qx qy qz qw (n, 7 or more).
+    """Returns the rotations of values x y z qx qy qz qw (n, 7 or more).
 
     Returns:
-        Rotations (n, 3, 3), Jacobians (n, 3, 3) (identities, see `_poses`), and the rows without a unit quaternion.
+        Rotations (n, 3, 3), Jacobians (n, 3, 3) (identities, see `_poses`), and the problem of the rows whose
+        quaternion is not of unit length.
     """
     length = np.linalg.norm(values[:, 3:7], axis=1)
     bad = np.abs(length - 1) > _QUATERNION_TOLERANCE
@@ -194,10 +203,10 @@ def _from_quaternions(values: Array) -> tuple[Array, Array, _Problem]:
 
 
 def _from_euler_angles(values: Array) -> tuple[Array, Array, _Problem]:
-    """Converts values x y z roll pitch yaw (n, 6 or more).
+    """Returns the rotations of values x y z roll pitch yaw (n, 6 or more) with angles in radians.
 
     Returns:
-        Rotations (n, 3, 3), Jacobians (n, 3, 3) (see `_poses`), and the problem of the pitches of +-90 deg.
+        Rotations (n, 3, 3), Jacobians (n, 3, 3) (see `_poses`), and the problem of the rows with a pitch of +-90 deg.
     """
     from scipy.spatial.transform import Rotation  # imported here as in `geometry.rotation_from_wxyz`
 
@@ -216,7 +225,7 @@ def _from_euler_angles(values: Array) -> tuple[Array, Array, _Problem]:
 
 #: Largest accepted deviation of a quaternion's length from 1; files have at least six digits.
 _QUATERNION_TOLERANCE = 1e-3
-#: Function that converts the values of a pose to a rotation, by tag.
+#: Function that converts the values of poses to rotations, by tag.
 _VERTICES: dict[str, _Convert] = {"VERTEX_SE3:QUAT": _from_quaternions, "VERTEX3": _from_euler_angles}
 _EDGES: dict[str, _Convert] = {"EDGE_SE3:QUAT": _from_quaternions, "EDGE3": _from_euler_angles}
 _LAYOUTS = {
@@ -228,11 +237,11 @@ _LAYOUTS = {
 
 
 def _pose_texts(poses: Array) -> list[str]:
-    """Returns "x y z qx qy qz qw" of each pose (n, 4, 4)."""
+    """Returns the text "x y z qx qy qz qw" of each of the poses (n, 4, 4)."""
     return _row_texts(np.column_stack([poses[:, :3, 3], geometry.quaternions_xyzw(poses[:, :3, :3])]), "%.12g")
 
 
 def _row_texts(rows: Array, number_format: str) -> list[str]:
-    """Returns each row of numbers (n, k) as text, separated by spaces."""
+    """Returns the text of each row of an array (n, k): its numbers in a printf format, separated by spaces."""
     line = " ".join([number_format] * rows.shape[1]) + "\n"
     return (line * len(rows) % tuple(rows.ravel().tolist())).splitlines()

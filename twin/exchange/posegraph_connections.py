@@ -1,6 +1,6 @@
 """Connectivity of a pose graph file.
 
-The warnings are on vertices without an edge, edges to nodes that no line of the file defines, and separate components.
+The warnings report vertices without an edge, nodes of edges that no vertex line defines, and separate components.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-#: Maximum number of nodes that a warning lists, and of warnings of separate components; the others are counted.
+#: Maximum number of nodes that a warning lists, and of warnings on separate components; the rest is only counted.
 _LISTED = 5
 
 _Nodes = NDArray[np.int64]
@@ -20,13 +20,13 @@ def connection_warnings(path: Path, vertices: tuple[_Nodes, _Nodes], edges: tupl
     """Returns the warnings about the connections of a graph.
 
     There is one warning for all vertices without an edge, one for all nodes that edges name but no vertex defines, and
-    one for each component that is not connected to the first edge; from the sixth such component on, they are counted
-    in one warning. In a file without any vertex, the missing vertices are not reported.
+    one for each connected component other than that of the first edge; if there are more than five such components, the
+    last warning states only the number of the others. In a file without any vertex, missing vertices are not reported.
 
     Args:
         path: file of the graph.
-        vertices: (n,) node number and line of each vertex.
-        edges: (m, 2) node numbers and (m,) line of each edge.
+        vertices: (n,) node numbers, and (n,) line numbers of the vertices.
+        edges: (m, 2) node numbers, and (m,) line numbers of the edges.
     """
     (nodes, node_lines), (pairs, pair_lines) = vertices, edges
     warnings = []
@@ -41,7 +41,11 @@ def connection_warnings(path: Path, vertices: tuple[_Nodes, _Nodes], edges: tupl
 
 
 def _separate_components(path: Path, pairs: _Nodes, pair_lines: _Nodes) -> list[str]:
-    """Returns a warning for each connected component of the graph other than that of the first edge."""
+    """Returns a warning for each connected component of the edges other than that of the first edge.
+
+    After five warnings, one more states the number of the remaining components. `pairs` and `pair_lines` are the node
+    numbers and lines of the edges, as in `connection_warnings`.
+    """
     if not len(pairs):
         return []
     from scipy.sparse import coo_array

@@ -17,9 +17,9 @@ from twin.core.geometry import Array
 from twin.core.paths import is_file
 from twin.errors import TwinError
 
-#: Maximum size of a file.
+#: Maximum size of a file [bytes].
 MAX_BYTES = 500_000_000
-#: Maximum number of splits of a line, into the tag, two words (the nodes of an edge) and the rest.
+#: Maximum number of splits of a line: into the tag, the next two words (of an edge: its nodes) and the rest.
 _SPLITS = 3
 #: A number as `numpy.fromstring` reads it.
 _NUMBER = re.compile(r"[+-]?(?:(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?|inf|infinity|nan)", re.ASCII | re.IGNORECASE)
@@ -55,7 +55,7 @@ class IgnoredLines(NamedTuple):
 
 
 def read_rows(file: Path, layouts: Mapping[str, Layout]) -> tuple[dict[str, Rows], tuple[IgnoredLines, ...]]:
-    """Reads all lines with a tag in `layouts`, and counts the lines with other tags.
+    """Returns the lines with a tag in `layouts` as numbers, and the counts of lines with other tags.
 
     Empty lines and comments (#) are skipped; a byte order mark at the start is accepted.
 
@@ -63,8 +63,8 @@ def read_rows(file: Path, layouts: Mapping[str, Layout]) -> tuple[dict[str, Rows
         The rows of each tag of `layouts`, and the lines with other tags.
 
     Raises:
-        TwinError: the file cannot be read, or a line has the wrong number of values, or a value that is not a finite
-            number.
+        TwinError: the file cannot be read, or a line has the wrong number of values, a node number that is not an
+            integer, or a value that is not a finite number.
     """
     by_tag: dict[str, tuple[list[int], list[list[str]]]] = defaultdict(lambda: ([], []))
     for count, text in enumerate(_text(file).splitlines(), start=1):
@@ -95,7 +95,15 @@ def _text(file: Path) -> str:
 
 
 def _rows(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[list[str]]) -> Rows:
-    """Returns node numbers and values of all lines with a tag. Raises TwinError at the first line that is malformed."""
+    """Returns the node numbers and values of all lines with a tag; raises TwinError at the first malformed line.
+
+    Args:
+        file: the file, for messages.
+        tag: the tag.
+        layout: layout of its lines.
+        lines: number of each line in the file, from 1.
+        rows: words of each line, split at most `_SPLITS` times.
+    """
     first = 1 + layout.n_nodes
     try:
         nodes = np.array([int(row[k]) for row in rows for k in range(1, first)], np.int64)
@@ -113,7 +121,10 @@ def _rows(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[lis
 
 
 def _line_error(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[list[str]]) -> TwinError:
-    """Returns the error of the first malformed line of a tag; raises AssertionError if no line is malformed."""
+    """Returns the error of the first malformed line of a tag; raises AssertionError if no line is malformed.
+
+    The arguments are those of `_rows`.
+    """
     allowed = f"{tag} followed by {layout.n_nodes} node number(s) and {layout.n_values} finite numbers"
     for line, row in zip(lines, rows, strict=True):
         words = " ".join(row[1:]).split()

@@ -33,15 +33,16 @@ class Message(NamedTuple):
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the bag `folder`/ros2_bag (MCAP and metadata.yaml) with all messages in the order of time.
+    """Writes the bag `folder`/ros2_bag (MCAP and metadata.yaml); returns its path, as a list of one.
 
-    Topics: /left/image_rect/compressed, /left/camera_info and the same for right; /tf_static; /odometry and /tf of the
-    final trajectory; /ground_truth/odometry if the truth is known; /imu/data (attitude), /imu/data_raw (rates and
-    specific forces), /pressure, /dvl if recorded.
-    All times are those of `euroc.timestamp_ns`.
+    All messages are in the order of time. Topics: /left/image_rect/compressed, /left/camera_info and the same for
+    right; /tf_static; /odometry and /tf of the final trajectory; /ground_truth/odometry if the truth is known; and, if
+    recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure and /dvl. All times are those
+    of `euroc.timestamp_ns`.
 
     Raises:
-        TwinError: the package rosbags is not installed, the bag exists already, or an image is truncated or no PNG.
+        TwinError: the package rosbags is not installed, the bag exists already, or an image is truncated or not a PNG
+            image.
         OSError: the folder cannot be written.
     """
     rosbag2 = optional("rosbags.rosbag2", "exchange", "--to mcap")
@@ -61,19 +62,22 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def pressure_pa(height_m: float, surface_m: float) -> float:
-    """Returns the pressure [Pa] at a height above z = 0: p = p_air + rho g (surface - height).
+    """Returns the pressure [Pa] at a height in the water.
+
+    If the height of the water surface is known, this is the absolute pressure p = p_air + rho g (surface - height),
+    with the standard air pressure p_air and rho g = `PASCAL_PER_METRE`. Otherwise it is the pressure relative to that
+    at the plane z = 0.
 
     Args:
         height_m: height of the sensor above the plane z = 0 [m].
-        surface_m: height of the water surface above this plane [m]; 0: not known, and the result is the pressure
-            relative to that at the plane z = 0, otherwise the absolute pressure.
+        surface_m: height of the water surface above this plane [m]; 0: not known.
     """
     air_pa = _AIR_PA if surface_m > 0 else 0.0
     return air_pa + PASCAL_PER_METRE * (surface_m - height_m)
 
 
 def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
-    """Returns all messages of a run in the order of time; images are read one by one."""
+    """Returns an iterator over all messages of a run in the order of time; images are read one by one."""
     streams = [_static(contents, factory), _images(contents, factory), _readings(contents, factory)]
     if contents.imu is not None:
         streams.append(_inertial(contents.imu, factory))
@@ -85,7 +89,7 @@ def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
 
 
 def _static(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
-    """Yields the static transforms of the two cameras in the body."""
+    """Yields one message with the static poses of the two cameras in the body."""
     rig = contents.rig
     poses = {(BODY, LEFT): rig.body_from_camera, (BODY, RIGHT): rig.body_from_camera @ rig.left_from_right}
     time_ns = timestamp_ns(0.0)
@@ -112,7 +116,7 @@ def _images(contents: RunContents, factory: MessageFactory) -> Iterator[Message]
 
 
 def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_from_left: Array) -> Iterator[Message]:
-    """Yields the pose and the twist of the body at each frame; for the topic /odometry also the pose as /tf.
+    """Yields pose and twist of the body at each frame; with the topic /odometry, also the pose as a message of /tf.
 
     Args:
         factory: makes the messages.
@@ -130,12 +134,12 @@ def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_
 
 
 def body_twists(times_s: Array, poses: Array) -> Array:
-    """Returns the twists (n, 6) [rotation, translation] (rad/s, m/s) in body axes, from the motion to the next pose.
+    """Returns the twists (n, 6) [rotation, translation] (rad/s, m/s) in body axes, from the motions to the next pose.
 
     The last pose has the twist of the one before; the twist of a single pose is zero.
 
     Args:
-        times_s: (n,) increasing times.
+        times_s: (n,) increasing times [s].
         poses: (n, 4, 4) poses world_from_body.
     """
     found = np.zeros((len(poses), 6))
@@ -172,7 +176,7 @@ def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
 
 
 def _inertial(imu: RecordedImu, factory: MessageFactory) -> Iterator[Message]:
-    """Yields the readings of the IMU; the variance of white noise of density s at a rate f is s^2 f."""
+    """Yields the readings of the IMU; white noise of density s, sampled at a rate f, has the variance s^2 f."""
     root = np.sqrt(imu.rate_hz)
     sigmas = imu.noise.gyroscope_noise_density * root, imu.noise.accelerometer_noise_density * root
     for time_s, rates, forces in zip(*imu.readings, strict=True):
@@ -181,7 +185,7 @@ def _inertial(imu: RecordedImu, factory: MessageFactory) -> Iterator[Message]:
 
 
 def _static_qos() -> list[Any]:
-    """Returns the quality of service of /tf_static: late subscribers get the last message (transient local)."""
+    """Returns the quality of service of /tf_static: late subscribers also get the last message (transient local)."""
     interfaces = optional("rosbags.interfaces", "exchange", "--to mcap")
     forever = interfaces.QosTime(9223372036, 854775807)  # as rosbag2 writes an unlimited duration
     return [

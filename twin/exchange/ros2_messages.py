@@ -33,14 +33,14 @@ class MessageFactory:
         self.typestore: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
     def serialised(self, message: Any) -> Any:
-        """Returns a message in CDR."""
+        """Returns a message serialised in CDR (Common Data Representation of the OMG)."""
         return self.typestore.serialize_cdr(message, message.__msgtype__)
 
     def compressed_image(self, time_ns: int, frame: str, kind: str, data: bytes) -> Any:
         """Returns sensor_msgs/CompressedImage with the bytes of an image file; `kind` is "png" or "jpeg".
 
-        The field `format` follows compressed_image_transport, for example "rgb8; png compressed bgr8": subscribers get
-        the decoded image as rgb8, and decoders return bgr8.
+        The field `format` follows compressed_image_transport, for example "rgb8; png compressed bgr8": decoding of the
+        file gives bgr8, which is converted to rgb8 for the subscribers.
         """
         values = np.frombuffer(data, np.uint8)
         header = self._header(time_ns, frame)
@@ -80,11 +80,11 @@ class MessageFactory:
         )  # fmt: skip
 
     def transforms(self, time_ns: int, poses: dict[tuple[str, str], Array]) -> Any:
-        """Returns tf2_msgs/TFMessage.
+        """Returns tf2_msgs/TFMessage with the poses of frames in their parent frames.
 
         Args:
             time_ns: time of the poses.
-            poses: for each (parent, frame), the pose (4, 4) of the frame in its parent.
+            poses: for each (name of the parent, name of the frame), the pose (4, 4) of the frame in its parent.
         """
         found = [
             self._make(
@@ -116,7 +116,7 @@ class MessageFactory:
         Args:
             time_ns: time of the reading.
             rates_radps: (3,) angular rates of the body in its own axes [rad/s].
-            forces_mps2: (3,) specific forces in the axes of the body, "linear acceleration" in ROS [m/s2].
+            forces_mps2: (3,) specific forces in the axes of the body [m/s2], "linear acceleration" in ROS.
             sigmas: standard deviations of the white noise of each rate [rad/s] and of each specific force [m/s2].
         """
         rate_cov, force_cov = (np.diag([sigma**2] * 3).ravel() for sigma in sigmas)
@@ -150,20 +150,20 @@ class MessageFactory:
         return self._make("geometry_msgs/msg/TwistWithCovarianceStamped", self._header(time_ns, BODY), twist)
 
     def _make(self, kind: str, *fields: Any) -> Any:
-        """Returns a message of a type from its fields, in their order."""
+        """Returns a message of the type `kind` with the given values of its fields, in the order of the fields."""
         return self.typestore.types[kind](*fields)
 
     def _header(self, time_ns: int, frame: str) -> Any:
-        """Returns std_msgs/Header."""
+        """Returns std_msgs/Header with a time and the name of a coordinate frame."""
         stamp = self._make("builtin_interfaces/msg/Time", time_ns // 1_000_000_000, time_ns % 1_000_000_000)
         return self._make("std_msgs/msg/Header", stamp, frame)
 
     def _point(self, p: Array) -> Any:
-        """Returns geometry_msgs/Point."""
+        """Returns geometry_msgs/Point of a position (3,)."""
         return self._make("geometry_msgs/msg/Point", *(float(value) for value in p))
 
     def _vector(self, v: Array) -> Any:
-        """Returns geometry_msgs/Vector3."""
+        """Returns geometry_msgs/Vector3 of a vector (3,)."""
         return self._make("geometry_msgs/msg/Vector3", *(float(value) for value in v))
 
     def _quaternion(self, pose: Array) -> Any:
@@ -175,12 +175,12 @@ class MessageFactory:
     def _twist(self, twist_body: Array, covariance: Array) -> Any:
         """Returns geometry_msgs/TwistWithCovariance of a twist (6,) [rotation, translation].
 
-        `covariance` (36,) is in the order of ROS: linear before angular velocity.
+        `covariance` (36,) is the row-major 6 x 6 matrix in the order of ROS: linear before angular velocity.
         """
         twist = self._make("geometry_msgs/msg/Twist", self._vector(twist_body[3:]), self._vector(twist_body[:3]))
         return self._make("geometry_msgs/msg/TwistWithCovariance", twist, covariance)
 
 
 def _unknown_covariance() -> Array:
-    """Returns the covariance (9,) of a quantity of sensor_msgs/Imu that is not measured."""
+    """Returns the covariance (9,) that marks a quantity of sensor_msgs/Imu as not measured."""
     return np.array([_NOT_MEASURED, *[0.0] * 8])

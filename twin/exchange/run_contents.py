@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from twin.core.georeference import Georeference
 from twin.core.records import Array, ElevationMap, Exposure, Image, ImuReadings, Readings, StereoRig, Trajectory
 
-#: Trajectories that give the poses of exported images, best first.
+#: Names of the trajectories that give the poses of exported images; the first one that a run has is used.
 POSES = ("truth", "final")
 
 
@@ -22,8 +22,8 @@ class RecordedFrame:
     """A frame whose left image is kept in the run folder.
 
     Args:
-        index: number of the frame, which is its row in the trajectories.
-        time_s: time of the exposure after the start of the survey [s].
+        index: number of the frame, from 0, which is its row in the trajectories.
+        time_s: time of the exposure since the start of the survey [s].
         left: file of the left image, an 8-bit RGB PNG.
         right: file of the right image; None if the right camera took none.
         keyframe: whether the frame is a keyframe of the estimators.
@@ -41,13 +41,13 @@ class RecordedFrame:
 
 
 class ImuNoise(NamedTuple):
-    """Noise of an inertial measurement unit (IMU) in the terms of Kalibr.
+    """Noise densities of an inertial measurement unit (IMU), named and defined as in Kalibr.
 
     Args:
-        gyroscope_noise_density: white noise of each angular rate [rad/s/sqrt(Hz)].
-        gyroscope_random_walk: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)].
-        accelerometer_noise_density: white noise of each specific force [m/s2/sqrt(Hz)].
-        accelerometer_random_walk: random walk of the bias of each specific force [m/s3/sqrt(Hz)].
+        gyroscope_noise_density: density of the white noise of each angular rate [rad/s/sqrt(Hz)].
+        gyroscope_random_walk: density of the random walk of the bias of each angular rate [rad/s2/sqrt(Hz)].
+        accelerometer_noise_density: density of the white noise of each specific force [m/s2/sqrt(Hz)].
+        accelerometer_random_walk: density of the random walk of the bias of each specific force [m/s3/sqrt(Hz)].
     """
 
     gyroscope_noise_density: float
@@ -73,7 +73,7 @@ class RecordedImu(NamedTuple):
 
 
 class CameraIntrinsics(NamedTuple):
-    """Camera model of delivered (rectified) images; the centre of the first pixel is at (0, 0).
+    """Camera model of the rectified images of a run; the centre of the first pixel is at (0, 0).
 
     Args:
         size_px: (width, height) of the images.
@@ -87,7 +87,7 @@ class CameraIntrinsics(NamedTuple):
 
 
 def project(points_m: Array, camera: CameraIntrinsics) -> Array:
-    """Returns the pixels (n, 2) of points (n, 3) in camera axes; the centre of the first pixel is at (0, 0).
+    """Returns the pixels (n, 2) of points (n, 3) [m] in camera axes; the centre of the first pixel is at (0, 0).
 
     The model is that of OpenCV: pinhole with radial and tangential distortion.
     """
@@ -108,7 +108,8 @@ class RigCalibration(NamedTuple):
         left, right: camera models.
         left_from_right: (4, 4) pose of the right camera in the axes of the left camera [m].
         body_from_left: (4, 4) pose of the left camera in the body frame of the vehicle [m].
-        residual_px: RMS distance of the camera models from the cameras that they describe; 0: exact [px].
+        residual_px: RMS distance [px] between image points by these models and by the cameras to which the models were
+            fitted; 0: exact.
     """
 
     left: CameraIntrinsics
@@ -128,19 +129,21 @@ class FrameTruth(NamedTuple):
     Args:
         frame: the recorded frame.
         depth_m: (H, W) float32 depth along the optical axis; inf where there is neither floor nor object.
-        normals: (H, W, 3) float32 unit normals of floor and objects in the axes of the left camera, towards the
+        normals: (H, W, 3) float32 unit normals of floor and objects, towards the camera, in the axes of the left
             camera; zero where there is neither.
         albedo: (H, W, 3) uint8, 255 = white.
         clean: (H, W, 3) uint8 image in clear water without marine snow, by the same lamps and sensor, without noise.
-        light: components (H, W, 3) float32 by name: "lamp" (illuminance of the floor by lamps and daylight [lx]; NaN
-            where too little of it reaches the camera to compute it), and the radiances [cd/m2] "direct" (light of the
-            floor that was not scattered), "forward" (light of the floor that was scattered), "veil" (backscatter) and
-            "snow" (change by marine snow). "forward" and "snow" exist only if the scenario has them.
+        light: components (H, W, 3) float32 of the light by name, for the bands R, G, B: "lamp" (illuminance of the
+            floor by lamps and daylight [lx]; NaN where there is no floor or the water transmits too little light to
+            compute it), and the radiances [cd/m2] "direct" (light from the floor, not scattered on its way to the
+            camera), "forward" (light from the floor, scattered on its way), "veil" (backscatter) and "snow" (change by
+            marine snow). "forward" and "snow" exist only if the scenario has forward scatter and marine snow.
         labels: (H, W) uint16, number of the object at each pixel, from 1; 0: the floor, or nothing.
-        flow_px: (H, W, 2) float32 displacement (columns, rows) of each point to the next recorded image; NaN where it
-            is outside the next image, hidden in it, or belongs to a swaying object; None for the last frame.
-        difference: RMS difference between the recorded image and the image rendered again without noise, which is
-            multiplied by the factor of exposure that fits best [grey levels].
+        flow_px: (H, W, 2) float32 displacement (columns, rows) of each point to the next recorded image; NaN where
+            there is no point, or it is outside the next image, hidden in it, or belongs to a swaying object; None for
+            the last frame.
+        difference: RMS of the recorded image minus f times the image rendered again without noise [grey levels], with
+            the factor of exposure f that makes it smallest; values at full scale are left out.
         identical: whether the image rendered again with its noise equals the recorded image in every pixel; None if
             this was not compared.
     """
@@ -162,7 +165,8 @@ class TrueLayers(NamedTuple):
 
     Args:
         object_names: name of the object of each label, from 1.
-        frames: yields the layers of the recorded frames in the order of time; each is computed when it is requested.
+        frames: iterator over the layers of the recorded frames in the order of time, which are computed when they are
+            requested. It raises TwinError if a recorded image cannot be read.
     """
 
     object_names: tuple[str, ...]
@@ -171,7 +175,7 @@ class TrueLayers(NamedTuple):
 
 @dataclass(frozen=True)
 class RunContents:
-    """Contents of a run folder. All poses are those of the left camera in the world (x east, y north, z up) [m].
+    """Contents of a run folder. Trajectories are those of the left camera in the world (x east, y north, z up) [m].
 
     Args:
         folder: the run folder.
@@ -184,14 +188,16 @@ class RunContents:
         keyframe_rows: (n_keyframes,) row of each keyframe in the trajectories.
         frames: recorded frames in the order of time; empty if no images were kept.
         elevation: elevation map with sigma and the colours of the orthomosaic at its cells; None without a map.
-        error_m: (rows, cols) estimated minus true elevation, NaN where unknown; None without truth.
+        error_m: (rows, cols) estimated minus true elevation at the cells of the map, NaN where unknown; None without a
+            true map.
         orthomosaic: file of the orthomosaic (GeoTIFF, RGBA or RGB); None if the run has no such file.
-        georeference: position of the scene in a CRS, from the measured DEM or the options of the export; None: local
-            coordinates.
-        true_layers: renders the world again and returns its true layers; None without a simulated world.
+        georeference: position of the scene in a coordinate reference system (CRS), from the measured DEM or the options
+            of the export; None: scene coordinates.
+        true_layers: function that renders the world again and returns its true layers; None for recorded data, for runs
+            with the surrogate, and without recorded true poses.
         imu: readings of the IMU; None if none were recorded.
         true_map: file of the true heights (dem_truth.tif); None without one.
-        jpeg_quality: quality of the exported images as JPEG, 1 to 100; None: copies of the PNG files.
+        jpeg_quality: quality of the exported images as JPEG, 1 to 100; None: the PNG files are copied.
         progress: called with the completed fraction of the format that is being written, 0 to 1.
         notes: sentences on files of the run that are missing.
     """

@@ -1,8 +1,9 @@
 """The elevation map as a triangle mesh with the orthomosaic as its texture: GLB (binary glTF) and OBJ.
 
-Both are in scene coordinates [m], because most programs read their numbers in single precision, which is too coarse for
-CRS coordinates. GLB is y-up, as glTF demands; OBJ is x east, y north, z up. The extras of the GLB scene and the
-comments of the OBJ file have the position of the scene origin in the CRS.
+Both are in scene coordinates [m], because most programs read coordinates of meshes in single precision, which is too
+coarse for coordinates in a coordinate reference system (CRS). In GLB, x is east, y up and z south, as glTF is y-up; in
+OBJ, x is east, y north and z up. With a georeference, the extras of the GLB scene and the comments of the OBJ file
+state the position of the scene origin in the CRS.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from twin.exchange import geotiff
 from twin.exchange.mesh import GLB_FROM_WORLD, MAX_VERTICES
 from twin.exchange.run_contents import RunContents
 
-_MOST_TEXTURE_PX = 8192  # largest side of a texture: what common graphics cards accept
+_MOST_TEXTURE_PX = 8192  # largest side of a texture [px], which common graphics cards support
 
 
 def export_glb_file(contents: RunContents, folder: Path) -> list[Path]:
@@ -43,7 +44,7 @@ def export_glb_file(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def export_obj_files(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes map.obj with its material and texture, and returns these files."""
+    """Writes map.obj and the files of its material and texture, and returns these files."""
     path, (mesh, texture) = folder / "map.obj", _mesh(contents)
     mesh.visual = TextureVisuals(_uv(mesh), SimpleMaterial(image=texture, name="map"))
     lines = ["z-up, metres", *(f"{key}: {value}" for key, value in _origin(contents.georeference).items())]
@@ -59,12 +60,13 @@ def export_obj_files(contents: RunContents, folder: Path) -> list[Path]:
 def textured_mesh(elevation: ElevationMap, texture_grid: MapGrid, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
     """Returns the mesh of a map in scene coordinates, with texture coordinates.
 
-    Vertices are the centres of the mapped cells, subsampled to about `max_vertices`; triangles face upwards. Texture
-    coordinates have their origin in the south-west corner of the texture.
+    Vertices are the centres of the mapped cells, subsampled to about `max_vertices`. Triangles connect neighbouring
+    vertices and face up in the frame of the map; cells that belong to no triangle are left out. Texture coordinates are
+    (0, 0) in the south-west and (1, 1) in the north-east corner of the texture.
 
     Args:
         elevation: the map.
-        texture_grid: position of the texture's pixels; row 0 is the northernmost.
+        texture_grid: grid of the pixels of the texture; row 0 is the northernmost.
         max_vertices: approximate largest number of vertices.
     """
     stride = max(1, int(np.ceil(np.sqrt(elevation.height_m.size / max_vertices))))
@@ -113,6 +115,6 @@ def _texture(file: Path) -> tuple[NDArray[np.uint8], MapGrid]:
 
 
 def _origin(georeference: Georeference | None) -> dict[str, str]:
-    """Returns the texts that state where the scene origin lies in the CRS; empty without a georeference."""
+    """Returns the position of the scene origin in the CRS, and the CRS, as texts; empty without a georeference."""
     tags = geotiff.placement_tags(georeference)
     return tags | {"CRS": geotiff.crs_of(georeference).to_wkt()} if tags else {}

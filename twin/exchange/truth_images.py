@@ -22,7 +22,11 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     8-bit PNG, and `labels` is a 16-bit PNG. `index.json` has the camera matrix, the names of the objects, and for each
     frame the difference between the recorded image and the image rendered again.
 
+    Returns:
+        `folder` and the path of index.json.
+
     Raises:
+        TwinError: the true poses are damaged, the scenario can no longer be prepared, or an image cannot be read.
         OSError: a file cannot be written.
     """
     assert contents.true_layers is not None
@@ -45,7 +49,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _index(contents: RunContents, frames: list[dict], names: tuple[str, ...]) -> dict:
-    """Returns the contents of index.json."""
+    """Returns the contents of index.json, given its entries for the frames and the names of the objects."""
     compared = [frame["identical"] for frame in frames if frame["identical"] is not None]
     return {
         "camera_matrix": contents.rig.matrix.tolist(),

@@ -13,11 +13,15 @@ from twin.exchange.run_contents import RunContents
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the trajectories of the left camera, and the images if any were recorded.
+    """Writes the trajectories of the left camera, and the images if any were recorded; returns the text files.
 
-    The truth is `groundtruth.txt`; the other trajectories have their names, for example `final.txt`.
-    Each line of a trajectory is: time [s], x, y, z [m], quaternion x, y, z, w (world_from_camera). `rgb.txt` lists the
-    left images with their times, and `right.txt` the right ones.
+    The truth is written to `groundtruth.txt`, each other trajectory to a file of its name, for example `final.txt`.
+    Each line of a trajectory is: time [s], x, y, z [m], quaternion x, y, z, w (world_from_camera). Images are written
+    to the folders `rgb` (left) and `right`; `rgb.txt` and `right.txt` list them with their times [s].
+
+    Raises:
+        TwinError: an image is truncated or not a PNG image.
+        OSError: a file cannot be read or written.
     """
     names = {"truth": "groundtruth.txt"}
     written = [

@@ -13,7 +13,7 @@ from twin.judge.summary_statistics import finite_float, rms
 from twin.judge.trajectory import anchor, path_errors
 
 #: The far end of a track consists of the frames whose planned distance from the start of the survey is at least this
-#: fraction of the track's greatest distance.
+#: fraction of the greatest planned distance within the track.
 FAR_SHARE = 0.9
 
 
@@ -54,9 +54,9 @@ def _row(
 def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
     """Returns the RMS position error at the far end of a track [m]; None if the track has no frames.
 
-    The far end consists of the frames at no less than `FAR_SHARE` of the track's greatest distance from the start,
-    where drift is greatest (Negahdaripour & Madjidi 2003, section III). The error of a single frame would be dominated
-    by frame-to-frame noise.
+    The far end consists of the frames whose planned distance from the start of the survey is at least `FAR_SHARE` of
+    the greatest one within the track. Drift is greatest there (Negahdaripour & Madjidi 2003, section III). The error of
+    a single frame would be dominated by frame-to-frame noise.
 
     Args:
         track: number of the track, from 1.
@@ -71,21 +71,21 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 
 
 def _keyframe_rmse(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> float | None:
-    """Returns the RMSE [m] of estimated positions (n, 3) of the first n keyframes in `frames`; None if there are none.
+    """Returns the RMS of the position errors of keyframes [m]; None if there are none.
 
-    Arguments as for `keyframe_errors_m`.
+    The arguments are those of `keyframe_errors_m`.
     """
     return rms(keyframe_errors_m(positions, frames, result, truth))
 
 
 def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> Array:
-    """Returns the position errors (n,) [m] of the first n keyframes in `frames`.
+    """Returns the position errors (min(n, m),) of the first keyframes of a survey [m].
 
     The positions are anchored at the first true pose before they are compared.
 
     Args:
-        positions: (n, 3) estimated positions, not yet anchored [m].
-        frames: (m,) frame numbers of the keyframes; those after the first n have no position yet.
+        positions: (n, 3) estimated positions of the first n keyframes, not yet anchored [m].
+        frames: (m,) frame numbers of the first m keyframes.
         result: output of the estimators, of which the first online pose is used.
         truth: source of the true trajectory.
     """

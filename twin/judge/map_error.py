@@ -20,7 +20,10 @@ INFINITE_WITH_HOLES = ("map.le90_area_m",)
 
 
 def height_error(elevation: ElevationMap, truth: Truth) -> Array:
-    """Returns estimated minus true height (rows, cols) [m]; NaN where the cell was not observed or not estimated."""
+    """Returns estimated minus true height (rows, cols) [m].
+
+    NaN in cells that were not observed, and in cells without an estimated or without a true height.
+    """
     error = elevation.height_m.astype(float) - truth.height_m
     return np.where(truth.seen, error, np.nan)
 
@@ -74,9 +77,10 @@ def _of_surface(name: str, size: Array) -> dict[str, float | None]:
 
 
 def completeness_metric(metric: str) -> str | None:
-    """Returns the completeness metric to report with a statistic of the height errors; None for all other metrics.
+    """Returns the name of the completeness metric to report with a statistic of the height errors.
 
-    The statistic does not cover the cells without a height, so it is never reported alone.
+    It shows how many cells have no height: most of these statistics leave them out, so none is reported alone. Returns
+    None if the metric is not such a statistic.
     """
     if not metric.startswith("map.") or metric.startswith("map.completeness") or metric == "map.cell_m":
         return None
@@ -84,15 +88,15 @@ def completeness_metric(metric: str) -> str | None:
 
 
 def with_completeness(metrics: Iterable[str]) -> list[str]:
-    """Returns the metrics without duplicates, with the completeness metric of each map statistic added."""
+    """Returns the given names of metrics and those of the completeness metrics to report with them, each once."""
     return list(dict.fromkeys(name for metric in metrics for name in (metric, completeness_metric(metric)) if name))
 
 
 def percentile_with_holes(size: Array, percent: float) -> float | None:
-    """Returns a percentile (0 to 100) of absolute errors (n,), linearly interpolated, with NaN as an infinite error.
+    """Returns a percentile (0 to 100) of absolute errors (n,), linearly interpolated; NaN counts as an infinite error.
 
-    Returns None if no value is finite, or if the percentile is infinite because an infinite error enters the
-    interpolation.
+    Returns None if no value is finite, or if an infinite error enters the interpolation and makes the percentile
+    infinite.
     """
     known = np.isfinite(size)
     if not known.any():

@@ -43,8 +43,8 @@ class EvaluationInput:
         rig: calibration that the estimators use.
         plan: pattern, requested and forecast overlaps of the plan: the argument `planned` of `overlap_metrics`.
         timing: wall_s, simulated_s, peak_rss_mb, and stages as `Stopwatch.summary` returns them.
-        identity: name, seed, version, scenario_hash, status ("complete", "degraded" or "aborted"), and the reason for a
-            status other than "complete", or "".
+        identity: name, seed, version, scenario_hash, status ("complete", "degraded" or "aborted"), and reason, the
+            reason for the status ("" if it is "complete").
         require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
         warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
         idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
@@ -105,8 +105,8 @@ def _judged(metrics: dict[str, Any], survey: EvaluationInput) -> dict[str, Any]:
 def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
     """Returns the metrics of a survey that was not compared with the truth.
 
-    They hold identity, timing, warnings, idealisations and requirements; all other metrics are None, 0 or empty. A
-    requirement on a metric that is None fails.
+    They hold schema, identity, timing, warnings, idealisations and requirements; all other metrics are None, 0 or
+    empty. A requirement on a metric that is None fails.
 
     Raises:
         TwinError: `require` names a metric that does not exist.

@@ -20,12 +20,13 @@ PATCH_PX, SEARCH_PX = 32, 8  # side of the patches that are matched, and largest
 #: Unrelated patches reach a correlation of about 0.2 at the best displacement: the correlation of patches with about
 #: 300 independent pixels has a standard deviation of 0.06.
 LEAST_CORRELATION = 0.25
-_COLOUR_STEP_PX = 3  # spacing of the pixels whose colour is judged
-_BINS = np.linspace(0, 100, 10001)  # of the colour differences
+_COLOUR_STEP_PX = 3  # spacing of the pixels whose colour is compared
+_BINS = np.linspace(0, 100, 10001)  # edges of the bins of the histogram of colour differences
 _LUMINANCE = XYZ_FROM_RGB[1].astype(np.float32)
 #: Distance from 10 % to 90 % of the edge response of a Gaussian blur, in standard deviations.
 _EDGE_PER_SIGMA = 2 * 1.2815515655446004
-#: Frequencies used to fit the blur: the highest [1/px], and the least transfer relative to the largest one.
+#: Limits of the frequencies to which the blur is fitted: the highest frequency [1/px], and the smallest transfer as a
+#: fraction of the largest.
 _HIGHEST_FREQUENCY, _LEAST_TRANSFER = 0.4, 0.1
 
 
@@ -33,7 +34,8 @@ class OrthomosaicJudge:
     """Compares an orthomosaic with the true one.
 
     Args:
-        restored: whether the colours are those of the floor; otherwise they are as seen, and are not evaluated.
+        restored: whether the colours of the orthomosaic are restored albedo; if not, they are the colours of the
+            images, and are not compared.
     """
 
     def __init__(self, restored: bool):
@@ -50,8 +52,9 @@ class OrthomosaicJudge:
 
         Args:
             tile: part of the orthomosaic.
-            albedo: (rows, cols, 3) true albedo of its pixels, 255 = white; NaN where there is no floor.
-            asked: (rows, cols) whether each pixel lies in the asked area.
+            albedo: (rows, cols, 3) true albedo of its pixels, 255 = white; NaN where there is no floor or an object
+                lies on it.
+            asked: (rows, cols) bool, whether each pixel lies in the asked area.
         """
         self._pixel_m = tile.grid.cell_m
         self._n_asked += int(asked.sum())
@@ -62,13 +65,27 @@ class OrthomosaicJudge:
         self._match(tile.rgba[..., :3] @ _LUMINANCE, np.nan_to_num(albedo) @ _LUMINANCE, known)
 
     def _compare_colours(self, rgb: NDArray[np.uint8], albedo: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
-        """Adds the colour differences of every `_COLOUR_STEP_PX`-th pixel along rows and columns to the histogram."""
+        """Adds the colour differences of known pixels, every `_COLOUR_STEP_PX`-th per row and column, to the histogram.
+
+        Args:
+            rgb: (rows, cols, 3) colours of the orthomosaic.
+            albedo: (rows, cols, 3) true albedo, 255 = white.
+            known: (rows, cols) bool, whether a pixel has a colour and a true albedo.
+        """
         some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
         colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (rgb, albedo))
         self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]
 
     def _match(self, shown: NDArray[np.float32], true: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
-        """Adds the displacement and the spectra of each patch whose surroundings have a colour and a true albedo."""
+        """Counts the patches that can be compared, and adds the displacement and the spectra of those that are found.
+
+        A patch can be compared if all pixels within the search range around it have a colour and a true albedo.
+
+        Args:
+            shown: (rows, cols) luminance of the orthomosaic.
+            true: (rows, cols) luminance of the true albedo.
+            known: (rows, cols) bool, whether a pixel has both.
+        """
         n, m = PATCH_PX, SEARCH_PX
         for row in range(m, len(shown) - n - m + 1, n):
             for col in range(m, shown.shape[1] - n - m + 1, n):
@@ -89,7 +106,7 @@ class OrthomosaicJudge:
     def metrics(self) -> dict[str, float | None]:
         """Returns `orthomosaic.*` of metrics.json; every value is None without an orthomosaic.
 
-        pixel_m is the side of a pixel, coverage_area the fraction of the asked area that has a colour. ce90_m and
+        pixel_m is the side of a pixel, and coverage_area the fraction of the asked area that has a colour. ce90_m and
         ce90_px are the 90th percentile of the horizontal displacement of patches against the true orthomosaic (circular
         error at 90 %), bias_east_m and bias_north_m the medians of its components, and matched the fraction of the
         patches that were found in the true orthomosaic. colour_difference_median and _p90 are percentiles of CIEDE2000
@@ -116,11 +133,12 @@ class OrthomosaicJudge:
 def edge_width_px(cross: Array, power: Array) -> float | None:
     """Returns the 10 % to 90 % edge width [px] of the Gaussian blur that best fits a modulation transfer function.
 
-    The blur has the transfer function exp(-2 (pi sigma f)^2), the measured one is `cross` / `power`. None if too few
-    frequencies have a usable ratio.
+    The measured transfer function of the frequency f [1/px] is `cross` / `power`, each summed over all directions. The
+    function gain * exp(-2 (pi sigma f)^2) is fitted to it, with sigma the standard deviation of the blur [px]. Returns
+    None if fewer than four frequencies have a usable ratio.
 
     Args:
-        cross: (n, n) sum of the cross-spectra.
+        cross: (n, n) sum of the cross-spectra of the patches with the true patches.
         power: (n, n) sum of the power spectra of the true patches.
     """
     n = len(power)
@@ -141,7 +159,12 @@ def edge_width_px(cross: Array, power: Array) -> float | None:
 
 
 def _percentile_of_counts(counts: NDArray[np.int64], percent: float) -> float | None:
-    """Returns a percentile (0 to 100) of values counted in `_BINS`, the upper edge of its bin; None without values."""
+    """Returns the upper edge of the bin of `_BINS` that contains a percentile (0 to 100); None without values.
+
+    Args:
+        counts: number of values in each bin.
+        percent: the percentile.
+    """
     if not counts.any():
         return None
     return float(_BINS[1 + np.searchsorted(np.cumsum(counts), percent / 100 * counts.sum())])

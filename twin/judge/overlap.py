@@ -43,7 +43,7 @@ class ImagePairs(NamedTuple):
     """Pairs of images whose overlap is computed.
 
     Args:
-        keyframe: (m,) index of the keyframe of the first image.
+        keyframe: (m,) index of the keyframe whose image is the first of the pair.
         first, second: (m, 4, 4) world_from_camera of both images.
     """
 
@@ -131,7 +131,7 @@ def _nearest_in_next(poses: KeyframePoses, swath: int) -> NDArray[np.int64]:
 
 
 def _overlaps(field: HeightField | None, pairs: ImagePairs, rig: StereoRig) -> Array:
-    """Returns the overlaps of the pairs; a pair without floor in its first image is left out; empty without a floor."""
+    """Returns the overlaps of the pairs whose first image shows floor; an empty array if `field` is None."""
     if field is None:
         return np.zeros(0)
     overlap = image_overlap(field, pairs.first, pairs.second, rig)

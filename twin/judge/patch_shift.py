@@ -1,4 +1,4 @@
-"""Local displacement of one picture against another, by normalised cross-correlation of patches."""
+"""Local displacement of one image against another, by normalised cross-correlation of patches."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class PatchShift(NamedTuple):
     """Displacement of a patch.
 
     Args:
-        right_px, down_px: displacement of the patch in the first picture from its position in the second one.
+        right_px, down_px: position of the patch in the first image minus its position in the second image.
         correlation: normalised cross-correlation at the displacement rounded to whole pixels.
     """
 
@@ -27,12 +27,17 @@ class PatchShift(NamedTuple):
 
 
 def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchShift | None:
-    """Returns the displacement of a patch (n, n) against a larger picture (n + 2 m, n + 2 m) with the same centre.
+    """Returns the displacement of a patch (n, n) of the first image against the second image.
 
-    The peak of the correlation is interpolated by a parabola through three values along each axis. Returns None if one
-    of the two has no texture, if the correlation is below `least_correlation`, if the peak lies at the border of the
-    search range of m pixels, or if the correlation exceeds 90 % of the peak at a distance of more than three pixels
-    along a row or a column.
+    The peak of the correlation is interpolated by a parabola through three values along each axis. Returns None if the
+    patch or the part of the second image has no texture, if the peak is below `least_correlation`, if it lies at the
+    border of the search range of m pixels, or if the correlation exceeds 90 % of the peak more than three rows or
+    columns away from it.
+
+    Args:
+        patch: (n, n) part of the first image.
+        around: (n + 2 m, n + 2 m) part of the second image with the same centre.
+        least_correlation: smallest accepted peak of the normalised cross-correlation.
     """
     if min(patch.std(), around.std()) < 1e-3:
         return None
@@ -51,13 +56,16 @@ def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchS
 
 
 def _vertex(before: float, at: float, after: float) -> float:
-    """Returns the position of the vertex of a parabola through values at -1, 0 and 1; the value at 0 is the largest."""
+    """Returns the position of the vertex of the parabola through values at -1, 0 and 1, of which that at 0 is largest.
+
+    Returns 0 if the three values are equal.
+    """
     curvature = before - 2 * at + after
     return 0.0 if curvature >= 0 else 0.5 * (before - after) / curvature
 
 
 def transfer(patch: Layer, true: Layer, shift: PatchShift) -> tuple[Array, Array]:
-    """Returns the cross-spectrum of a patch and the true patch (n, n), and the power spectrum of the true patch.
+    """Returns the cross-spectrum (n, n) of a patch and the true patch, and the power spectrum (n, n) of the true patch.
 
     Both patches are weighted by a Hann window. The cross-spectrum is corrected for the displacement `shift`, and its
     real part is returned. The ratio of the spectra is the modulation transfer function.

@@ -116,7 +116,10 @@ def _map_metrics(survey: ReplayEvaluation) -> dict[str, float | None]:
 
 
 def unevaluated_replay(survey: ReplayEvaluation) -> dict[str, Any]:
-    """Returns the metrics of a replay without its evaluation: identity, data set, timing; others None, 0 or empty."""
+    """Returns the metrics of a replay that was not evaluated.
+
+    They hold schema, identity, description of the data set, timing and warnings; all others are None, 0 or empty.
+    """
     result = survey.result
     unknown = {"alignment": None, "frames_with_truth": 0, "network": dict.fromkeys(NETWORK_KEYS)}
     metrics = empty_metrics() | survey.identity | {
@@ -190,7 +193,7 @@ def world_alignment(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
 
 def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> PathErrors:
-    """Returns the errors of an estimate at the frames that have a true pose, after the alignment.
+    """Returns the errors of the aligned estimate at the frames that have a true pose.
 
     The errors are empty if fewer than three frames have a true pose.
     """
@@ -205,7 +208,7 @@ def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
     """Returns warnings if the truth seems to have another clock, unit, scale or body than the estimate.
 
-    An estimate of fewer than three frames, as after an early interrupt, is too short for any of them.
+    There are no warnings if the estimate has fewer than three frames, as after an early interrupt.
     """
     if len(estimate) < _MIN_ASSOCIATED:
         return []
@@ -278,6 +281,6 @@ def _selected(path: Trajectory, rows: NDArray[np.int64]) -> Trajectory:
 
 
 def _is_spatial(positions: Array) -> bool:
-    """Returns whether positions (n, 3) define a rotation: they do not lie on a line."""
+    """Returns whether positions (n, 3) determine a rotation, which they do not if they lie nearly on a line."""
     spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
     return bool(spread[1] > 0.05 * spread[0] > 0)

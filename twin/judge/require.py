@@ -20,7 +20,7 @@ MORE_IS_BETTER = (
     "orthomosaic.matched",
 )
 
-#: Metrics that can be negative: the ratio of two values has no meaning.
+#: Metrics that can be negative, for which the ratio of two values has no meaning.
 SIGNED = (
     "map.bias_m",
     "orthomosaic.bias_east_m",
@@ -62,7 +62,7 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
 
 
 def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
-    """Yields the dotted path of every number and every None in the tables of `metrics`, not at its top level."""
+    """Yields the dotted path of every number and every None in nested tables of `metrics`, but not at its top level."""
     for key, value in metrics.items():
         if isinstance(value, Mapping):
             yield from number_paths(value, f"{prefix}{key}.")

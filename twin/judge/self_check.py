@@ -21,8 +21,8 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     row difference that they do not explain, and disparity_offset the common error of all disparities that the links
     imply (both are fractions of the focal length). sigma_max_m is the largest 3-D standard deviation (square root of
     the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D standard deviation of the position
-    of a frame relative to the last keyframe by frame-to-frame motion, just before the next keyframe, 90th percentile
-    over the keyframes [m].
+    of a keyframe relative to the previous keyframe, by frame-to-frame motion alone: the 90th percentile over the
+    keyframes [m].
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]

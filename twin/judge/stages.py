@@ -25,7 +25,8 @@ class StageError(NamedTuple):
     Args:
         stage: one of `STAGES`.
         rmse_m: RMS position error [m].
-        gain: error of the preceding stage / error of this stage; None without a preceding stage or if an error is 0.
+        gain: error of the preceding stage that has one / error of this stage; None if there is no such stage or an
+            error is 0.
     """
 
     stage: str
@@ -49,7 +50,8 @@ def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, flo
 def compose_chain(links: Links, nodes: NDArray[np.int64]) -> Array:
     """Returns the poses (n, 4, 4) of the nodes relative to the first, by composing the links of consecutive nodes.
 
-    Returns an empty array (0, 4, 4) if a link between consecutive nodes is missing.
+    Returns an empty array (0, 4, 4) if a link between consecutive nodes is missing, and one identity matrix (1, 4, 4)
+    without nodes.
     """
     chain = links.select(node_distance(links, nodes) == 1)
     motions = dict(zip(zip(chain.i.tolist(), chain.j.tolist(), strict=True), chain.i_from_j, strict=True))
@@ -73,7 +75,7 @@ def stage_errors(metrics: Mapping[str, Any]) -> list[StageError]:
 
 
 def _errors(path: Trajectory, true: Trajectory) -> dict[str, float | None]:
-    """Returns RMS and largest position error [m]; both are None if poses are missing from the path."""
+    """Returns RMS and largest position error [m]; both are None if the two paths differ in their number of poses."""
     complete = len(path.world_from_camera) == len(true)
     distance_m = path_errors(path, true).distance_m if complete else np.zeros(0)
     return {"ate_rmse_m": rms(distance_m), "ate_max_m": finite_float(distance_m.max()) if len(distance_m) else None}

@@ -13,8 +13,8 @@ def stereo_quality(result: SurveyResult) -> dict[str, Any]:
 
     points_median and points_p10 are the median and the 10th percentile of the number of matched points.
     contrast_median and saturated_median are the medians of the contrast and of the saturated fraction of the pixel
-    values; both are None without images. blind_looks is the number of stereo observations that did not give
-    a keyframe because they had too few matched points.
+    values; both are None without images. blind_looks is the number of frames that have a stereo observation but
+    did not become keyframes, because they had too few matched points.
     """
     points = [observation.n_points for observation in result.stereo_observations]
     contrast = [observation.contrast for observation in result.stereo_observations if observation.contrast is not None]

@@ -10,15 +10,16 @@ from twin.core.records import Array, Truth
 #: A frame belongs to a leg if |cos| of the angle between its direction of travel and the axis of the legs exceeds
 #: this value (angle below 26 deg).
 ON_LEG_COSINE = 0.9
-#: Smallest step of the planned heading between two frames of a turn [rad].
+#: Change of the planned heading between two frames above which they belong to a turn [rad].
 TURNING_STEP = 1e-9
 
 
 def travel_direction(reference: Array) -> Array:
     """Returns horizontal unit vectors of travel (n, 2) along reference positions (n, 3).
 
-    While the reference position does not change horizontally, the direction is that of the previous step, or of the
-    first step if there is no previous one; [1, 0] if there is no step at all.
+    The direction at a position is that of the step to the next position. Where this step has no horizontal length, the
+    direction is that of the last step before it that has one, or else of the first step that has one; [1, 0] if no step
+    has one.
     """
     n = len(reference)
     if n == 0:
@@ -58,8 +59,8 @@ def is_turning(yaw: Array) -> NDArray[np.bool_]:
 def leg_numbers(reference: Array) -> NDArray[np.int64]:
     """Returns the number (n,) of the leg of each frame, from 0; -1 on the short segments between legs.
 
-    The axis of the legs is the principal axis of the steps between the reference positions (n, 3). A leg ends at a
-    turn or at a short segment.
+    The axis of the legs is the principal axis of the steps between the reference positions (n, 3). A leg ends where the
+    direction of travel reverses or a short segment begins.
     """
     direction = travel_direction(reference)
     steps = np.diff(reference[:, :2], axis=0, prepend=reference[:1, :2])

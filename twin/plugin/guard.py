@@ -23,14 +23,14 @@ class PluginFailed(SurveyAborted):
 
 
 class GuardedPlugin:
-    """Plug-in whose calls and results are checked. An object of its class is created at the first call.
+    """Plug-in whose calls and results are checked. An object of the plug-in's class is created at the first call.
 
     Args:
         key: key of the scenario that names the plug-in, for example "control.plugin".
         group: group of entry points.
         name: "module:Class", or the name of an entry point.
         methods: methods that the plug-in must have.
-        arguments: arguments of its class.
+        arguments: arguments with which the class is called.
 
     Raises:
         TwinError: the class cannot be loaded.
@@ -82,7 +82,7 @@ class GuardedPlugin:
 
         Raises:
             PluginFailed: the value is not valid for `numbers`, a rotation is not orthonormal with determinant 1, a
-                last row is not (0, 0, 0, 1), or a coordinate is larger than 1e6 m.
+                last row is not (0, 0, 0, 1), or the absolute value of a coordinate is larger than 1e6 m.
         """
         array = self.numbers(method, value, shape)
         rotation = array[..., :3, :3]
@@ -128,6 +128,12 @@ def check_loadable(key: str, group: str, name: str | None) -> None:
 
 def terrain_heights(name: str, x_m: Array, y_m: Array, seed: int) -> Array:
     """Returns the heights (rows, cols) [m] of a floor from a terrain plug-in (`TerrainGenerator.heights`).
+
+    Args:
+        name: "module:Class", or the name of an entry point.
+        x_m: (cols,) x of the grid nodes, ascending [m].
+        y_m: (rows,) y of the grid nodes, ascending [m].
+        seed: seed of the scenario.
 
     Raises:
         TwinError: the plug-in cannot be loaded, raised an exception, or returned an unusable value.

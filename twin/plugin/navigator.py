@@ -64,9 +64,12 @@ class PluginNavigator(Navigator):
     def update(self, frame: Frame, track: int = 1) -> Estimate:
         """Passes one frame to the plug-in and returns its online estimate.
 
+        If the plug-in returns no pose, the estimate has the last pose, the velocity zero, and a status other than "ok".
+
         Raises:
             PluginFailed: the plug-in raised an exception or returned an unusable value.
-            ValueError: the frame is not later than the last one.
+            ValueError: the frame is not later than the last one, or an image of a keyframe is not of the size that the
+                calibration states.
             OSError: images could not be written.
         """
         interval_s = self._interval_s(frame.time_s)
@@ -99,7 +102,7 @@ class PluginNavigator(Navigator):
     def finish(self) -> SurveyResult:
         """Returns the result of the survey, with the trajectories and covariances that the plug-in gave.
 
-        The final trajectory is the online one if the plug-in gives none.
+        The final trajectory is the online one if `finish` of the plug-in returns None or is not called.
 
         Raises:
             PluginFailed: `finish` of the plug-in raised an exception or returned an unusable value.

@@ -22,7 +22,7 @@ class ControllerSetup(NamedTuple):
         hull: inertia, added mass and drag of the BlueROV2 Heavy.
         allocation: its thrust allocation; `allocation.commands(wrench)[0]` are the thruster commands (8,) for a wrench
             (6,) [moment, force] in the body [N m, N].
-        n_commands: 8 thruster commands; 3 for vehicle.dynamics = "kinematic".
+        n_commands: length of a command: 8, one per thruster; 3 for vehicle.dynamics = "kinematic".
     """
 
     rig: StereoRig

@@ -15,7 +15,7 @@ Kind = Literal["controller", "estimator", "terrain", "reader"]
 
 
 class _Flown(NamedTuple):
-    """Settings of the survey in which the test of a skeleton uses the plug-in.
+    """Settings of the survey that the test of a skeleton flies with the plug-in.
 
     Args:
         section: section of the scenario with the key `plugin`.
@@ -45,10 +45,12 @@ def plugin_kind(text: str) -> Kind:
 
 
 def package_name(folder: Path) -> str:
-    """Returns the name of the package in a folder: that of the folder in lower case, with "_" for ".", "-" and spaces.
+    """Returns the name of the package in a folder.
+
+    It is the name of the folder in lower case, with "_" in place of each run of ".", "-" and white space.
 
     Raises:
-        TwinError: the name is not valid for a Python package, or a package of this name can already be imported.
+        TwinError: the name is not valid for a Python package, or a module of this name can already be imported.
     """
     name = re.sub(r"[\s.-]+", "_", folder.absolute().name).lower()
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
@@ -67,7 +69,8 @@ def write(kind: Kind, folder: Path) -> list[Path]:
         folder: new or empty folder; its name becomes the name of the package and of the entry point.
 
     Raises:
-        TwinError: the name of the folder gives no name of a package, or a package of this name is installed.
+        TwinError: the name of the folder does not give a valid name of a package (`package_name`), or a module of
+            this name can already be imported.
         OSError: a file cannot be written.
     """
     package = package_name(folder)

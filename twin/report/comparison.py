@@ -101,7 +101,10 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def names_of(runs: Sequence[Run]) -> list[str]:
-    """Returns distinct names of runs: those of their folders, all with as few parent folders as make them distinct."""
+    """Returns distinct names of runs: the last parts of the paths of their folders, joined by "/".
+
+    All names have the same number of parts, the smallest that makes them distinct.
+    """
     paths = [run.folder.resolve() for run in runs]
     for n in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-n:]) for path in paths]
@@ -200,7 +203,14 @@ def _value(metrics: Mapping[str, Any], name: str) -> float | None:
 
 
 def _cell(quantity: ComparedQuantity, value: float | None, first: float | None, is_first: bool) -> Cell:
-    """Returns the cell of a value, compared with that of the first run."""
+    """Returns the table cell of one run, with its value compared to that of the first run.
+
+    Args:
+        quantity: the quantity of the row.
+        value: value of the run; None if it has none.
+        first: value of the first run; None if it has none.
+        is_first: whether the run is the first one.
+    """
     if is_first or value is None or first is None:
         return Cell(value, None, quantity.text(value), "", "")
     difference = value - first
@@ -216,12 +226,12 @@ def _cell(quantity: ComparedQuantity, value: float | None, first: float | None, 
 
 
 def _relative(factor: float) -> str:
-    """Returns the ratio of two values as text: a change in percent below three, e.g. "+10 %", otherwise a factor."""
+    """Returns the ratio of two values as text: as a change in percent, e.g. "+10 %", below 3, otherwise as a factor."""
     return f"{100 * (factor - 1):+.0f} %" if factor < 3 else wording.ratio(factor)
 
 
 def _flattened(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Returns the dotted keys and the values of a tree; lists are values."""
+    """Returns the dotted keys and the values of nested tables; a list is one value."""
     return [
         pair
         for key, value in tree.items()

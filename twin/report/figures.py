@@ -24,7 +24,7 @@ from twin.report.style import COLOURS, ESTIMATES, FIGURE_STYLE, LABELS
 from twin.report.wording import PROCESSING_STAGES, improvement, length
 
 WIDTH_IN = 9.6
-#: Longest side of a map in a figure [cells]; finer maps are subsampled.
+#: Longest side of a map in a figure [cells]; maps with more cells are subsampled.
 MAP_CELLS = 500
 #: The true path is drawn as a broad band below the estimates, so it remains visible where they coincide with it.
 PATH_STYLES: dict[str, dict[str, Any]] = {
@@ -144,7 +144,7 @@ def log_axis(axis: Any, set_scale: Callable[[str], None], steps: tuple[float, ..
 
 
 def stage_bars(run: Run) -> Figure | None:
-    """Returns bars of the keyframe error after each positioning stage, with the change from the preceding stage."""
+    """Returns bars of the RMS position error after each positioning stage, with the change from the preceding stage."""
     rows = stage_rows(run.metrics or {}, run.scenario)
     errors_m = [row.rmse_m for row in rows if row.rmse_m]
     if not errors_m:
@@ -165,7 +165,7 @@ def stage_bars(run: Run) -> Figure | None:
 
 
 def track_bars(run: Run) -> Figure | None:
-    """Returns bars of the keyframe error before and after each global alignment."""
+    """Returns bars of the RMS position error of the keyframes before and after the alignment of each track."""
     tracks = (run.metrics or {}).get("tracks") or []
     if not tracks:
         return None
@@ -183,7 +183,10 @@ def track_bars(run: Run) -> Figure | None:
 
 
 def stereo_quality_curves(run: Run) -> Figure | None:
-    """Returns curves of matched points and contrast over time; red: observations with too few points for a keyframe."""
+    """Returns curves of matched points and contrast over time.
+
+    Stereo observations with too few points for a keyframe are red.
+    """
     observations, path = run.keyframes.stereo_observations, run.trajectories.get("online")
     if path is None or not len(observations) or observations[:, 0].max() >= len(path):
         return None
@@ -237,7 +240,7 @@ def error_maps(run: Run) -> Figure | None:
 
 
 def _scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normalize) -> None:
-    """Adds a raster with its colour bar; cells without data are light grey."""
+    """Draws a raster with one band and its colour bar; cells without data are light grey."""
     image = _map_axes(axes).imshow(subsampled(raster), cmap=cmap, norm=norm, extent=_extent(raster))
     axes.set_title(title)
     axes.set_facecolor("#dfe6ea")
@@ -247,7 +250,7 @@ def _scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normali
 
 
 def error_histogram(run: Run) -> Figure | None:
-    """Returns a histogram of the absolute height error, with the percentiles of metrics.json."""
+    """Returns a histogram of the absolute height error, with lines at the percentiles given in metrics.json."""
     if "dem_error" not in run.rasters:
         return None
     size = np.abs(run.rasters["dem_error"].values)
@@ -282,7 +285,7 @@ def network_plot(run: Run) -> Figure | None:
 
 
 def timing_bars(run: Run) -> Figure | None:
-    """Returns bars of the mean time per call of each processing stage, with its budget."""
+    """Returns bars of the mean time per call of each processing stage, with a line at the budget of the stage."""
     rows = [
         row
         for row in stage_times(run.metrics or {}, run.scenario, run.keyframes.n_frames_per_keyframe)

@@ -21,7 +21,7 @@ READING_COLUMNS = ("pressure_z_m", "roll_rad", "pitch_rad", "yaw_rad", "forward_
 #: Columns of frames/imu.csv.
 IMU_COLUMNS = ("time_s", "rate_x_radps", "rate_y_radps", "rate_z_radps", "specific_force_x_mps2",
                "specific_force_y_mps2", "specific_force_z_mps2")  # fmt: skip
-#: Columns between index, time_s, stereo and the readings: `Frame.exposure`, empty if the cameras do not report it.
+#: Columns of `Frame.exposure` in frames/frames.csv, after index, time_s and stereo; empty if the cameras report none.
 EXPOSURE_COLUMNS = ("exposure_r", "exposure_g", "exposure_b")
 _MOST_WAITING = 8  # frames whose images wait to be written; a survey waits for the disk beyond this number
 #: PNG in half the time of the default filters and strategy; the files are 6 % larger.
@@ -68,7 +68,7 @@ class FrameRecorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Waits for the images, and writes truth.npz."""
+        """Waits until all images are written, and writes truth.npz."""
         self._writer.shutdown()
         if self._lines is not None:
             self._lines.close()

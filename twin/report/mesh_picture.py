@@ -104,9 +104,9 @@ def shaded_colours(colours: Image, normals: Array) -> Image:
 
 
 def camera_pose(vertices: Array) -> Array:
-    """Returns the pose (4, 4) of an OpenGL camera (viewing along -z) that has all vertices in view.
+    """Returns the pose (4, 4) of an OpenGL camera (viewing along -z) that has all vertices except outliers in view.
 
-    The viewing direction is fixed (`DEPRESSION_DEG`, `EAST_DEG`), and outliers are ignored (`FRAMED_PERCENT`). Let the
+    The viewing direction is fixed (`DEPRESSION_DEG`, `EAST_DEG`), and outliers are clipped (`FRAMED_PERCENT`). Let the
     camera be at distance d from the centre of the vertices, and q a vertex relative to this centre in camera axes. The
     vertex is in view if |q_x| <= t (d - q_z), where t is the tangent of half the horizontal field of view, and if q_y
     satisfies the same condition for the vertical field of view. The distance is the smallest such d times `MARGIN`.

@@ -143,7 +143,8 @@ def log_paths(recording: rr.RecordingStream, run: Run) -> None:
 def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
     """Logs the final elevation map in the colours of the orthomosaic.
 
-    Each part of the map appears at the first snapshot whose keyframes observe it.
+    Each part of the map appears at the first snapshot whose keyframes observe it; parts that no keyframe observes are
+    left out. Without an orthomosaic, the map is coloured by height.
     """
     if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
         return
@@ -204,7 +205,7 @@ def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
 
 
 def log_curves(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the errors of every estimate and the durations of the processing stages."""
+    """Logs the errors of every estimate, if the true path is known, and the durations of the processing stages."""
     if "truth" in run.trajectories:
         for name in ESTIMATES:
             if name in run.trajectories:
@@ -272,7 +273,7 @@ class LiveViewer:
 
 
 def colour(role: str) -> tuple[int, int, int]:
-    """Returns the RGB colour of a role (see `style.COLOURS`), with white for the truth on the dark background."""
+    """Returns the RGB colour of a role (see `style.COLOURS`); near white for the truth, as the background is dark."""
     return (245, 245, 245) if role == "truth" else rgb(role)
 
 

@@ -15,7 +15,7 @@ from twin.core.map_slopes import map_slopes
 from twin.core.records import Array, Image, MapGrid, StereoRig
 from twin.report.run_folder import Raster
 
-#: Largest number of vertices of a surface; finer maps are subsampled.
+#: Approximate largest number of vertices of a surface; maps with more cells are subsampled.
 N_VERTICES = 100_000
 #: Group number of a point that no camera observes.
 NOT_OBSERVED = np.iinfo(np.int64).max
@@ -135,12 +135,14 @@ def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArra
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles whose last vertex is first observed by a given camera group, with their vertices.
+    """Returns the triangles that are completely observed once a given camera group has been added, and their vertices.
+
+    These are the triangles for which the largest group number of a vertex is `number`.
 
     Args:
         surface: the whole surface.
-        group: (n,) group of each vertex, as `first_observed` returns it.
-        number: number of the group.
+        group: (n,) number of the group that first observes each vertex, as `first_observed` returns it.
+        number: number of the given group.
     """
     triangles = surface.triangles[group[surface.triangles].max(axis=1, initial=-1) == number]
     used, renumbered = np.unique(triangles, return_inverse=True)

@@ -14,7 +14,7 @@ def run_alignment(run: Run) -> AlignmentName | None:
 
 
 def run_errors(run: Run, name: str) -> PathErrors:
-    """Returns the errors of an estimate at the frames of a run.
+    """Returns the errors of an estimate at the frames that have a true pose.
 
     The estimate of a replay is aligned with the truth as its metrics state; any other estimate is anchored at the first
     true pose.

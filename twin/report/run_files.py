@@ -32,8 +32,8 @@ def checked_metrics(metrics: Any) -> dict[str, Any]:
     """Returns the contents of metrics.json, validated, with None for each missing number and [] for each missing list.
 
     Raises:
-        ValueError: a value does not have the type that `twin` writes, or `name` or `status` is missing; the message
-            names the key.
+        ValueError: a value does not have the type that `twin` writes, or `name`, `status` or a value in a row of
+            `tracks` is missing; the message names the key.
     """
     template = empty_metrics()
     texts = dict.fromkeys(("name", "status"), "")
@@ -76,16 +76,24 @@ class _OptionalText:
 def conform(given: Any, template: Any, key: str = "", complete: bool = False) -> Any:
     """Checks that a value has the structure of a template, and returns it.
 
+    A template has one of these forms:
+        a table: the value is a table, and the value of each of its keys has the structure given for that key or, if
+            there is none, for the key "*"; without the key "*", other keys are accepted unchecked.
+        a list: the value is a list whose items have the structure of the template's only item; the items are not
+            checked if the template is empty.
+        a string, a Boolean or a finite number: the value is of this type.
+        `_OptionalText`: the value is a string or None.
+        None: the value is a finite number or None.
+        NaN: the value is a number, NaN or None.
+
+    Numbers may be up to `_LARGEST` in magnitude.
+
     Args:
         given: the value.
-        template: a table (the values of its keys are checked; other keys are checked against its key "*"; without
-            that key they are accepted unchecked), a list that holds the template of its items or is empty (items are
-            not checked), or the template of a single value: any string, Boolean or finite number stands for a value of
-            its type, `_OptionalText` for a string or None, None for a finite number or None, and NaN for a number, NaN
-            or None.
+        template: the template.
         key: dotted key of the value, for the message.
-        complete: add the missing keys of tables, with None for numbers, Booleans and optional strings, and [] for
-            lists; another missing string is an error.
+        complete: whether to add missing keys to tables (not to those in lists), with None for numbers, Booleans and
+            optional strings, and [] for lists; another missing string is an error.
 
     Raises:
         ValueError: the value does not have this structure, or an item of a list lacks a key; the message names the key.

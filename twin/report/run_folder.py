@@ -135,7 +135,8 @@ def read_raster(file: Path) -> Raster:
     scene.
 
     Raises:
-        ValueError: the raster is rotated or its cells are not square.
+        ValueError: the raster is rotated, its cells are not square, or its tags are damaged.
+        RasterioError: the file is not a readable raster.
     """
     with rasterio.open(file) as source:
         grid, elevation_m = geotiff.scene_placement(source)
@@ -146,7 +147,13 @@ def read_raster(file: Path) -> Raster:
 
 
 def read_mosaic(file: Path) -> Raster:
-    """Reads the orthomosaic as `read_raster` does, reduced to at most `MAX_MOSAIC_PX` pixels by averaging."""
+    """Reads the RGB values of the orthomosaic, reduced to at most `MAX_MOSAIC_PX` pixels by averaging.
+
+    Rows and columns at the south and east edges that do not fill a reduced pixel are left out.
+
+    Raises:
+        ValueError, RasterioError: see `read_raster`.
+    """
     with rasterio.open(file) as source:
         grid, _ = geotiff.scene_placement(source)
         step = int(np.ceil(np.sqrt(source.width * source.height / MAX_MOSAIC_PX)))
@@ -158,7 +165,12 @@ def read_mosaic(file: Path) -> Raster:
 
 
 def read_network(file: Path) -> Network:
-    """Reads the node positions and the edges of a g2o pose graph (SE3:QUAT)."""
+    """Reads the node positions and the edges of a g2o pose graph (SE3:QUAT).
+
+    Raises:
+        KeyError: an edge names a node that the file does not contain.
+        ValueError: a number or an edge is damaged.
+    """
     lines = [line.split() for line in file.read_text(encoding="utf-8").splitlines()]
     nodes = [line for line in lines if line and line[0] == "VERTEX_SE3:QUAT"]
     pairs = [line[1:3] for line in lines if line and line[0] == "EDGE_SE3:QUAT"]
@@ -173,7 +185,10 @@ def _empty_network() -> Network:
 
 
 def _read_keyframes(file: Path) -> Keyframes:
-    """Reads keyframes/index.json; if the file is missing, the arrays are empty."""
+    """Reads keyframes/index.json.
+
+    If the file is missing, the arrays are empty, except `map_from_world`, which is the identity.
+    """
     index = _read_json(file, checked_index) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}

@@ -77,7 +77,8 @@ class SurveyRecord:
         georeference: position of the scene in the CRS of the DEM; None: rasters are in scene coordinates.
         has_orthomosaic: whether mosaic.tif has been written as an orthomosaic (`RunFolder.orthomosaic_file`); otherwise
             it is written with the cells of the map.
-        recorded_truth: recorded poses at all frames, in the world of the estimates; None if there are none.
+        recorded_truth: recorded true poses of all frames, in the world of the estimates; None unless every frame has
+            one.
         recorded_heights_m: (rows, cols) true heights at the cells of the map, along its axis of height; None if they
             are not known.
     """
@@ -101,7 +102,7 @@ class RunFolder:
         folder: path of the run folder, which is created if it does not exist.
         scenario: the resolved scenario of the run, or the description of a run without a scenario.
         outputs: members of `OPTIONAL_OUTPUTS` to write at the end; writing them may take longer than a short survey.
-            None: write only the metrics, without trajectories and maps.
+            None: the metrics are the only results that are written, without trajectories and maps.
 
     Raises:
         TwinError: the folder cannot be written.
@@ -289,7 +290,7 @@ class RunFolder:
 
 @cache
 def environment() -> dict[str, str]:
-    """Returns the versions of Python and the main packages, and the machine, for env.json."""
+    """Returns the contents of env.json: versions of this program, Python and the main packages, and the machine."""
     names = ("mujoco", "numpy", "scipy", "opencv-python-headless", "numba", "rerun-sdk")
     return {
         "twin": version("seabed-twin"),

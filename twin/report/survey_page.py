@@ -76,7 +76,10 @@ def context(run: Run) -> dict[str, Any]:
 
 
 def _closed_form_comparison(metrics: Mapping[str, Any]) -> str:
-    """Returns the comparison of the links with the closed form; "" without metrics or for a replay (no link errors)."""
+    """Returns the comparison of the links with the closed form as text.
+
+    Returns "" without metrics, and for a replay, which has no link errors.
+    """
     return "" if "links" not in metrics or metrics.get("replay") else wording.closed_form_comparison(metrics["links"])
 
 
@@ -105,7 +108,10 @@ def sample_images(run: Run) -> list[tuple[int, str, str | None]]:
 
 
 def _stereo_pair(run: Run, frame: int) -> tuple[str, str | None]:
-    """Returns the left and the right image of a keyframe as JPEG data URIs; "" or None, respectively, if missing."""
+    """Returns the left and the right image of a keyframe as JPEG data URIs.
+
+    A missing left image is "", and a missing right image is None.
+    """
     left, right = (read_rgb(run.image_file(frame, side)) for side in ("left", "right"))
     return (jpeg_uri(left) if left is not None else ""), (jpeg_uri(right) if right is not None else None)
 

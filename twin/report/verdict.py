@@ -24,8 +24,8 @@ class Badge(NamedTuple):
 def badge(metrics: Mapping[str, Any] | None) -> Badge:
     """Returns the verdict on a survey.
 
-    It is red if the survey is unfinished, is not complete or missed a requirement, amber if the survey only has
-    warnings, else green.
+    The badge is red if the survey is unfinished, is not complete or missed a requirement; otherwise it is amber if the
+    survey has warnings, and green if it has none.
 
     Args:
         metrics: contents of metrics.json; None for an unfinished survey.

@@ -116,7 +116,7 @@ def ratio(value: float | None) -> str:
 
 
 def improvement(gain: float | None) -> str:
-    """Returns the change of an error as text, e.g. "2.0 × smaller"; "" for a change up to 5 % or an unknown one.
+    """Returns the change of an error as text, e.g. "2.0 × smaller"; "" for gains of 0.95 to 1.05 and for None.
 
     Args:
         gain: error before divided by error after; None if unknown.
@@ -183,7 +183,10 @@ def replay_summary(metrics: Mapping[str, Any]) -> str:
 
 
 def conditions(scenario: Mapping[str, Any]) -> str:
-    """Returns as text the altitude of a survey and its water: Jerlov type with the source of its table, turbidity."""
+    """Returns the conditions of a survey as text: altitude, Jerlov type with the source of its table, and turbidity.
+
+    If the scenario defines the optical properties itself, the text states this instead of a Jerlov type.
+    """
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
     custom = water.get("absorption_per_m") or water.get("spectrum_file")

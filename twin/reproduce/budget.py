@@ -34,7 +34,7 @@ class Module(NamedTuple):
     Args:
         label: name of the module.
         stage: key of its stage in the stopwatch; "" if it is part of the stage of another module.
-        unit: name of the item that one call processes, as "frame" or "pair".
+        unit: name of the item that one call processes, such as "frame" or "pair".
         paper: time of the module in the paper's words.
         budget_ms: time available for one frame or keyframe at the paper's 30 Hz; None if the module has no limit.
         per: "frame", "keyframe", "track" or "survey": unit to which the budget refers.
@@ -106,14 +106,14 @@ def per_unit_ms(stages: Mapping[str, Any], stage: str, count: int) -> float | No
 
 
 def keyframe_load_ms(stages: Mapping[str, Any], n_frames: int, n_keyframes: int) -> float | None:
-    """Returns the processing time of one keyframe and of F2F for `N_FRAMES` frames [ms]; None if F2F never ran."""
+    """Returns the time for the work on one keyframe plus F2F of `N_FRAMES` frames [ms]; None if F2F never ran."""
     f2f = per_unit_ms(stages, "f2f", n_frames)
     work = [per_unit_ms(stages, stage, n_keyframes) for stage in KEYFRAME_STAGES]
     return None if f2f is None else N_FRAMES * f2f + sum(value or 0.0 for value in work)
 
 
 def budget_table(stages: Mapping[str, Any], n_frames: int, n_keyframes: int) -> Table:
-    """Returns a table with the time of each module and of all together, the paper's figures and the budget at 30 Hz.
+    """Returns a table with the time of each module and of all together, the paper's times and the budget at 30 Hz.
 
     Args:
         stages: durations of the stages, as `Stopwatch.summary` returns them.

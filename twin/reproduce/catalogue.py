@@ -11,7 +11,7 @@ from twin.errors import TwinError
 from twin.reproduce import index_page
 from twin.reproduce.exhibit import SCHEMA, Exhibit, Figure, exhibit_of, make_table
 
-#: Function that runs an experiment: folder to write, whether to run it quickly -> its results.
+#: Function that runs an experiment: takes its folder, and whether to run the quick version; returns the results.
 Experiment = Callable[[Path, bool], Exhibit]
 RESULTS_FILE, PAGE_FILE = "results.json", "index.html"
 
@@ -118,7 +118,7 @@ def read_all(file: Path) -> tuple[list[Exhibit], bool]:
     """Returns the exhibits in a results.json, and whether they are those of the quick versions.
 
     Raises:
-        TwinError: the file is missing or is not a results.json.
+        TwinError: the file cannot be read or is not a results.json.
     """
     try:
         contents = json.loads(file.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Conclusion of a flight of an experiment: result of the estimators and elevation map, or an error in one line."""
+"""Conclusion of an experiment's flight: result of the estimators and elevation map, or an error that states why not."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from twin.estimate.pipeline import Navigator, finish_in_stage
 
 
 def finished(navigator: Navigator, guard: StageGuard) -> SurveyResult:
-    """Returns the result of the estimators, without the final alignment if it fails; `guard.cause` then has the cause.
+    """Returns the result of the estimators, without the final alignment if it fails; `guard.cause` then states why.
 
     Raises:
         KeyboardInterrupt: the alignment was interrupted; an interrupt ends the whole experiment.
@@ -27,7 +27,7 @@ def required_map(navigator: Navigator, result: SurveyResult, grid: MapGrid, guar
         navigator: the estimators.
         result: result of the estimators.
         grid: grid of the map.
-        guard: holds the reason if the flight ended early, for the message.
+        guard: its `cause` states why the flight ended early, for the error message; "" if it did not.
 
     Raises:
         TwinError: the survey has no keyframe, so that there is no map.

@@ -44,7 +44,7 @@ LIFT_M = 1e-3  # height of the slopes above the floor
 SLOPE_DEG = 45.0  # angle of the slopes that face the sun and face away from it
 SUN_RADIUS_RAD = 0.0047 / SEA_WATER_INDEX  # angular radius of the sun's disc, under water
 SKY_STEPS = 4000  # number of steps of the table of the sky's radiance
-ROUND, MOST_WALKS = 8_000, 1_500_000  # walks (pairs of walks for a pixel) of a round, and the most of each value
+ROUND, MOST_WALKS = 8_000, 1_500_000  # walks (for a pixel: pairs) in a round; most walks for each value
 LIGHT_ERROR, PLANE_ERROR = 0.05, 0.03  # largest relative standard errors accepted: upwelling light, illuminance
 RIG = StereoRig(64, 48, 100.0, 0.1)  # the model's pixel next to the principal point is compared with the ray through it
 
@@ -166,7 +166,7 @@ def _normals() -> tuple[Array, Array, Array]:
 
 
 def plane_lx(daylight: Daylight, normal: Array, depth_m: float) -> float:
-    """Returns the green illuminance [lx] of a floor at a depth with a unit normal (3,), by the model."""
+    """Returns the green illuminance [lx] of a floor with a unit normal (3,), at a depth [m], by the model."""
     floor = floor_daylight(daylight._replace(reference_depth_m=depth_m))
     four = np.append(normal, 1.0)
     beam = floor.beam_lx[GREEN] * np.exp(-floor.beam_per_m[GREEN] * depth_m)

@@ -94,7 +94,7 @@ def exhibit_of(contents: Any, file: Path) -> Exhibit:
 
 
 def millimetres(value_m: float | None) -> str:
-    """Returns a length as text in millimetres, with two decimals below 10 mm, one below 100 mm; "-" if unknown."""
+    """Returns a length as text in millimetres, with 2 decimals below 10 mm, 1 below 100 mm, else 0; "-" if unknown."""
     if value_m is None or value_m != value_m:
         return DASH
     value = 1e3 * value_m
@@ -102,5 +102,5 @@ def millimetres(value_m: float | None) -> str:
 
 
 def percent(share: float | None, digits: int = 0) -> str:
-    """Returns a share (0 to 1) as text in percent; "-" if it is unknown."""
+    """Returns a share (0 to 1) as text in percent, with `digits` decimals; "-" if it is unknown."""
     return DASH if share is None or share != share else f"{100 * share:.{digits}f} %"

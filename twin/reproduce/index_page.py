@@ -9,5 +9,5 @@ from twin.reproduce.exhibit import Exhibit
 
 
 def render(exhibits: Sequence[Exhibit], quick: bool) -> str:
-    """Returns the page as HTML; its figures are files in a subfolder of the page's folder for each experiment."""
+    """Returns the page as HTML; it shows the figures from one subfolder per experiment, next to the page."""
     return render_page("twin.reproduce", "index_page.html.j2", {"exhibits": exhibits, "quick": quick})

@@ -53,7 +53,7 @@ LAMP_ARRANGEMENTS: dict[str, tuple[str, ...]] = {
     ),
 }
 NEAR_PX, FAR_PX = 2.0, 40.0
-ROUND, MOST_WALKS = 8_000, 1_500_000  # pairs of walks of a round, and the most of a cell
+ROUND, MOST_WALKS = 8_000, 1_500_000  # pairs of walks in a round; most pairs of walks for a cell
 #: Standard errors at which the reference of a cell is accurate enough: of all light and of the veil (relative), of the
 #: sharp share (absolute), of the blur shares (relative).
 LIGHT_ERROR, SHARP_ERROR, BLUR_ERROR = 0.019, 0.01, 0.1
@@ -113,7 +113,7 @@ def _is_accurate(light: PixelLight) -> bool:
 
 
 def _blur_shares(light: PixelLight) -> tuple[BatchMean, BatchMean]:
-    """Returns the shares of the blurred light displaced by up to `NEAR_PX`, and by more than `FAR_PX`."""
+    """Returns the shares of the blurred light that is displaced by less than `NEAR_PX`, and by at least `FAR_PX`."""
     return light.blurred_share(0.0, NEAR_PX), light.blurred_share(FAR_PX)
 
 

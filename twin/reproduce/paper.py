@@ -30,8 +30,8 @@ MEAN_RANGE_M = 8 * FOOT_M  # the paper relates its errors of elevation to this r
 #: Overrides of the scenarios of the coarse texture and of the full resolution.
 COARSE: tuple[str, ...] = ()
 FINE = ("navigation.aiding=[]",)
-#: The quick plan: 25 tracks as far apart as the paper's, with legs of half a metre, five frames per second and the
-#: paper's motion without rotation.
+#: The quick plan: 25 tracks as far apart as the paper's, with legs of half a metre, at five frames per second and
+#: without rotation, as in the paper.
 QUICK = (
     "plan.area_m=[0.5, 30.48]", "terrain.size_m=[6.0, 36.0]", "rig.frame_rate_hz=5", "control.hold_s=0.4",
     "plan.overlap_along=0.8", "vehicle.dynamics=kinematic",
@@ -52,7 +52,7 @@ class Claim(NamedTuple):
     Args:
         label: name of the quantity.
         paper: the paper's values, as text.
-        limit_m: the least of the paper's values [m]; a result below it is better than the paper's.
+        limit_m: the smallest of the paper's values [m]; a result below it is better than the paper's.
         value_m: function that returns the value of a flight [m]; NaN if it is unknown.
     """
 

@@ -20,7 +20,7 @@ from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, height_error
 Array = NDArray[np.floating]
 
 BAD_M = 0.02  # a cell is bad if its height error is larger
-WORST_SHARE = 0.2  # a bad cell is predicted if it is among this share of the cells, those with the largest sigma
+WORST_SHARE = 0.2  # a bad cell counts as predicted if it is among this share of the cells, with the largest sigma
 TITLES = {"tank1": "Tank test 1: 130 pairs on parallel legs", "tank2": "Tank test 2: two loops that touch at the start"}
 #: Keys of the tables of each experiment.
 TABLES = {"tank1": ("rows", "sizes", "map"), "tank2": ("rows", "closure", "sizes", "map")}

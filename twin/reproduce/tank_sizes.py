@@ -73,7 +73,7 @@ def true_size(item: TankObject) -> Size:
 
 
 def window_around(item: TankObject, height_m: Array, grid: MapGrid) -> Window:
-    """Returns the part of a map around an object; heights are relative to the median height of the outer border."""
+    """Returns the part of a map around an object; heights are above their median in the outer half of the margin."""
     x, y = (axis - c for axis, c in zip(grid.centres(), item.centre_m, strict=True))
     inside = [np.abs(axis) <= side / 2 + MARGIN_M for axis, side in zip((x, y), item.size_m, strict=False)]
     part = height_m[np.ix_(inside[1], inside[0])].astype(np.float64)
@@ -84,7 +84,7 @@ def window_around(item: TankObject, height_m: Array, grid: MapGrid) -> Window:
 
 
 def _plateau(window: Window) -> float:
-    """Returns the median height of the cells on top of an object with a flat top [m]."""
+    """Returns the median height of the cells on top of an object with a flat top [m]; NaN without heights."""
     known = window.height_m[np.isfinite(window.height_m)]
     if known.size == 0:
         return np.nan
@@ -92,7 +92,7 @@ def _plateau(window: Window) -> float:
 
 
 def _summit(window: Window) -> float:
-    """Returns the height of the summit of a dome [m]: the height of the vertex of a paraboloid fitted to the cap."""
+    """Returns the height of the vertex of a paraboloid fitted to the cap of a dome [m]; NaN for fewer than 12 cells."""
     x, y = np.meshgrid(window.x_m, window.y_m)
     known = np.isfinite(window.height_m)
     reach = 0.3 * max(np.abs(window.x_m).max() - MARGIN_M, 0.0)

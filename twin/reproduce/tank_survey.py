@@ -74,8 +74,8 @@ class Closure(NamedTuple):
 def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: int = N_PAIRS) -> TankSurvey:
     """Returns the survey of a tank experiment.
 
-    The estimators start at the planned pose of the first frame; the true pose differs from it by the bend
-    and the jitter of the track.
+    The estimators start at the planned pose of the first frame; the true pose differs from it by the bend and the
+    jitter of the track.
 
     Args:
         name: "tank1", parallel legs, or "tank2", two loops that touch at the start.

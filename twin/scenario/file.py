@@ -44,7 +44,8 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
 
     Args:
         path: path of a scenario file, or name of a scenario in scenes/.
-        overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is a string.
+        overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is taken as a
+            string.
 
     Raises:
         ScenarioError: there is no such scenario, or a file or an override is invalid; lists the errors of files as
@@ -121,7 +122,7 @@ def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Mo
         source: origin of the keys, for error messages.
 
     Raises:
-        ScenarioError: lists up to `_MAX_ERRORS` errors and the number of the others.
+        ScenarioError: a key or a value is invalid; lists up to `_MAX_ERRORS` errors and the number of the others.
     """
     try:
         return model.model_validate(tree)
@@ -160,7 +161,7 @@ def _built_in_scenes() -> dict[str, Path]:
 
 
 def dump_toml(scenario: Scenario) -> str:
-    """Returns the scenario as the text of a TOML file, which `load_scenario` reads as an equal scenario."""
+    """Returns the scenario as the text of a TOML file, from which `load_scenario` reads the same values."""
     tree = scenario.model_dump(mode="json", exclude_none=True)
     require = tree.pop("require")
     tables = {key: tree.pop(key) for key in ("lamps", "beacons", "objects")}
@@ -258,7 +259,10 @@ def _is_path_key(key: str) -> bool:
 
 
 def _expand(value: str, folder: Path) -> Path:
-    """Returns the absolute path; ${TWIN_DATA} is expanded, and a relative path without it refers to `folder`."""
+    """Returns the absolute path of a file: a relative path refers to `folder`, and ${TWIN_DATA} is expanded.
+
+    If the expanded ${TWIN_DATA} is relative, as its default ../shared/data, the path refers to the current folder.
+    """
     data = os.environ.get("TWIN_DATA", "../shared/data")
     if "${TWIN_DATA}" in value:
         return resolved(Path(value.replace("${TWIN_DATA}", data)))
@@ -298,7 +302,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
 
 
 def _override_value(key: str, text: str) -> Any:
-    """Returns the TOML value in the text of an override; the text itself if it is not TOML.
+    """Returns the TOML value in the text of an override; the text itself if it is not a single TOML value.
 
     Raises:
         ScenarioError: the text or the value exceeds the limits of `toml_text`.
@@ -326,7 +330,8 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
         origin: text that names the source of the value, at the beginning of error messages.
 
     Raises:
-        ScenarioError: the key leads into a value that is not a section, to no item of a list, or to a whole item.
+        ScenarioError: a part of the key other than the last one is a value instead of a section, or the key leads to a
+            list without naming an existing item of it and a key of this item.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -345,7 +350,7 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
 
 
 def _child(node: Any, part: str, origin: str) -> Any:
-    """Returns the section or list item `part` of a node; a missing section is created.
+    """Returns the value of the key or list item `part` of a node; a missing key gets an empty section as its value.
 
     Raises:
         ScenarioError: the list has no such item; the message begins with `origin`.
@@ -401,7 +406,7 @@ _ALLOWED = {
 def shown(text: str, longest: int = 200) -> str:
     """Returns the text for an error message.
 
-    Of a text with more than `longest` characters, the first half of `longest` is shown with the length of the text.
+    A text of more than `longest` characters is cut off after half of this number, and its length is stated.
     """
     return text if len(text) <= longest else f"{text[: longest // 2]}... ({len(text)} characters)"
 

@@ -1,4 +1,4 @@
-"""Idealisations of a scenario: effects of a real survey that it leaves out, which makes simulated errors too small."""
+"""Idealisations of a scenario: effects of a real survey that it leaves out, so that simulated errors are too small."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ from twin.scenario.model import CalibrationErrorConfig, Scenario
 
 
 def idealisations(scenario: Scenario) -> list[str]:
-    """Returns a sentence for each idealised part: cameras, water, light, vehicle, restored colours, images."""
+    """Returns a sentence for each of cameras, water, light, vehicle and restored colours that is idealised.
+
+    A surrogate survey has one more sentence, which states that no images were rendered.
+    """
     subjects = {
         "The cameras are ideal": _cameras(scenario),
         "The water is ideal": _water(scenario),

@@ -27,7 +27,7 @@ from twin.core.settings import EstimatorSettings
 from twin.errors import TwinError
 from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 
-FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of texels of the default size [m]
+FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of the default size of a texel [m]
 SEA_WATER_INDEX = 1.339  #: refractive index of sea water in visible light
 PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry point
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
@@ -57,7 +57,7 @@ RelativeIntensity = Annotated[Number, Field(ge=0, le=100)]
 
 
 def _path(text: str) -> str:
-    """Returns the text unchanged. Raises PydanticCustomError if it cannot be a path."""
+    """Returns the text unchanged. Raises PydanticCustomError if the file system rejects it (`path_problem`)."""
     if problem := path_problem(Path(text)):
         raise PydanticCustomError("path", "a path; it {problem}", {"problem": problem})
     return text
@@ -67,14 +67,17 @@ FilePath = Annotated[str, AfterValidator(_path)]
 
 
 class Section(BaseModel):
-    """Base class of the sections: immutable; rejects unknown keys, NaN and infinity."""
+    """Base class of the sections, which are immutable and reject unknown keys, NaN and infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     @field_validator("*", mode="before")
     @classmethod
     def _require_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Rejects strings and booleans where a number is required; items of a list are checked by `Number`."""
+        """Returns the value unchanged. Raises PydanticCustomError for text and booleans where a number is required.
+
+        The items of a list are checked by `Number`.
+        """
         kind = cls.model_fields[info.field_name or ""].annotation
         if kind is int and isinstance(value, str | bool):
             raise PydanticCustomError("int_type", "an integer")
@@ -310,7 +313,7 @@ class SensorConfig(Section):
 
 
 class LensConfig(Section):
-    """True distortion and blur of both lenses (Brown-Conrady, as in OpenCV).
+    """True distortion (Brown-Conrady, as in OpenCV), blur and lateral colour of both lenses.
 
     Images are rectified with calibrated coefficients, which differ from the true ones by `calibration_error.k1_error`
     and `k2_error`. The image coordinates of the model are normalised coordinates in the air behind the port, or in
@@ -341,8 +344,8 @@ class PortConfig(Section):
     """Window in front of each lens; every ray is refracted at both faces of the window.
 
     `rig.hfov_deg` is the field of view of the equivalent pinhole camera in water. For a port that is neither tilted nor
-    laterally offset, the image of this pinhole camera equals the image through the port near its centre, at any
-    distance. The position of a camera is the projection centre of its equivalent pinhole camera.
+    laterally offset, the image of this pinhole camera equals the image through the port near the image centre, at any
+    distance of the floor. The position of a camera is the projection centre of its equivalent pinhole camera.
     """
 
     kind: Literal["none", "flat", "dome"] = Field(
@@ -373,7 +376,10 @@ class PortConfig(Section):
 
 
 class CalibrationErrorConfig(Section):
-    """Calibration error: true camera parameters minus those that the estimators use."""
+    """Calibration error: true camera parameters minus those that the estimators use.
+
+    The errors of focal length and baseline are relative to the values that the estimators use.
+    """
 
     focal_error: float = Field(
         default=0.0, ge=-0.2, le=0.2, description="relative error of the focal length of both cameras"
@@ -449,7 +455,7 @@ class WaterConfig(Section):
 
     @property
     def _type_label(self) -> str:
-        """Name of the Jerlov type with its source, or "clear"."""
+        """Name of the Jerlov type with its source, or `jerlov` alone if the water is of no Jerlov type."""
         return f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
 
     @property
@@ -460,7 +466,7 @@ class WaterConfig(Section):
     @field_validator("jerlov")
     @classmethod
     def _require_type_of_source(cls, jerlov: str, info: ValidationInfo) -> str:
-        """Rejects a Jerlov type that the table `source` does not contain."""
+        """Returns the type unchanged. Raises PydanticCustomError if the table `source` does not contain it."""
         source = info.data.get("source")
         if source is None or jerlov in (allowed := ("clear", *WATER_SOURCES[source].types)):
             return jerlov
@@ -560,7 +566,7 @@ class CurrentConfig(Section):
 
 
 class NavigationConfig(Section):
-    """Navigation sensors and their noise; the estimators receive the readings of the sensors in `aiding` only."""
+    """Navigation sensors and their noise; the estimators receive only the readings of the sensors in `aiding`."""
 
     aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty: vision only")
     pressure_sigma_m: float = Field(
@@ -697,7 +703,10 @@ class PlanConfig(Section):
     @field_validator("polygon", mode="before")
     @classmethod
     def _require_corners(cls, value: Any) -> Any:
-        """Raises one error for a value that is neither a file nor a list of corners; pydantic would raise several."""
+        """Returns the value unchanged. Raises PydanticCustomError unless it is None, a string or a list of corners.
+
+        A corner is a pair of finite numbers. Pydantic alone would raise several errors for one wrong value.
+        """
         if isinstance(value, list | tuple):
             corners = all(isinstance(corner, list | tuple) and len(corner) == 2 for corner in value)
             numbers = corners and all(type(c) in (int, float) and math.isfinite(c) for pair in value for c in pair)
@@ -709,7 +718,7 @@ class PlanConfig(Section):
 
 
 class ObjectConfig(Section):
-    """Object on the sea floor, or many of one kind: one at `position_m`, or `per_m2` of them scattered at random."""
+    """Object at `position_m` on the sea floor, or many of one kind, scattered at random with the density `per_m2`."""
 
     shape: Literal[
         "mesh", "boulder", "brain_coral", "branching_coral", "table_coral", "sponge", "sea_star", "pipe", "crate",
@@ -869,9 +878,10 @@ class Source(BaseModel):
     def describe(self, error: TwinError) -> str:
         """Returns the error as `FILE:LINE: key: problem (allowed: ...)` or, for an override, as `--set: ...`.
 
-        FILE and LINE locate the key or, if no file contains the key, the innermost section around it; they are `path`
-        and 1 if no file contains that either. The second form applies if an override sets the key, a section around it
-        or, where `path` does not contain the key, a key in it.
+        FILE and LINE locate the key or, if no file contains the key, the innermost section around it that a file
+        contains; without such a section, FILE is `path` and LINE is 1. The second form applies if an override sets the
+        key or a section around it. It also applies if the error refers to a section that `path` does not contain, and
+        an override sets a key of this section.
         """
         overridden = [override.split("=", 1)[0].strip().replace('"', "") for override in self.overrides]
         in_overridden_section = error.field not in self.lines and any(
@@ -932,12 +942,15 @@ class Scenario(Section):
 
     @property
     def source(self) -> Source:
-        """Files, line numbers and overrides that the scenario was read from, for error messages."""
+        """Files and overrides from which the scenario was read, with line numbers, for error messages."""
         return self._source
 
     @property
     def delivers_linear_images(self) -> bool:
-        """Whether images are proportional to the radiance: linear tone curve, white balance for white light."""
+        """Whether images are proportional to the radiance.
+
+        They are without [sensor], or with a linear tone curve and the white balance "white_light".
+        """
         sensor = self.sensor
         return sensor is None or (sensor.tone_curve == "linear" and sensor.white_balance == "white_light")
 
@@ -991,7 +1004,8 @@ class Scenario(Section):
     def fingerprint(self) -> str:
         """Returns a hash of all values, 16 hexadecimal digits; of files, only the paths are hashed.
 
-        `record` is left out, and `imu` if there is none: the section is younger than results that have the hash.
+        `record` is left out, and `imu` if there is none, so that results from before that section was introduced keep
+        their hash.
         """
         left_out = {"record"} if self.imu else {"record", "imu"}
         return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()[:16]

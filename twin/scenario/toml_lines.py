@@ -92,7 +92,7 @@ def _parsed_key_lines(text: str) -> dict[str, int]:
 
 
 def _blocks(header: str, path: str, body: _Body, n_header_lines: int) -> Iterator[_Block]:
-    """Yields the block of the top level, or of a table with a header of its own, then those of the tables in it.
+    """Yields the block of the top level or of a table, if it has a header of its own, then those of the tables in it.
 
     Args:
         header: header of the table; empty for the top level and for a table without a header of its own.
@@ -129,7 +129,7 @@ def _with_parent(name: str, blocks: Iterator[_Block]) -> Iterator[_Block]:
 
 
 def _locate(keys: list[tuple[str, int]], path: str, key: Key | None, item: Item, row: int) -> int:
-    """Adds a key and the keys in its value, with their rows, to `keys`; returns the row after the item."""
+    """Adds a key and the keys in its value, with their rows, to `keys`; returns the row where the next item begins."""
     if key is None:  # whitespace or a comment
         return row + item.as_string().count("\n")
     name = _join(path, key)

@@ -11,7 +11,7 @@ from twin.errors import TwinError
 
 #: Limits of a TOML text: characters, levels of tables and arrays, and characters of a key.
 MAX_CHARACTERS, MAX_LEVELS, MAX_KEY_CHARACTERS = 1_000_000, 32, 200
-#: Largest magnitude of an integer (TOML 1.0: 64 bits, signed).
+#: Smallest and largest integer (TOML 1.0: 64 bits, signed).
 MIN_INTEGER, MAX_INTEGER = -(2**63), 2**63 - 1
 
 #: A dotted key with more than 100 parts; the time that `tomllib` takes grows with the square of their number.
@@ -45,7 +45,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def value_errors(tree: dict[str, Any]) -> Iterator[TwinError]:
-    """Yields an error for each value that is nested too deeply, each integer beyond 64 bits and each key too long."""
+    """Yields an error for each value that is nested too deeply, each integer beyond 64 bits and each overlong key."""
     pending: list[tuple[str, int, Any]] = [("", 0, tree)]
     while pending:
         key, level, value = pending.pop()

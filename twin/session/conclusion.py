@@ -128,7 +128,7 @@ def plugin_notes(scenario: Scenario) -> list[str]:
 
 
 def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | None:
-    """Returns the result of a function; None if a file cannot be read or written; the guard records the cause."""
+    """Returns the result of a function; if a file cannot be read or written, returns None and records the cause."""
     try:
         return function()
     except OSError as error:

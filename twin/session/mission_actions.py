@@ -1,6 +1,7 @@
 """Actions of a mission in poor visibility.
 
-The vehicle slows down if many frames have no measured motion, and stops if no motion has been measured for `BLIND_S`.
+The vehicle slows down if many frames have no measured motion, and stops if no motion has been measured for more than
+`BLIND_S` seconds.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ _STOPPED = 0.1  # below this rate, keyframes are added, because the plan has non
 class MissionActions:
     """Chooses the pace along the path from the status of the estimates, frame by frame.
 
-    The vehicle stops (`hold`) if no motion was measured for `BLIND_S`. From then on, the speed that the estimators
-    predict decays with the time constant by which the vehicle brakes (`BRAKING_S`), so prediction and reference agree.
+    The vehicle stops (`hold`) if no motion was measured for more than `BLIND_S` seconds. From then on, the speed that
+    the estimators predict decays with the time constant with which the vehicle brakes (`BRAKING_S`), so prediction and
+    reference agree.
     The vehicle slows down if many frames of the last second were lost; this is decided at measured frames only, because
     a predicted motion has the speed of the last measured one.
 

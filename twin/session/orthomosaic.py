@@ -62,8 +62,8 @@ def make_orthomosaic(
         elevation: elevation map.
         truth: source of the true albedo and of the asked area.
         folder: run folder.
-        tools: timer of the stage "orthomosaic", which excludes the comparison; function called with the completed
-            fraction.
+        tools: timer of the stages, which excludes the comparison from the stage "orthomosaic"; and function called
+            with the completed fraction.
 
     Returns:
         The elevation map with the orthomosaic averaged to its cells, and the errors of the orthomosaic; None without

@@ -108,7 +108,7 @@ class SteppedWorld:
         return self.flight.step(values, pace, keyframe)
 
     def capture(self) -> StereoPair:
-        """Returns a stereo pair at the current pose, in addition to the frames; later frames do not change.
+        """Returns a stereo pair at the current pose, in addition to the frames; has no effect on later frames.
 
         Raises:
             TwinError: the scenario has imaging.fidelity = "surrogate", which has no images.
@@ -120,7 +120,7 @@ class SteppedWorld:
         return self.world.truth()
 
     def estimator(self, folder: Path | None = None) -> Navigator:
-        """Returns the estimators of the scenario, which get the believed calibration and no truth; `close` ends them.
+        """Returns the estimators of the scenario, which get the believed calibration and no truth; `close` closes them.
 
         Args:
             folder: folder for images of keyframes; None: a temporary folder that `close` removes.

@@ -45,12 +45,15 @@ def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
 
 
 def off_course_limit_m(mission: Mission) -> float:
-    """Returns the distance from the planned path beyond which a survey is degraded [m]."""
+    """Returns the distance from the planned path beyond which a survey is degraded [m].
+
+    It is `control.off_course_m` or, if that is not set, `MAX_OFF_COURSE` times the shorter side of the footprint.
+    """
     return mission.scenario.control.off_course_m or MAX_OFF_COURSE * min(mission.plan.footprint_m)
 
 
 def _off_course(mission: Mission, result: SurveyResult, reference_m: Array) -> list[Finding]:
-    """Returns a finding if the online trajectory was too far from the planned path for too long."""
+    """Returns one finding if the online trajectory was too far from the planned path for a whole second; else none."""
     n = min(len(result.online), len(reference_m))
     limit_m = off_course_limit_m(mission)
     distance_m = np.linalg.norm(result.online.positions[:n] - reference_m[:n], axis=1)
@@ -65,7 +68,7 @@ def _off_course(mission: Mission, result: SurveyResult, reference_m: Array) -> l
 
 
 def _area(mission: Mission, elevation: ElevationMap | None) -> list[Finding]:
-    """Returns a finding if the map covers too small a fraction of the asked area.
+    """Returns one finding if the map covers less than `MIN_AREA_MAPPED` of the asked area; else none.
 
     An area that is smaller than a cell may contain no cell centre; it is not checked.
     """

@@ -26,6 +26,8 @@ _FLOWN = ("complete", "degraded")  # statuses of a survey that was flown to its 
 class MetricAgreement(NamedTuple):
     """Comparison of one metric over the pairs in which both surveys were flown to their end.
 
+    If `pairs` is 0, all other numbers are NaN.
+
     Args:
         metric: dotted name of the metric.
         pairs: number of pairs with a value in both surveys; a missing value of a metric that is infinite if the map has
@@ -80,7 +82,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(analysis: StudyAnalysis) -> Agreement | None:
-    """Returns the agreement of a study's pairs; None if it compares no metrics or no pair has two results."""
+    """Returns the agreement of a study's pairs; None if the study compares no metrics or no pair has two results."""
     if not analysis.study.compare:
         return None
     rendered, surrogate = pairs(analysis)

@@ -29,7 +29,7 @@ LIMITS = (
 
 
 def table(result: Agreement) -> list[tuple[str, ...]]:
-    """Returns the rows of the table with the columns `HEADER`, one per metric."""
+    """Returns the rows of the table, one row per metric, with the columns `HEADER`."""
     return [_row(metric) for metric in result.metrics]
 
 
@@ -117,7 +117,10 @@ def _verdict(agrees: bool) -> str:
 
 
 def _draw_pairs(axes: Axes, metric: str, rendered: Array, surrogate: Array) -> None:
-    """Plots surrogate against rendered values (n,), with the line of equal values and the limits on the medians."""
+    """Plots surrogate against rendered values (n,), with the line of equal values and the limits on the medians.
+
+    Infinite values are drawn at the edge. Without finite values, the axes stay empty.
+    """
     finite = np.concatenate([rendered[np.isfinite(rendered)], surrogate[np.isfinite(surrogate)]])
     if len(finite) == 0:
         return

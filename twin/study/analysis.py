@@ -38,10 +38,10 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key: rank correlation (NaN unless the key is a number), explained rank variance.
+    """Dependence of a metric on a key.
 
-    `explained` is the fraction of the variance of the metric's ranks that the key explains
-    (`statistics.explained_variance`).
+    `correlation` is their rank correlation, NaN if the values of the key are not numbers. `explained` is the fraction
+    of the variance of the metric's ranks that the key explains (`statistics.explained_variance`).
     """
 
     key: str
@@ -84,12 +84,12 @@ class StudyAnalysis:
     """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
 
     Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Surveys
-    of the same scenario with the same seed are identical and count once.
+    of the same scenario with the same seed are identical and count once, except in `warning_counts` and `sobol`.
 
     Args:
         rows: results table.
         study: the study.
-        planned: number of surveys of the study; None: all are in the table.
+        planned: number of surveys of the study; None: all of them are in the table.
     """
 
     def __init__(self, rows: pa.Table, study: Study, planned: int | None = None):
@@ -122,13 +122,16 @@ class StudyAnalysis:
         return duplicate
 
     def numbers(self, name: str) -> Array:
-        """Returns a numeric column of the table (n,), with NaN where a survey has no value."""
+        """Returns a numeric column of the table (n,), with NaN where a survey has no value or if there is no column."""
         if name not in self.rows.column_names:
             return np.full(self.rows.num_rows, np.nan)
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
 
     def _has_values(self, metric: str) -> bool:
-        """Returns whether the metric is in the table, and is required or has a value (surrogates have no contrast)."""
+        """Returns whether the metric is in the table, and is required or has a finite value in some survey.
+
+        Surveys by the surrogate, for example, have no contrast.
+        """
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
@@ -187,7 +190,15 @@ class StudyAnalysis:
         return None
 
     def key_groups(self, key: str, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[str]]:
-        """Groups the chosen surveys by the value of a key; returns their group indices and the names of the groups."""
+        """Groups surveys by the value of a key; see `statistics.group_indices` for numbers.
+
+        Args:
+            key: the varied key.
+            chosen: (n,) mask of the surveys to group.
+
+        Returns:
+            The group index of each chosen survey, and the name of each group: its value or its range of values.
+        """
         values = self.key_numbers(key)
         if values is None:
             names, index = np.unique(self._texts(f"vary.{key}")[chosen].astype(str), return_inverse=True)
@@ -214,7 +225,7 @@ class StudyAnalysis:
 
     @cached_property
     def sensitivities(self) -> list[Sensitivity]:
-        """Returns the sensitivity of each metric to each key, sorted by metric, then strongest first."""
+        """Returns the sensitivity of each metric to each key, metric by metric, the strongest first."""
         unsorted = [self._sensitivity(key, metric) for metric in self.metrics for key in self.keys]
         order = {metric: k for k, metric in enumerate(self.metrics)}
         return sorted(unsorted, key=lambda s: (order[s.metric], -_strength(s)))
@@ -231,8 +242,7 @@ class StudyAnalysis:
     def sobol(self) -> dict[str, dict[str, SobolIndex]]:
         """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes.
 
-        Metrics that are constant are left out, as are those without a value in some survey of the design, for
-        instance because that survey is not complete.
+        A metric is left out if it is constant, or if a survey of the design is not complete or has no value of it.
         """
         axes = axis_names(self.study)
         usable = self.study.sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1
@@ -246,7 +256,10 @@ class StudyAnalysis:
         }
 
     def _mean_of_samples(self, metric: str) -> Array:
-        """Returns the mean of a metric over the surveys of each sample; NaN unless all are complete with a value."""
+        """Returns the mean of a metric over the surveys of each sample, by sample number.
+
+        It is NaN unless all surveys of the sample are complete and have a value.
+        """
         values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)
@@ -255,9 +268,9 @@ class StudyAnalysis:
     def answers(self) -> dict[str, list[Answer]]:
         """Returns, for each varied key, the verdicts on whether the pass probability reaches the required value.
 
-        A key with a distribution has one answer per range, a key with listed values one per value, or per range if it
-        has more than 12 different numbers. The other keys vary as the study specifies. Empty without a required pass
-        probability, or if no survey was evaluated.
+        A key with a continuous distribution has one answer per range. A key with listed values has one answer per
+        value, or per range if it has more than 12 different numbers. The other keys vary as the study specifies. The
+        result is empty without a required pass probability, or if no survey was evaluated.
         """
         if self.required_probability is None or not self.evaluated.any():
             return {}
@@ -297,7 +310,10 @@ class StudyAnalysis:
 
     @cached_property
     def key_comparisons(self) -> list[KeyComparison]:
-        """Returns a comparison of passed and other surveys for each numeric key, the greatest difference first."""
+        """Returns, for each numeric key, a comparison of the evaluated surveys that passed with those that did not.
+
+        The greatest difference comes first. Empty if all of these surveys passed or none did.
+        """
         comparisons = []
         for key in self.keys:
             x = self.key_numbers(key)
@@ -328,12 +344,15 @@ class StudyAnalysis:
 
 
 def mask_numbers(reason: str) -> str:
-    """Returns a reason with every number replaced by "…", so that reasons that differ only in numbers become equal."""
+    """Returns a reason with its numbers replaced by "…", so that reasons that differ only in numbers become equal.
+
+    Digits within a word, e.g. in "LE90", are kept.
+    """
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", reason)
 
 
 def count_similar(texts: Iterable[str]) -> dict[str, int]:
-    """Counts texts that differ only in numbers as one; returns {first such text: count}, the most frequent first."""
+    """Returns {text: count}, the most frequent first; texts that differ only in numbers count as the first of them."""
     first: dict[str, str] = {}
     counts: dict[str, int] = {}
     for text in texts:

@@ -59,9 +59,9 @@ class PassRecord(NamedTuple):
     fail_level: float = LEVEL
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
-        """Returns the verdict on the surveys that the mask `chosen` (n,) selects.
+        """Returns the answer for the surveys that the mask `chosen` (n,) selects, of which there is at least one.
 
-        `label`, `low` and `high` are those of the answer.
+        `label`, `low` and `high` are the fields of the answer.
         """
         passed, clusters = self.passed[chosen], self.clusters[chosen]
         n, k = effective_number(passed, clusters), float(passed.mean())
@@ -79,8 +79,8 @@ class PassRecord(NamedTuple):
 
         The error probability is divided by the number of disjoint ranges that could get the verdict (Bonferroni). For
         "fails", this is `n_bins`, because the surveys of one bin can be enough. For "passes", a range needs at least
-        z^2 r / (1 - r) surveys, even if all of them passed; r is the required probability and z the normal quantile of
-        the confidence level.
+        z^2 r / (1 - r) effective surveys, even if all of them passed; r is the required probability and z = 1.96 the
+        normal quantile for 95 % confidence.
         """
         smallest = float(ndtri(0.5 + LEVEL / 2)) ** 2 * self.required / max(1 - self.required, 1e-9)
         n_passing = max(1, min(n_bins, int(effective_number(self.passed, self.clusters) / max(smallest, 1e-9))))

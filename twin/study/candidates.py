@@ -34,9 +34,10 @@ _PENALTY = 1e9  # objective of a candidate without a finite median; Optuna does 
 
 
 class SurveyScore(NamedTuple):
-    """Part of a survey's result that the search uses: status, whether it passed, metrics to optimise or limit.
+    """Part of a survey's result that the search uses.
 
-    `reason` states why the survey was refused; it is empty for other surveys.
+    `metrics` are the objectives and the metrics with a limit, with their completeness metrics, by name. `reason` states
+    why the survey was refused; it is empty for other surveys.
     """
 
     status: str
@@ -63,7 +64,7 @@ class Candidate(NamedTuple):
 
     @property
     def has_metrics(self) -> bool:
-        """Returns whether every objective has a finite value; all but "risk" require a completed survey."""
+        """Returns whether every objective has a finite value; a metric has none without a completed survey."""
         return max(abs(value) for value in self.objectives) < _PENALTY
 
 
@@ -114,9 +115,11 @@ class CandidateSurveys:
     def confirmation(self, rows: Iterable[Row]) -> CandidateSurveys:
         """Returns the surveys that confirm a plan: `tune.confirm` times as many as in the search, with new seeds.
 
-        Sampled keys have new samples, each with its own seeds: with shared seeds, samples of a parameter with few
-        values would repeat surveys, and all samples would be on the same few floors. The designs "sobol" and "saltelli"
-        need a power of 2 as number of samples; for another number, the samples are those of "lhs".
+        Sampled keys have `tune.confirm` times as many design points, which are new, each with its own seeds: with
+        shared seeds, samples of a key with few values would repeat surveys, and all samples would be on the same few
+        floors. The designs "sobol" and "saltelli" need a power of 2 as number of samples; for another number, the
+        samples are those of "lhs". Without sampled keys, or with the design "grid", the samples stay the same, with
+        `tune.confirm` times as many seeds.
 
         Args:
             rows: rows of the surveys flown so far.
@@ -135,8 +138,8 @@ class CandidateSurveys:
     def rendered(self, rows: Iterable[Row]) -> CandidateSurveys:
         """Returns the rendered surveys that verify a plan: `tune.verify` new design points, each with its own seed.
 
-        Each design point is combined with every cell of the grids. A study without sampled keys has `tune.verify` seeds
-        for each cell instead.
+        Each design point is combined with every cell of the grids. Without a number of samples in the study, i.e. with
+        the design "grid" or without sampled keys, each cell has `tune.verify` seeds instead.
 
         Args:
             rows: rows of the surveys flown so far.
@@ -156,11 +159,11 @@ class CandidateSurveys:
 
     @property
     def uses_surrogate(self) -> bool:
-        """Returns whether the surveys are flown by the surrogate, judged by the first sample."""
+        """Returns whether the surveys are flown by the surrogate, judged by the first valid sample."""
         return scenario_of_sample(self.study, self.base, self.conditions[0]).imaging.fidelity == "surrogate"
 
     def add(self, row: Row) -> None:
-        """Adds the result of a survey; it replaces an earlier result with the same sample and seed."""
+        """Adds the result of a survey, which replaces an earlier result with the same sample and seed."""
         metrics = {name: row.get(name) for name in self.metrics}
         reason = row["reason"] if row["status"] == "refused" else ""
         warning, identity = row.get("warning") or "", row["scenario_hash"]
@@ -176,7 +179,7 @@ class CandidateSurveys:
         return score is not None and score.status != "failed" and score.scenario_hash == survey.scenario_hash
 
     def _samples(self, number: int, values: dict[str, Any]) -> Iterator[Sample]:
-        """Yields the samples of a candidate: its values combined with each valid sample of the study."""
+        """Yields the samples of a candidate: the searched values combined with each valid sample of the study."""
         for condition in self.conditions:
             yield Sample(number * self._n_samples + condition.number, condition.point, values | condition.values)
 
@@ -197,9 +200,12 @@ class CandidateSurveys:
             yield from surveys_of_sample(self.study, self.folder, sample, scenario)
 
     def missing(self, candidates: Mapping[int, dict[str, Any]]) -> Iterator[Survey]:
-        """Yields the surveys of the candidates (values by trial number) that have not been flown or have failed.
+        """Yields the surveys of the candidates that have not been flown with the present scenario or have failed.
 
         A survey whose scenario is not valid is not yielded, but recorded as refused.
+
+        Args:
+            candidates: values of the searched keys of each candidate, by its trial number.
         """
         for number, values in candidates.items():
             for survey in self.surveys(number, values):
@@ -225,16 +231,21 @@ class CandidateSurveys:
         return key in self._scores and self._scores[key].status != "failed"
 
     def keys(self, number: int, values: dict[str, Any]) -> list[tuple[int, int]]:
-        """Returns (sample, seed) of every survey of a candidate."""
+        """Returns the list of (sample, seed) of every survey of a candidate."""
         return [(s.number, seed) for s in self._samples(number, values) for seed in seeds_of_sample(self.study, s)]
 
     def warnings(self, plans: Iterable[Candidate]) -> dict[str, int]:
-        """Returns the number of surveys of the given candidates with each warning, the most frequent first."""
+        """Returns {warning: number of surveys of the given candidates that have it}, the most frequent first.
+
+        Warnings that differ only in numbers count as one; see `count_similar`.
+        """
         scores = (score for plan in plans for score in self.scores(plan.number, plan.values))
         return count_similar(score.warning for score in scores if score.warning)
 
     def refusals(self, plans: Mapping[int, dict[str, Any]]) -> dict[str, int]:
-        """Returns the number of plans that were refused in every survey, by reason, the most frequent first.
+        """Returns {reason: number of plans whose surveys were all refused for it}, the most frequent first.
+
+        The reason of a plan is that of its first survey; reasons that differ only in numbers count as one.
 
         Args:
             plans: values of the searched keys, by number of the plan.
@@ -247,12 +258,15 @@ class CandidateSurveys:
         return count_similar(reasons)
 
     def evaluate(self, number: int, values: dict[str, Any], correction: PlanCorrection = NO_CORRECTION) -> Candidate:
-        """Returns a candidate with its objectives and pass probability; failed surveys are not counted.
+        """Returns a candidate with its objectives and pass probability.
+
+        A refused survey counts as one that does not pass; a failed survey is not counted.
 
         Args:
             number: trial number of the candidate.
             values: value of each searched key.
-            correction: expected ratios of rendered surveys to these surveys; by default 1.
+            correction: expected ratios of the results of rendered surveys to those of these surveys; by default all
+                are 1.
         """
         scores = self.scores(number, values)
         n_passed = sum(self._passes(score, correction) for score in scores)
@@ -276,9 +290,10 @@ class CandidateSurveys:
         return score.status == "complete" and all(met)
 
     def _objective(self, name: str, scores: list[SurveyScore], correction: PlanCorrection) -> float:
-        """Returns the corrected median of a metric over the surveys, or a penalty if it is missing or not finite.
+        """Returns the corrected median of a metric over the completed surveys.
 
-        For "risk", which has no value per survey, it returns 1.
+        If the median is missing or not finite, returns 1e9, or -1e9 if larger values of the metric are better. For
+        "risk", returns 1, its value without any survey.
         """
         if name == "risk":
             return 1.0
@@ -288,7 +303,11 @@ class CandidateSurveys:
         return -_PENALTY if more_is_better(name) else _PENALTY
 
     def scenario(self, candidate: Candidate) -> Scenario:
-        """Returns the scenario of the study with the plan of a candidate; varied keys keep their original values."""
+        """Returns the scenario of the study with the plan of a candidate; varied keys keep their original values.
+
+        Raises:
+            ScenarioError: this scenario is not valid.
+        """
         return scenario_of_sample(self.study, self.base, Sample(0, 0, candidate.values))
 
 
@@ -304,10 +323,12 @@ def median_of(scores: list[SurveyScore], name: str) -> float | None:
 
 
 def check_bounds(study: Study, config: TuningConfig) -> None:
-    """Validates the scenario at both bounds, or at all listed values, of each searched key, in the first valid sample.
+    """Validates the scenario at both bounds, or at all listed values, of each searched key.
+
+    The other searched keys keep their original values, and the varied keys have those of the first valid sample.
 
     Raises:
-        ScenarioError: lists the errors, each key once.
+        ScenarioError: a scenario is not valid; lists the errors, each key once.
     """
     base, errors = read_tree(study.scenario_file), []
     condition = _first_valid_sample(study, base)
@@ -322,7 +343,7 @@ def check_bounds(study: Study, config: TuningConfig) -> None:
 
 
 def _first_valid_sample(study: Study, base: Mapping[str, Any]) -> Sample:
-    """Returns the first sample whose scenario is valid with the original plan; the first one of all if none is.
+    """Returns the first sample whose scenario is valid with the original plan; if none is, the first sample.
 
     Args:
         study: the study.
@@ -340,7 +361,7 @@ def _first_valid_sample(study: Study, base: Mapping[str, Any]) -> Sample:
 def cost_index(config: TuningConfig) -> int:
     """Returns the index of the objective that is the cost of a plan.
 
-    It is the first objective that is a duration, e.g. "timing.simulated_s", otherwise the first objective.
+    It is the first objective that is a duration, e.g. "timing.simulated_s", or else the first objective.
     """
     costs = [k for k, name in enumerate(config.objectives) if name.startswith("timing.") and name.endswith("_s")]
     return costs[0] if costs else 0

@@ -44,8 +44,8 @@ NO_CORRECTION = PlanCorrection({}, 1.0)
 def metric_ratio(metric: str, rendered: float | None, surrogate: float | None) -> float:
     """Returns the ratio rendered / surrogate of a metric, clipped to the range from 1/100 to 100.
 
-    Without a finite rendered value, the ratio is 10, or 1/10 if larger values of the metric are better. It is 1 if the
-    surrogate has no finite value, or if either value is not positive.
+    If the surrogate's value is None, not finite or not positive, the ratio is 1. Otherwise it is 10 without a finite
+    rendered value, or 1/10 if larger values of the metric are better, and 1 if the rendered value is not positive.
     """
     if surrogate is None or surrogate <= 0 or not math.isfinite(surrogate):
         return 1.0
@@ -62,7 +62,8 @@ def correction_at(
     For each metric, the logarithm of the correction factor is the kernel-weighted mean (Nadaraya 1964, Watson 1964) of
     the logarithms of the flown plans' ratios and of a prior value of 0, so that the factor tends to 1 far from all
     flown plans. The pass factor is the same mean of the fractions of completed surveys, with a prior value of 1.
-    The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d and the kernel width w.
+    The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d and the kernel width w = 0.15; the prior has the
+    weight of a plan at the distance 2 w. Without a flown plan, the correction is `NO_CORRECTION`.
 
     Args:
         search: distribution of each searched key.
@@ -82,15 +83,16 @@ def correction_at(
 
 
 def plan_distance(search: dict[str, Distribution], one: dict[str, Any], other: dict[str, Any]) -> float:
-    """Returns the RMS difference of two plans over the searched keys, each as a fraction of its range, 0 to 1."""
+    """Returns the RMS difference of two plans over the searched keys, 0 to 1; see `_difference`."""
     squares = [_difference(distribution, one[key], other[key]) ** 2 for key, distribution in search.items()]
     return math.sqrt(sum(squares) / len(squares))
 
 
 def _difference(distribution: Distribution, one: Any, other: Any) -> float:
-    """Returns the difference of two values (for a choice of numbers, of their ranks) as a fraction of the range.
+    """Returns the absolute difference of two values as a fraction of the searched range.
 
-    For a choice of texts, it is 0 if they are equal, otherwise 1.
+    The difference is that of the logarithms for a log-uniform distribution, and that of the ranks for a choice of
+    numbers. For any other choice, returns 0 if the values are equal, otherwise 1.
     """
     values = distribution.values
     if distribution.kind == "choice":

@@ -52,7 +52,12 @@ def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
 
 
 def _slurm_cluster(jobs: int) -> Any:
-    """Returns a cluster of SLURM jobs as configured in Dask (jobqueue.slurm); default: one core and 4 GB per job.
+    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration.
+
+    Where they give no cores or no memory, a job has one core or 4 GB.
+
+    Args:
+        jobs: number of SLURM jobs.
 
     Raises:
         TwinError: dask-jobqueue is not installed.
@@ -118,7 +123,10 @@ def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> 
 
 
 class _QueueSize:
-    """Callable that returns the number of tasks to keep submitted; caches the cluster size, which is a network call."""
+    """Callable that returns the number of tasks to keep submitted.
+
+    It caches this number for `_REFRESH_S` seconds, because a network call is needed to get the size of the cluster.
+    """
 
     def __init__(self, client: Client):
         self.client, self.tasks, self.updated_s = client, 0, -math.inf

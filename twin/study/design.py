@@ -48,7 +48,10 @@ def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
 
 
 def design_points(method: SamplingMethod, n_points: int, n_axes: int, seed: int) -> Array:
-    """Returns (n, n_axes) points in the unit cube; n is n_points, or n_points (n_axes + 2) for "saltelli"."""
+    """Returns points (n, n_axes) in the unit cube.
+
+    n is n_points, or n_points (n_axes + 2) for "saltelli" with at least one axis.
+    """
     from scipy.stats import qmc  # the import takes a second, and workers do not need it
 
     rng = np.random.default_rng([seed, _DESIGN_STREAM])
@@ -77,7 +80,10 @@ def _saltelli(pairs: Array) -> Array:
 
 
 def axis_names(study: Study) -> list[str]:
-    """Returns the name of each sampled axis: a key, or the jointly varied keys of a table, joined by " + "."""
+    """Returns the name of each axis that methods other than "grid" sample.
+
+    It is the key, or the jointly varied keys of a table, joined by " + ".
+    """
     single = [key for key, distribution in study.vary.items() if distribution.is_sampled]
     return single + [" + ".join(table.keys) for table in study.together]
 

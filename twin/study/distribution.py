@@ -18,7 +18,7 @@ Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 
 
 class Distribution(Section):
-    """Distribution of one varied key; exactly one field is given, whose name is the kind of distribution."""
+    """Distribution of one varied key; exactly one field is given, and its name is the kind of distribution."""
 
     uniform: Pair | None = Field(default=None, description="[low, high]")
     log_uniform: Pair | None = Field(default=None, description="[low, high]; the logarithm is uniformly distributed")

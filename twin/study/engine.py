@@ -12,7 +12,14 @@ Result = TypeVar("Result")
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task: its `result` (None if it failed), the reason of its failure, and the number of attempts."""
+    """Outcome of one task.
+
+    Args:
+        task: the task.
+        result: result of the function; None if the task failed.
+        failure: reason of the failure; "" if the task did not fail.
+        attempts: number of attempts.
+    """
 
     task: Task
     result: Result | None

@@ -40,7 +40,7 @@ def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
 
 
 def make_panels(count: int, columns: int = 3) -> tuple[Figure, list[Axes]]:
-    """Returns a figure with `count` axes in rows of at most `columns`; four axes form a square by default."""
+    """Returns a figure and its `count` axes, in rows of at most `columns`; by default, four axes form a square."""
     columns = 2 if count == 4 and columns == 3 else min(columns, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(WIDTH_IN if columns > 1 else WIDTH_IN * 0.62, _ROW_IN * rows))
@@ -94,8 +94,8 @@ def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], group
     Args:
         axes: axes to format.
         values: values of the key; None if it is text.
-        chosen: mask of the surveys shown.
-        groups: group of each chosen survey.
+        chosen: (n,) mask of the surveys shown.
+        groups: group index of each chosen survey.
         names: names of the groups.
     """
     if values is None:
@@ -112,7 +112,7 @@ def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], group
 
 
 def _axis_range(values: Array, log: bool) -> tuple[float, float]:
-    """Returns the limits of an axis that shows the values with a margin."""
+    """Returns the limits of an axis, logarithmic or linear, that shows the values with a margin."""
     low, high = float(values.min()), float(values.max())
     if log:
         return low / 1.15, high * 1.15
@@ -216,7 +216,7 @@ def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
 
 
 def _dots(axes: Axes, x: Array, y: Array, passed: NDArray[np.bool_], rng: np.random.Generator) -> None:
-    """Plots surveys as dots whose colour shows whether they passed; a random subset if there are too many."""
+    """Plots surveys as dots whose colour shows whether they passed; of more than 3000, a random subset of 3000."""
     shown = rng.permutation(len(x))[:_MAX_POINTS]
     for mask, colour in ((passed, POINTS), (~passed, NOT_PASSED)):
         subset = shown[mask[shown]]

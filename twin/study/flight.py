@@ -24,8 +24,9 @@ OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report
 def fly(survey: Survey) -> Row:
     """Flies a survey, writes the files of its run folder that are kept, and returns its row of results.
 
-    A ScenarioError gives a row with status "refused", any other TwinError or an OSError one with "failed". The survey
-    writes to a hidden folder that is renamed at the end, so a folder with the final name is complete.
+    The row has the status "refused" if a ScenarioError was raised, and "failed" if another TwinError or an OSError was
+    raised. The survey writes to a hidden folder that is renamed at the end, so a folder with the final name is
+    complete.
     """
     import cv2
 
@@ -72,7 +73,7 @@ def _status(metrics: Mapping[str, Any]) -> str:
 
 
 def row_of(survey: Survey, status: str, reason: str) -> Row:
-    """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason and values of varied keys.
+    """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason, values of the varied keys.
 
     Args:
         survey: the survey.

@@ -13,10 +13,12 @@ from twin.study.worker import TaskLimits, WorkerPool
 
 
 class LocalEngine:
-    """Engine that runs tasks in worker processes on this machine, with a thread per worker that waits for results.
+    """Engine that runs tasks in worker processes on this machine, each pinned to a CPU core.
+
+    One thread per worker process waits for its results.
 
     Args:
-        jobs: number of worker processes.
+        jobs: largest number of worker processes.
     """
 
     def __init__(self, jobs: int):

@@ -30,7 +30,7 @@ class StudyProgress:
         self._task: Any = bar.add_task("", total=None, note="starting workers") if bar else None
 
     def begin(self, total: int) -> None:
-        """Sets the total number of surveys to fly."""
+        """Sets the number of surveys that this run flies in total."""
         self.total = total
         self._update_bar()
 
@@ -81,7 +81,7 @@ def study_progress(print_surveys: bool) -> Iterator[StudyProgress]:
 
 
 def survey_line(row: Row) -> str:
-    """Returns one line with a survey's sample, seed, status, reason and varied values."""
+    """Returns one line with a survey's sample, seed, status, reason, and values of the varied keys."""
     missed = "" if has_passed(row) else ", requirements not met"
     result = row["status"] + (f" ({row['reason']})" if row["reason"] else missed)
     varied = ", ".join(f"{name[5:]} {plain(value)}" for name, value in row.items() if name.startswith("vary."))

@@ -47,10 +47,7 @@ class RenderedCheck(NamedTuple):
 
     @property
     def exit_status(self) -> int:
-        """Returns 130 if the check was interrupted; 0 if surrogate and rendered surveys agree or there are no limits.
-
-        Otherwise 1.
-        """
+        """Returns 130 if the check was interrupted; 0 if `agrees` is true or the study has no limit; otherwise 1."""
         return 130 if self.interrupted else int(self.has_limits and not self.agrees)
 
     @property
@@ -96,12 +93,12 @@ def check(
 ) -> RenderedCheck:
     """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
 
-    Ctrl-C ends the check early; the comparison then has the rendered surveys flown until then.
+    Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
 
     Args:
         study: the study.
         analysis: results of the study.
-        n: number of surveys to fly, at most.
+        n: largest number of surveys to compare.
         folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
         engine: runs the surveys in parallel.
         progress: display of the progress.

@@ -52,7 +52,7 @@ class ResultsLog:
         self._unwritten.clear()
 
     def rows(self) -> Iterator[Row]:
-        """Yields all rows in the order in which they were written; skips partly written rows."""
+        """Yields all rows of the file in the order in which they were written; skips partly written rows."""
         if not self.file.exists():
             return
         with self.file.open("rb") as file:
@@ -116,7 +116,10 @@ def write_parquet(rows: pa.Table, file: Path) -> None:
 
 
 def _sorted_columns(names: Iterable[str]) -> list[str]:
-    """Returns the names by section: identity in a fixed order; varied keys, metrics, timing, each sorted by name."""
+    """Returns the names of the columns in four sections: identity, varied keys, metrics, timing.
+
+    The identity has a fixed order; the names of each other section are sorted alphabetically.
+    """
     identity = ("sample", "seed", "status", "reason", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 

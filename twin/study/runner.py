@@ -23,7 +23,7 @@ from twin.study.worker import TaskLimits
 
 
 class Throughput(NamedTuple):
-    """Number of surveys flown, elapsed wall time [s], and sum of the run times of all surveys on the workers [s]."""
+    """Number of surveys flown, elapsed wall time [s], and sum of the run times of these surveys on the workers [s]."""
 
     surveys: int
     wall_s: float
@@ -36,7 +36,7 @@ class StudyResult(NamedTuple):
     Args:
         analysis: statistics of the surveys.
         page: file of the report.
-        write_errors: messages of errors while the results were written.
+        write_errors: messages of the errors that occurred while the results were written.
         interrupted: whether Ctrl-C ended the study.
         throughput: number of surveys flown by this call, and their run times.
     """
@@ -58,8 +58,8 @@ def run_study(
 ) -> StudyResult:
     """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
-    A study that compares rendered and surrogate surveys also gets agreement.md and its figure. Ctrl-C ends the study
-    early; the results obtained until then are written.
+    For a study that compares rendered and surrogate surveys, agreement.md and its figure are written too. Ctrl-C ends
+    the study early; the results obtained until then are written.
 
     Args:
         study: the study.
@@ -107,7 +107,7 @@ def run_study(
 
 
 def _identities(study: Study, folder: Path, refused: dict[int, str]) -> Iterator[tuple[tuple[int, int], str]]:
-    """Yields (sample, seed) and the scenario hash of every survey; a refused sample has an empty hash."""
+    """Yields ((sample, seed), scenario hash) of every survey; the hash is empty for the surveys of a refused sample."""
     yield from ((survey.key, survey.scenario_hash) for survey in surveys(study, folder, without=refused))
     yield from (((row["sample"], row["seed"]), "") for row in _refused_rows(study, refused))
 
@@ -138,7 +138,7 @@ def open_folder(folder: Path, resume: bool, planned: Iterable[tuple[tuple[int, i
     Args:
         folder: results folder.
         resume: whether the folder may contain results.
-        planned: (sample, seed) and scenario hash of each survey of the study.
+        planned: ((sample, seed), scenario hash) of each survey of the study.
 
     Raises:
         TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study.
@@ -197,7 +197,7 @@ def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
 
 
 def _write_errors(*writes: Callable[[], object]) -> list[str]:
-    """Calls every function, even if an earlier one raised an OSError, and returns the messages of these errors."""
+    """Calls every function, also after one has raised an OSError, and returns the messages of these errors."""
     errors = []
     for write in writes:
         try:

@@ -40,7 +40,7 @@ class Search:
 
         Args:
             study: the study.
-            config: its section [tune].
+            config: section [tune] of the study.
             folder: results folder.
             search_round: round of the search, from 0; a further round begins with the candidates given to
                 `add_earlier_candidates`.
@@ -67,7 +67,8 @@ class Search:
     def add_earlier_candidates(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
         """Adds the candidates of earlier rounds, whose results the sampler uses from the first batch of this round.
 
-        Does nothing once this round has candidates of its own. After an interruption, adds the ones still missing.
+        Does nothing once this round has candidates of its own. If an interrupted search added some of the candidates,
+        adds the others.
 
         Args:
             candidates: (values of the searched keys, objectives, shortfall) of each candidate, in the same order at
@@ -88,10 +89,10 @@ class Search:
             )
 
     def next_batch(self) -> list[Proposal]:
-        """Returns the candidates to evaluate next; an empty list after the last trial.
+        """Returns the candidates to evaluate next; an empty list after the last trial of this round.
 
         If an interrupted search left unfinished candidates, returns these, otherwise a new batch. A batch depends only
-        on the earlier trials, not on the number of workers or on interruptions.
+        on the earlier trials and the seed of the study, not on the number of workers or on interruptions.
         """
         known = self._trials()
         if unfinished := [trial for trial in known if trial.state == TrialState.RUNNING]:

@@ -29,14 +29,13 @@ class Interval(NamedTuple):
 def wilson_interval(successes: float, n: float, level: float = LEVEL) -> Interval:
     """Returns the proportion of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
-    (p + z^2/2n +- z sqrt(p (1-p)/n + z^2/4n^2)) / (1 + z^2/n)
-
-    Without trials, the proportion is NaN and the interval is 0 to 1.
+    The bounds are (p + z^2 / (2 n) +- z sqrt(p (1 - p) / n + z^2 / (4 n^2))) / (1 + z^2 / n), with the proportion p
+    and the normal quantile z of (1 + level) / 2. Without trials, the proportion is NaN and the interval is 0 to 1.
 
     Args:
         successes: number of successes.
         n: number of trials, or effective number of trials.
-        level: confidence level.
+        level: confidence level, 0 to 1.
     """
     if n <= 0:
         return Interval(np.nan, 0.0, 1.0)
@@ -57,7 +56,7 @@ def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
 
     Args:
         passed: (n,) whether each survey passed.
-        clusters: (n,) cluster label of each survey, i.e. its sample or its seed.
+        clusters: (n,) cluster label of each survey: the number of its sample, or its seed.
     """
     success = np.asarray(passed, dtype=float)
     if len(success) == 0:
@@ -67,7 +66,12 @@ def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
 
 
 def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:
-    """Returns the effective number of surveys for a proportion, at most their number; see `clustered_proportion`."""
+    """Returns the effective number of surveys for a proportion, at most their number; see `clustered_proportion`.
+
+    Args:
+        passed: (n,) whether each survey passed.
+        clusters: (n,) cluster label of each survey.
+    """
     success = np.asarray(passed, dtype=float)
     labels, index = np.unique(np.asarray(clusters), return_inverse=True)
     n, k = len(success), len(labels)
@@ -83,7 +87,7 @@ def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, l
     """Returns the number of further surveys after which Wilson's interval would exclude the required proportion r.
 
     For n effective surveys and an observed proportion p, the interval contains r if (p - r)^2 <= z^2 r (1 - r) / n,
-    with z the normal quantile of the confidence level. If p stays the same, n = z^2 r (1 - r) / (p - r)^2 effective
+    where z is the normal quantile of (1 + level) / 2. If p stays the same, n = z^2 r (1 - r) / (p - r)^2 effective
     surveys are therefore needed.
 
     Args:
@@ -93,7 +97,7 @@ def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, l
         level: confidence level of the interval.
 
     Returns:
-        The number of surveys; infinite if p equals r, if r is 1, or if no survey is given.
+        The number of surveys, at least 1; infinite if p equals r, if r is 1, or if no survey is given.
     """
     success = np.asarray(passed, dtype=float)
     difference = float(success.mean()) - required if len(success) else 0.0
@@ -116,8 +120,8 @@ def bootstrap_interval(
         clusters: (n,) label of the cluster of each value; None if the values are independent.
 
     Returns:
-        The statistic with its interval. The bounds are NaN if there are fewer than five clusters, or if both bounds are
-        equal: data without variation do not show how much further data would vary.
+        The statistic with its interval; NaN without data. The bounds are NaN if there are fewer than five clusters, or
+        if both bounds are equal: data without variation do not show how much further data would vary.
     """
     data = np.asarray(values, dtype=float)
     table = _by_cluster(data, np.arange(len(data)) if clusters is None else np.asarray(clusters))
@@ -140,7 +144,7 @@ def bootstrap_interval(
 
 
 def _by_cluster(values: Array, clusters: NDArray) -> Array:
-    """Returns the values as a table with one row per cluster, padded with NaN to the size of the largest cluster."""
+    """Returns the values as a table with one row per cluster; shorter rows are padded with NaN."""
     _, index = np.unique(clusters, return_inverse=True)
     order = np.argsort(index, kind="stable")
     sizes = np.bincount(index)
@@ -156,13 +160,13 @@ def median(values: Array) -> Array:
 
 
 def percentile(values: Array, percent: float) -> Array:
-    """Returns a percentile along the last axis, ignoring NaN."""
+    """Returns a percentile, 0 to 100, along the last axis, ignoring NaN."""
     function = np.nanpercentile if np.isnan(values).any() else np.percentile
     return function(values, percent, axis=-1)
 
 
 def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
-    """Returns Spearman's rank correlation with its interval; NaN with fewer than five values or a constant x or y.
+    """Returns Spearman's rank correlation with its interval; NaN for fewer than five pairs, or for a constant x or y.
 
     The interval is symmetric in Fisher's z = artanh(r), with variance (1 + r^2/2) / (n - 3) (Bonett & Wright 2000,
     Psychometrika 65, 23).
@@ -212,10 +216,11 @@ class SobolIndex(NamedTuple):
 def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
     """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals.
 
-    Uses the estimator of `scipy.stats.sobol_indices`.
+    Uses the estimator of `scipy.stats.sobol_indices`. If an interval is not defined, its bounds equal the index.
 
     Args:
-        values: (n (n_axes + 2),) metric at the design points of the blocks A, B, AB_1, AB_2, ...
+        values: (n (n_axes + 2),) metric at the n design points of each block A, B, AB_1, AB_2, ..., where AB_k is A
+            with column k of B (`design.design_points`).
         n_axes: number of sampled axes.
     """
     blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, 1, -1)

@@ -64,7 +64,7 @@ class SamplingConfig(Section):
 
 
 class TuningConfig(Section):
-    """Settings of the search by `twin tune`, which flies each candidate plan in every survey of the study."""
+    """Settings of the search by `twin tune`; each candidate plan is flown with every sample and seed of the study."""
 
     search: Annotated[dict[str, Distribution], Field(min_length=1)] = Field(
         description="keys of the scenario to optimise, each with a range (uniform, log_uniform) or values (choice)"
@@ -181,7 +181,8 @@ def load_study(path: str | Path) -> Study:
         path: a file, or a name in scenes/studies/.
 
     Raises:
-        ScenarioError: lists every error, each as `FILE:LINE: key: problem (allowed: ...)`.
+        ScenarioError: a file does not exist or is not valid; lists the errors of the study file or, if it has none,
+            those of the scenario file, each as `FILE:LINE: key: problem (allowed: ...)`.
     """
     file = find_study(path)
     tree, lines = read_toml(file)
@@ -220,7 +221,12 @@ def find_study(path: str | Path) -> Path:
 
 
 def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value."""
+    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value.
+
+    Args:
+        tree: nested tables.
+        prefix: text before every key.
+    """
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
             yield from flatten_keys(value, f"{prefix}{key}.")
@@ -253,7 +259,7 @@ def _key_errors(study: Study) -> Iterable[TwinError]:
 
 
 def named_keys(study: Study) -> Iterator[tuple[str, str]]:
-    """Yields (dotted name in the study file, key of the scenario) for every key that the study sets or varies."""
+    """Yields (dotted name in the study file, key of the scenario) for every key that is set, varied or searched."""
     yield from ((f"set.{key}", key) for key in study.set)
     yield from ((f"vary.{key}", key) for key in study.vary)
     for k, table in enumerate(study.together):

@@ -1,4 +1,4 @@
-"""Summary of a study that `--json` prints: counts, pass probability, answers, refused samples and metrics."""
+"""Summary of a study, printed with `--json`: counts, pass probability, answers, metrics, and reasons for failure."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
 
 
 def _agreement(analysis: StudyAnalysis) -> dict[str, Any] | None:
-    """Returns the agreement of surrogate with rendered surveys as JSON values; None without it."""
+    """Returns the agreement of surrogate with rendered surveys as JSON values; None if there is none to report."""
     result = agreement(analysis)
     if result is None:
         return None

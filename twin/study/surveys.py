@@ -43,7 +43,10 @@ class Survey(NamedTuple):
 
 
 class SampleSource(Source):
-    """Source of a sample's scenario: locates an error in it at the line of the study file that sets the faulty key."""
+    """Source of a sample's scenario: locates an error in it at the line of the study file that sets the faulty key.
+
+    An error in a key that the study does not set is located at the line of the key `scenario`.
+    """
 
     sample: int
     given: dict[str, str]  #: for each scenario key, its dotted name in the study file
@@ -93,6 +96,8 @@ def survey_keys(study: Study) -> Iterator[tuple[int, int]]:
 def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) -> Scenario:
     """Returns the validated scenario of a sample.
 
+    The limits of the study, if it has any, replace the section [require] of the scenario file.
+
     Args:
         study: the study.
         base: contents of the study's scenario file.
@@ -108,7 +113,7 @@ def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) ->
 
 
 def refusals(study: Study) -> dict[int, str]:
-    """Returns the errors of each sample whose scenario is not valid, as one text per sample number.
+    """Returns {sample number: errors, as one text} of the samples whose scenario is not valid.
 
     Raises:
         ScenarioError: no sample is valid; lists the errors of all samples, each key once.

@@ -88,6 +88,7 @@ class TuningFlights(NamedTuple):
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
+            TwinError: the engine lost its connection.
         """
 
         def add_row(row: Row) -> None:
@@ -139,7 +140,7 @@ def tune(
 
 
 class Tuning:
-    """Search for a plan, with the evaluated plans, finalists (evaluated again with new seeds), and verifications."""
+    """State of a search: the evaluated plans, the finalists (evaluated again with new seeds), and the verifications."""
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, flights: TuningFlights):
         self.study, self.config, self.folder, self.flights = study, config, folder, flights
@@ -157,10 +158,11 @@ class Tuning:
 
         Each round evaluates candidates, confirms the cheapest plans with new seeds, and flies their rendered surveys.
         The first round is the only one if no plan was verified in it. After a plan has passed, cheaper plans that the
-        surrogate rejects are verified until one does not pass.
+        surrogate rejects are verified; see `_verify_cheaper`.
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
+            TwinError: the engine lost its connection, or the folder contains another search.
         """
         search_round = 0
         for search_round in range(1 + self.config.rounds):
@@ -216,8 +218,9 @@ class Tuning:
     def _verify_front(self, search_round: int) -> None:
         """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
 
-        Repeats this until the cheapest confirmed plan has already passed verification, until no plan is confirmed, or
-        `config.plans` times. If plans are not verified, it only determines the cheapest confirmed plan.
+        Repeats this until the cheapest confirmed plan is one that has passed verification, until no plan is confirmed,
+        or until `config.plans` plans were verified. If plans are not to be verified, only determines the cheapest
+        confirmed plan.
         """
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()
@@ -226,7 +229,7 @@ class Tuning:
             self._verify(chosen, (self.config.rounds - search_round + 2) * self.config.plans - k, search_round)
 
     def _verify_cheaper(self, search_round: int) -> None:
-        """Verifies cheaper plans than the recommended one, until one does not pass or after `config.plans` plans.
+        """Verifies plans cheaper than the recommended one, until one does not pass or `config.plans` were verified.
 
         The surrogate may be pessimistic, so a plan that it rejects can still pass.
         """
@@ -244,7 +247,7 @@ class Tuning:
         The costs of all plans, including the recommended one, are the corrected results of the search. The candidates
         are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those that are not
         verified, the one with the smallest shortfall of the pass probability is returned; of several with the same
-        shortfall, the most expensive one. None if no plan is recommended, or if all candidates are verified.
+        shortfall, the most expensive one. Returns None if no plan is recommended, or if all candidates are verified.
         """
         if self.recommended is None:
             return None
@@ -271,7 +274,7 @@ class Tuning:
         self.flights.progress.print_line(verification.notice())
 
     def _announce(self, plan: Candidate, most_plans: int) -> None:
-        """Prints how many rendered surveys of a plan are to be flown, and their expected run time.
+        """Prints how many rendered surveys of a plan are to be flown, and their expected run time; nothing if none are.
 
         Args:
             plan: the plan.

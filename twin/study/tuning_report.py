@@ -33,7 +33,7 @@ FRONT, FEASIBLE, INFEASIBLE = COLOURS["final"], COLOURS["link"], COLOURS["f2f"]
 
 
 def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult, folder: Path) -> None:
-    """Writes tuning.html, pareto.png and, if a plan is recommended, recommended.toml."""
+    """Writes tuning.html, pareto.png and, if a plan is recommended, recommended.toml to a folder."""
     shown = [candidate for candidate in result.candidates if candidate.has_metrics]
     with matplotlib.rc_context(FIGURE_STYLE):
         trade_off = trade_off_figure(shown, result, config)
@@ -118,7 +118,11 @@ def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
 
 
 def warnings(result: TuningResult) -> list[str]:
-    """Returns the warnings of a search: unverified plan, surrogate errors, refused plans, warnings of surveys."""
+    """Returns the warnings of a search.
+
+    They concern a plan that was not verified, large errors of the surrogate, refused plans, and the warnings of
+    surveys.
+    """
     texts = []
     if result.recommended and result.needs_rendering and result.recommended_verification is None:
         texts.append(NOT_VERIFIED)
@@ -140,7 +144,7 @@ def warnings(result: TuningResult) -> list[str]:
 
 
 def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[str, Any]:
-    """Returns the summary that `--json` prints: candidates, the recommended plan, rendered surveys and warnings."""
+    """Returns the summary that `--json` prints: candidates, the recommended plan, verifications and warnings."""
     chosen, verification = result.recommended, result.recommended_verification
     recommended = chosen and {
         "values": chosen.values,
@@ -161,7 +165,7 @@ def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[st
 
 
 def _rendered(verification: Verification) -> dict[str, Any]:
-    """Returns the verdict and figures of the rendered surveys of a plan, with those of the surrogate, as JSON."""
+    """Returns a verification as JSON values: verdict, numbers of rendered surveys, plan, and medians with ratios."""
     medians = {
         name: {"surrogate": surrogate, "rendered": rendered, "ratio": verification.ratio.ratios[name]}
         for name, (surrogate, rendered) in verification.medians.items()

@@ -89,7 +89,7 @@ class ExpectedTime(NamedTuple):
 
     Args:
         survey_s: run time [s].
-        measured: whether it is derived from run times measured in this search; otherwise it is a rough estimate.
+        measured: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate.
     """
 
     survey_s: float
@@ -117,8 +117,8 @@ def expected_time(
     """Returns the expected run time of a rendered survey of a plan.
 
     It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second. The
-    latter is measured in the rendered surveys flown so far; before the first one, it is estimated from the frame rate
-    and the image size.
+    run time per simulated second is measured in the rendered surveys flown so far; before the first one, it is
+    estimated from the frame rate and the image size.
 
     Args:
         trials: surrogate surveys of the candidates.

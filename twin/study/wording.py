@@ -36,7 +36,7 @@ def metric_name(metric: str) -> str:
 
 
 def metric_value(metric: str, value: float | None) -> str:
-    """Returns the value of a metric with its unit; `risk` in percent."""
+    """Returns the value of a metric with its unit; `risk` in percent; a dash for None, NaN and infinity."""
     if metric == "risk":
         return percent(value)
     if value is None or not np.isfinite(value):
@@ -47,7 +47,7 @@ def metric_value(metric: str, value: float | None) -> str:
 
 
 def metric_interval(metric: str, interval: Interval) -> str:
-    """Returns the estimate of a metric with its confidence interval in brackets."""
+    """Returns the estimate of a metric, with its confidence interval in brackets unless the bounds are not finite."""
     low, high = metric_value(metric, interval.low), metric_value(metric, interval.high)
     bounds = f" ({low} to {high})" if np.isfinite(interval.low) else ""
     return metric_value(metric, interval.value) + bounds
@@ -60,7 +60,7 @@ def metric_heading(metric: str) -> str:
 
 
 def correlation(interval: Interval) -> str:
-    """Returns a rank correlation with its confidence interval in brackets."""
+    """Returns a rank correlation with its confidence interval in brackets; a dash if it is not finite."""
     if not np.isfinite(interval.value):
         return DASH
     return f"{interval.value:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
@@ -81,7 +81,7 @@ def headline(study: Study, analysis: StudyAnalysis) -> str:
 
     They are the answer for the key that `seek` of the study names, the pass probability, whether the requirement is
     met, the most frequent reason if no survey passed, the numbers of surveys that are not counted, and the most
-    frequent warning.
+    frequent warning. Without an evaluated survey, only the numbers of surveys that are not counted are given.
     """
     n = int(analysis.evaluated.sum())
     left_out = _refused(analysis) + _duplicates(analysis) + _failed(analysis) + _not_flown(analysis)
@@ -97,7 +97,10 @@ def headline(study: Study, analysis: StudyAnalysis) -> str:
 
 
 def answer_lines(analysis: StudyAnalysis) -> list[str]:
-    """Returns for each varied key a sentence on the values at which the required fraction of surveys passes."""
+    """Returns for each varied key a sentence on the values at which the required fraction of surveys passes.
+
+    Empty without a required pass probability.
+    """
     required = analysis.required_probability
     return [answer_sentence(key, answers, required) for key, answers in analysis.answers.items()]
 
@@ -146,7 +149,7 @@ def _count(surveys: int) -> str:
 def _more(undecided: list[Answer]) -> str:
     """Returns a phrase with the number of further surveys that would decide all undecided answers.
 
-    The number is rounded up to two significant digits.
+    The number is rounded up to two significant digits. If it is infinite, the phrase gives the reason instead.
     """
     total = sum(answer.more_surveys for answer in undecided)
     if np.isinf(total):
@@ -174,13 +177,13 @@ def _labelled(low: str, high: str) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the number of surveys that have a warning and the most frequent warning; else ""."""
+    """Returns a sentence with the number of surveys with a warning and the most frequent one; "" without warnings."""
     warned, texts = int((analysis.warning != "").sum()), list(analysis.warning_counts)
     return f" Warning in {warned} of {len(analysis.warning)} surveys: {texts[0].rstrip('.')}." if texts else ""
 
 
 def _main_reason(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the most frequent reason why surveys did not pass, if none passed; else ""."""
+    """Returns a sentence with the most frequent reason why surveys did not pass; "" if a survey passed."""
     if analysis.passed.any() or not analysis.failure_reasons:
         return ""
     return f" The most frequent reason: {analysis.failure_reasons[0].reason}."
@@ -251,7 +254,7 @@ def _failed(analysis: StudyAnalysis) -> str:
 
 
 def superiority(comparison: KeyComparison) -> str:
-    """Returns a phrase that compares the values of a key in surveys that did not pass with those in passing surveys."""
+    """Returns a phrase on whether a key has higher or lower values in surveys that did not pass than in the others."""
     higher = comparison.superiority >= 0.5
     probability = comparison.superiority if higher else 1 - comparison.superiority
     if probability < 0.6:

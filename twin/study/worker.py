@@ -73,7 +73,10 @@ class Worker:
         child_end.close()
 
     def run(self, request: bytes, timeout_s: float) -> Reply:
-        """Sends a pickled (function, task) to the process and returns its reply; kills the process after a timeout."""
+        """Sends a pickled (function, task) to the process and returns its reply.
+
+        Kills the process if it does not reply within `timeout_s`; the reply then has the kind "timeout".
+        """
         try:
             self._pipe.send_bytes(request)
             if self._pipe.poll(timeout_s):
@@ -90,12 +93,15 @@ class Worker:
         self._process.wait()
 
     def close(self) -> None:
-        """Kills the process and closes the pipe to it; only for the thread that owns this worker."""
+        """Kills the process and closes the pipe to it; to be called only by the thread that uses this worker."""
         self.kill()
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns how the process ended (signal or exit status), and the last output line before a blank one."""
+        """Returns how the process ended (signal or exit status), and a line of its output if there is any.
+
+        The line is the last one before the first blank line.
+        """
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)
@@ -107,7 +113,7 @@ class WorkerPool:
     """Thread-safe pool of worker processes, one per concurrent task; idle workers are reused.
 
     Args:
-        cores: CPU cores, one for each worker to pin; further workers are not pinned.
+        cores: CPU core of each of the first workers, to which it is pinned; further workers are not pinned.
     """
 
     def __init__(self, cores: Sequence[int | None] = ()) -> None:
@@ -130,8 +136,8 @@ class WorkerPool:
     def run(self, function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
         """Runs a task on an idle or a new worker and returns its reply and the number of attempts.
 
-        Retries the task, at most `limits.retries` times, if its process ends or is killed; an exception or a timeout is
-        not retried.
+        The task is retried, at most `limits.retries` times, if its process ends or is killed, but not after an
+        exception or a timeout.
         """
         request = pickle.dumps((function, task))
         attempts = 0

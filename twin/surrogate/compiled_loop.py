@@ -25,8 +25,9 @@ def compiled_loop(
 
     The function performs the same operations with the same random numbers as the loop in `survey.fly`, so the results
     are equal. It returns the index of the next frame to simulate: that of the next keyframe, or the number of frames if
-    the sequence has no further keyframe. If F2F has no points to track, it simulates no frames. If the physics
-    diverges, it keeps the frames up to the one after which this was detected, and raises SurveyAborted.
+    the sequence has no further keyframe. If F2F has no points to track, it simulates no frames and returns the given
+    index. If the physics diverges, it records the frames up to the one after which this was detected, and raises
+    SurveyAborted.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz

@@ -20,9 +20,10 @@ class Quantity(NamedTuple):
     Args:
         label: name in messages.
         unit: unit in messages, with a leading space; "" for a ratio.
-        factor: factor by which a value may lie outside the fitted range.
-        limits: ends of the fitted range that restrict the use of the error model. Beyond the other end, the functions
-            of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free images.
+        factor: largest allowed ratio of a value to the upper end of the fitted range, and of the lower end to a value.
+        limits: ends of the fitted range that restrict the use of the error model. Beyond an end that is not named, the
+            functions of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free
+            images.
     """
 
     label: str
@@ -94,8 +95,8 @@ class QuantityOutsideFit(NamedTuple):
 def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[QuantityOutsideFit]:
     """Returns the quantities whose values in a survey lie outside the allowed range.
 
-    The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; the
-    other end is unlimited.
+    The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; an end
+    that is not named is unlimited. Quantities without a fitted range are not checked.
 
     Args:
         conditions: smallest and largest value of each quantity in the survey, by name.

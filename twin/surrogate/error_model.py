@@ -51,9 +51,9 @@ class DepthLaw(NamedTuple):
     """Standard deviation of a pixel's depth from the Kalman depth filter.
 
     One keyframe gives a depth from stereo, with the standard deviation of `sigma_px`. Each further one adds a depth
-    from stereo and one from the motion between the keyframes. The shorter the distance B between consecutive keyframes,
-    the less each adds, except that the image noise of two keyframes is independent at any distance. With n keyframes,
-    the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
+    from stereo and one from the motion between the keyframes. The smaller the distance B between consecutive keyframes,
+    the less information it adds. Image noise is the exception: it is independent between keyframes at any distance.
+    With n keyframes, the variance is multiplied by common + (1 - common) / (1 + g (n - 1)), where
     g = gain B^2 / (B^2 + half_step^2) + noise_gain s, and s is the fraction of the variance that the image noise
     causes: (slope c)^2 / (floor_px^2 + (slope c)^2) at the Cramér-Rao bound c.
 
@@ -109,14 +109,14 @@ class DepthLaw(NamedTuple):
 
 
 class ScatterLaw(NamedTuple):
-    """Standard deviation of the logarithm of a precision: gain t c / (c + half_px).
+    """Standard deviation, over map cells, of the logarithm of a standard deviation of depth: gain t c / (c + half_px).
 
     c is the Cramér-Rao bound [px], t the standard deviation of its logarithm over the windows of dense matching
     (`window_texture.WindowTexture.scatter`).
 
     Args:
         gain: standard deviation for large bounds, divided by t.
-        half_px: bound at which it is half of that [px].
+        half_px: bound at which the standard deviation is half of that for large bounds [px].
     """
 
     gain: float
@@ -131,7 +131,7 @@ class ScatterLaw(NamedTuple):
 class BinnedDepthLaw(NamedTuple):
     """Change of a `DepthLaw` for binned images, in their pixels.
 
-    In murky water, weak textures cause errors that more keyframes do not reduce as they reduce noise.
+    In murky water, weak textures cause errors that further keyframes reduce less than they reduce noise.
 
     Args:
         by_2, by_4: factor on the standard deviation from one keyframe for images that are binned by 2 and by 4.
@@ -164,7 +164,7 @@ class BorderLaw(NamedTuple):
     Args:
         share: fraction at the border.
         floor_px: width in noise-free images [px].
-        slope: width per Cramér-Rao bound, for large bounds.
+        slope: ratio of the width to the Cramér-Rao bound for large bounds, without lamps.
         lamp_growth: the part that increases with the bound is multiplied by sqrt(1 + (lamp_growth * lamp_share)^2),
             where lamp_share is the fraction of the reflected light that comes from the lamps.
     """
@@ -222,7 +222,8 @@ class ErrorModel(NamedTuple):
             patch change when the lamps move.
         lamp_sigma_growth: growth of the reported covariance of a link due to the lamps, which the estimators derive
             from residuals: it is multiplied by 1 + (lamp_sigma_growth * lamp_share)^2.
-        match_fraction: fraction of a keyframe's points in the field of view of another keyframe that are matched there.
+        match_fraction: of a keyframe's points that lie in the field of view of another keyframe, the fraction that is
+            matched there.
         match_parallax_px: parallax of the relief within a patch, i.e. its unevenness times distance / depth, at which
             half of the points that could be matched between two keyframes are matched. The fraction is
             1 / (1 + (parallax / match_parallax_px)^2), because the patch then looks different from the two keyframes.
@@ -272,7 +273,7 @@ class ErrorModel(NamedTuple):
             [px].
         map_completeness: fraction of the smooth map cells in view, away from the borders of the images, for which the
             Kalman depth filter provides a depth.
-        border_holes: fraction of the cells without a depth near the borders of the images.
+        border_holes: fraction of the cells near the borders of the images that have no depth for this reason.
         relief_error_gain: gain g of the true standard deviation of the height error due to the roughness r of a cell,
             a q^2 / sqrt(1 + q^4) with q = g r / a and the limit a, `relief_error_limit_px`. The roughness is the RMS
             deviation of the floor from a plane within the window of dense matching. The error is common to all views of

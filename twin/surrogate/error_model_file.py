@@ -171,7 +171,7 @@ def _invalid(path: Path, problem: str) -> TwinError:
 
 
 def _value(name: str, given: Any) -> Any:
-    """Converts a TOML value to the type of the parameter `name`; keys with a default may be missing."""
+    """Converts a TOML value to the type of the parameter `name`; keys of a law that have a default may be missing."""
     kind = type(ErrorModel._field_defaults[name])
     if kind in _LAWS:
         keys = [key for key in kind._fields if key in given or key not in kind._field_defaults]

@@ -1,7 +1,7 @@
 """Model of the elevation map: the grid cells that a keyframe sees, and samples of the heights that it contributes.
 
 The heights stand for those from the Kalman depth filter, with one sample per grid cell for all pixels that show the
-cell. Their errors are correlated over the matching window, as those of dense matching are. A cell is visible if its
+cell. Their errors are correlated over about a matching window, as those of dense matching are. A cell is visible if its
 centre projects into both images and no relief hides it from either camera (ray casting). Where the floor is not a plane
 within the matching window, heights have an additional error that grows with the RMS deviation from the plane (the
 roughness of the cell), and cells without a height are more frequent. Near walls, errors are larger and heavy-tailed,
@@ -44,7 +44,9 @@ _LEAST_SLOPE = 0.1  # slope below which errors near walls do not decrease
 ONE_KEYFRAME = DepthLaw(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
 _NO_CELLS = np.zeros((0, 0), np.float32)
 _EVEN = np.ones((1, 1))  # relative bounds of an evenly lit image
-_HIDING_SLOPE = 1.0  # rise over run: floor below a line of this slope cannot hide the cell where the line starts
+#: Rise over run of a line from a cell; floor below this line is taken not to hide the cell. This is exact for rays that
+#: are at most 45 deg from the vertical.
+_HIDING_SLOPE = 1.0
 
 
 class CellErrors(NamedTuple):
@@ -61,8 +63,8 @@ class CellErrors(NamedTuple):
         dropout: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which
             is multiplied by factors for the roughness and for the image border.
         lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the next four fields, `edge_error`, `border_width_px`,
-            `error_noise_share` and `sigma_noise_share` are tabulated [m].
+        depths_m: (m,) ascending depths at which the next four fields are tabulated, and also `edge_error`,
+            `border_width_px`, `error_noise_share` and `sigma_noise_share` [m].
         depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
         depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
         cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
@@ -128,9 +130,10 @@ class ObservedCells(NamedTuple):
     Args:
         row, col: grid position of the first (north-west) cell of the window.
         depth_m: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen.
-        border_px: (rows, cols) distance of this point from the nearest border of the two images [px].
+        border_px: (rows, cols) distance of this point from the nearest border of the two images [px]; 0 if it is not
+            seen.
         information: (rows, cols) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left
-            image to that of the whole image.
+            image to that of the whole image; 0 if it is not seen.
         true, estimated: (4, 4) poses of the keyframe.
     """
 
@@ -165,7 +168,8 @@ class MapModel:
         correlated_cells: side of the square over which errors are correlated [cells].
         views: (rows, cols) number of consecutive keyframes whose depths were fused in the latest height of the cell;
             updated by `sample_patch`.
-        step_baselines: (rows, cols) RMS distance between these keyframes, in stereo baselines; 0 for one keyframe.
+        step_baselines: (rows, cols) RMS distance between neighbours in this series of keyframes, in stereo baselines; 0
+            for one keyframe.
         border_px: (rows, cols) largest distance of the cell from the image border over consecutive keyframes, times the
             square root of their number; the maximum over all series of keyframes [px].
         border_distance_px: (rows, cols) largest distance of the cell from the image border over the consecutive
@@ -222,8 +226,8 @@ class MapModel:
 
         Args:
             true: (4, 4) true pose of the keyframe.
-            estimated: (4, 4) estimated pose of the keyframe. With calibration errors, it determines which floor point
-                is mapped to a cell.
+            estimated: (4, 4) estimated pose of the keyframe. With calibration errors or an approximated port, it
+                determines which floor point is mapped to a cell.
         """
         row, end_row, col, end_col = self._window(true)
         shape = max(end_row - row, 0), max(end_col - col, 0)
@@ -356,7 +360,7 @@ def _border_of(camera, x, y, disparity):
 def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
     """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error.
 
-    Used only with calibration errors: pose errors alone are much smaller than a cell.
+    Used only with calibration errors or an approximated port: pose errors alone are much smaller than a cell.
     """
     x, y, z = point
     px, py, _ = _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z)
@@ -392,9 +396,10 @@ def _estimated_position(camera_from_world, camera, view, estimated_from_true, x,
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
     """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast.
 
-    A cell may be hidden if part of the floor rises above the line that starts at the cell with slope `_HIDING_SLOPE`.
-    The floor is searched in square windows whose size doubles, up to the distance at which the range of the heights is
-    too small to reach the line.
+    A cell may be hidden if part of the floor rises above a line that starts at the cell with slope `_HIDING_SLOPE`.
+    Lower floor can hide it only from rays more than 45 deg from the vertical; this is neglected. The floor is
+    searched in square windows whose size doubles, up to the distance at which the range of the heights is too small to
+    reach the line.
     """
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m))
     hidden, radius, relief_m = np.zeros(height.shape, np.bool_), 1, float(np.ptp(height))
@@ -450,12 +455,12 @@ def step_slope(height_m: Map, cell_m: float) -> Map:
 def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     """Returns the strength of the edges (rows, cols) [px^(1/2)], which determines the errors near walls.
 
-    It is the square root of r s, and 0 where the matching window of the cell shows no wall. The slope s of the cell
-    counts because a lateral displacement of the matched edge causes a height error on the face of the wall, and hardly
-    any on the level floor next to the wall. r is the geometric mean of the roughness of the cell and of the largest
-    roughness of the windows that contain the cell: the error is large if the window of the cell shows two surfaces, or
-    if the cell is matched as its neighbours are. The square root is taken because dense matching resolves large
-    structures better.
+    It is the square root of r s, and 0 where the matching window of the cell shows no wall. The slope s of the cell, at
+    least `_LEAST_SLOPE`, counts because a lateral displacement of the matched edge causes a height error on the face of
+    the wall, and hardly any on the level floor next to the wall. r is the geometric mean of the roughness of the cell
+    and of the largest roughness of the windows that contain the cell: the error is large if the window of the cell
+    shows two surfaces, or if the cell is matched as its neighbours are. The square root is taken because dense matching
+    resolves large structures better.
 
     Args:
         roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
@@ -566,7 +571,8 @@ class _Runs(NamedTuple):
 
     Args:
         views: (rows, cols) number of these keyframes.
-        squared_steps: (rows, cols) sum of the squared distances between them, in squared stereo baselines.
+        squared_steps: (rows, cols) sum of the squared distances between neighbours in this series, in squared stereo
+            baselines.
         border_px: (rows, cols) largest distance from the image border over these keyframes [px].
         information: (rows, cols) sum of `ObservedCells.information` over these keyframes.
     """
@@ -585,7 +591,8 @@ def _sample_patch(
     """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m].
 
     Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
-    the lateral error and walls to `systematic`. The mean depth is over the cells that have a height; 0 without any.
+    the lateral error and walls to `systematic`. Updates the arrays of `runs` and `fused`. The mean depth is over the
+    cells that have a height; 0 without any.
     """
     (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px, information) = floor, observed
     next_row, next_col, next_depth_m = following

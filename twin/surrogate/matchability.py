@@ -118,10 +118,7 @@ class Matchability:
 
     @property
     def medium_bound_px(self) -> float:
-        """Returns the Cramér-Rao bound of a patch's position at a medium depth [px of the binned images].
-
-        The medium depth is the geometric mean of the smallest and the largest depth.
-        """
+        """Returns the Cramér-Rao bound of a patch's position at `medium_depth_m` [px of the binned images]."""
         return self.bound_at(self.medium_depth_m)
 
     @property
@@ -131,7 +128,7 @@ class Matchability:
 
     @property
     def medium_depth_m(self) -> float:
-        """Returns the geometric mean of the smallest and the largest depth [m]."""
+        """Returns the geometric mean of the smallest and the largest of `depths_m` [m]."""
         return float(np.sqrt(self.depths_m[0] * self.depths_m[-1]))
 
     def _set_image_scale(self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> None:
@@ -252,15 +249,16 @@ def position_dependence(
     """Returns the dependence of matching on the position in the image, for a level floor.
 
     Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The floor has a
-    random texture whose statistics are the same everywhere, so the details of the true floor do not count. Squared
-    gradients and noise are averaged over each block, and smoothed by a polynomial in the position, because few pixels
-    determine a block of binned images. The result is `NO_DEPENDENCE` if the image shows no texture.
+    random texture whose statistics are the same everywhere, so the details of the true floor do not count. The squares
+    of gradients and noise are averaged over each block, and their logarithms are smoothed by a polynomial in the
+    position, because a block of binned images has few pixels. The result is `NO_DEPENDENCE` if a block shows no texture
+    or no noise.
 
     Args:
         scenario: description of the survey.
         illumination: optical properties of the water, and daylight in the water.
         depth_m: depth of the floor along the optical axis.
-        binning: number of pixels that are averaged along each side of the images.
+        binning: see `precision`.
     """
     scenario = _without_unmodelled_effects(_with_linear_images(scenario))
     rig, rng = scenario.believed_rig(), np.random.default_rng(0)
@@ -447,12 +445,12 @@ def _radiance_of_texture(
 
 
 def _texture_signal(textured: Radiance, untextured: Radiance, gain: float, binning: int) -> NDArray[np.floating]:
-    """Returns the difference (rows, cols) that the texture makes in the grey image of `binning` [grey levels].
+    """Returns the difference (rows, cols) that the texture makes in the binned grey image [grey levels].
 
     Args:
         textured: radiance (H, W, 3) of the floor.
         untextured: radiance (H, W, 3) of a floor of its mean colour.
-        gain: pixel value of a unit of radiance, 1 at saturation.
+        gain: pixel value per unit of radiance; a saturated pixel has the value 1.
         binning: see `precision`.
     """
     lit, smooth = (

@@ -50,15 +50,17 @@ class MeasuredRows:
     def observe(
         self, observation: StereoObservation, points: Array, sigma_px: float
     ) -> tuple[StereoObservation, float]:
-        """Adds the row differences of a stereo pair; returns the observation with their statistics and the noise ratio.
-
-        The noise ratio is defined as in `stereo.row_noise_ratio`, but for any number of points.
+        """Adds the row differences of a stereo pair.
 
         Args:
             observation: stereo observation of the pair, without row differences.
             points: (n, 3) true normalised (x, y, disparity) of points that are matched; they represent
                 `observation.n_points` points.
             sigma_px: standard deviation of a match in one image [px].
+
+        Returns:
+            The observation with the statistics of the row differences, and their noise ratio. The noise ratio is
+            defined as in `stereo.row_noise_ratio`, but for any number of points.
         """
         rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
         of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)

@@ -93,7 +93,7 @@ class MeasuredView(NamedTuple):
         """Returns the (6, 6) matrix that maps the twist of a small true motion to the twist estimated from images.
 
         The motion of the left camera is estimated by least squares from the measured flow and depth of points; see
-        `sampling.unit_motion_cov`. Empty if all points are measured at their true positions.
+        `sampling.unit_motion_cov`. The matrix is empty if all points are measured at their true positions.
 
         Args:
             points: (n, 3) true points, normalised (x, y, disparity).

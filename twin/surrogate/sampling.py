@@ -49,7 +49,8 @@ def sample_link(
         earlier_noise: (rows, cols, 3) standard normal samples of the earlier stereo pair's biases, on a raster over its
             image.
         relief_noise: (f, f, 2) standard normal samples of the errors due to relief; they repeat every f floor cells.
-        normals: (n + 1, 3) standard normal samples of this link alone: n for its points, one for their common bias.
+        normals: (n + 1, 3) standard normal samples of this link alone: n for its points, the last one for their common
+            bias.
         earlier_pose, later_pose: (4, 4) true poses.
         camera: focal length, principal point x and y, image width and height, margin along the border [px]; baseline
             [m]; table of the measured positions of true points (`measured_view.ViewTable`).
@@ -120,7 +121,7 @@ def sample_link(
 
 @njit(cache=True, nogil=True)
 def _robust_weights(normalised_residual, noise_share):
-    """Returns the weights (n,) that single matches would have in `two_view_motion.pair_motion`: Huber, with a cutoff.
+    """Returns approximate weights (n,) of single matches in `two_view_motion.pair_motion`: Huber, 0 beyond a cutoff.
 
     Args:
         normalised_residual: (n,) residuals relative to the covariance of the points.

@@ -1,9 +1,9 @@
 """Effect of marine snow on matching, from images of a level floor with and without snow.
 
-Let g be the gradient of a patch along the rows, and n the change of its grey levels by flakes. Least-squares matching
-shifts the patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its weight,
-1 / variance, is smaller. A patch that flakes change too much is not matched: the correlation between its two images is
-too low. The image of a flake, its defocus and the light on it are those of `imaging.snow`.
+Let g be the gradient of a patch along the rows, and n the change of its grey levels by particles. Least-squares
+matching shifts the patch by sum(g n) / sum(g^2), summed over its pixels. The match has a larger residual, so its
+weight, 1 / variance, is smaller. A patch that particles change too much is not matched: the correlation between its two
+images is too low. The image of a particle, its defocus and the light on it are those of `imaging.snow`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from twin.imaging.snow import BOX_M
 Gray = NDArray[np.float32]
 
 _MIN_CORRELATION = 0.7  # of a match, as in `estimate.vision.patches`
-_VIEWS = 3  # number of views with different flakes
+_VIEWS = 3  # number of views with different particles
 
 
 class SnowEffect(NamedTuple):
@@ -38,7 +38,7 @@ class SnowEffect(NamedTuple):
 
 
 def snow_poses(pose: StampedPose) -> list[StampedPose]:
-    """Returns poses of the camera that show different flakes, shifted by fractions of the periodic snow box."""
+    """Returns poses of the camera that show different particles, shifted by fractions of the periodic snow box."""
     poses = []
     for k in range(_VIEWS):
         shifted = pose.world_from_left.copy()
@@ -48,7 +48,9 @@ def snow_poses(pose: StampedPose) -> list[StampedPose]:
 
 
 def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patch_px: int) -> SnowEffect:
-    """Returns the effect of snow on matches between images with different flakes.
+    """Returns the effect of snow on matches between images with different particles.
+
+    If no patch is matched, the variance is infinite.
 
     Args:
         clean: noise-free images of the same floor without snow, one for each view [grey levels].

@@ -127,7 +127,7 @@ class SurrogateVision:
     """Implementation of `Vision` that samples measurements from an error model.
 
     Args:
-        rig: calibration that the estimators use, for the images that they match, which may be binned.
+        rig: calibration that the estimators use, at the scale of the images that they match, which may be binned.
         settings: settings of the estimators.
         model: error model of the measurements.
         scene: true scene.
@@ -136,7 +136,8 @@ class SurrogateVision:
 
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
-        last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 after `restart_tracking`.
+        last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 if there was none since tracking
+            was restarted.
         n_corners: number of points of a keyframe that the estimators try to match, see `corner_count`.
     """
 
@@ -324,7 +325,7 @@ class SurrogateVision:
         return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the raster points (mask (n,)) that lie inside both images and satisfy the epipolar constraint.
+        """Returns the mask (n,) of the points whose patches lie inside both images and satisfy the epipolar constraint.
 
         Args:
             indices: (n,) indices of the points in the raster.
@@ -416,7 +417,7 @@ class SurrogateVision:
     def _sample_link(
         self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes; None if too few points, or too small a fraction, would be matched.
+        """Samples the motion between two keyframes; None if the number or the fraction of matched points is too small.
 
         The motion is estimated from noisy points by least squares, starting at the true motion: in one iteration, or in
         several if `TrueScene.view` is not ideal. The random numbers that belong to the link alone depend only on the
@@ -466,13 +467,13 @@ class SurrogateVision:
         return 1 + relief_px**2 / (2 * match_sigma_px(model, bound_px, stereo_px) ** 2)
 
     def _match_fraction(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
-        """Returns the fraction of a keyframe's points in the field of view of an earlier one that are matched there."""
+        """Returns the fraction of the later keyframe's points in view of the earlier one that are matched there."""
         parallax = _parallax_px(later, earlier.pose, self.rig.baseline_m) / model.match_parallax_px
         clear_share = min(later.clear_share, earlier.clear_share)
         return clear_share * model.match_fraction(max(later.bound_px, earlier.bound_px)) / (1 + parallax**2)
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
-        """Returns the standard normal numbers (n, 3) of a link, which depend only on its two keyframe numbers."""
+        """Returns standard normal numbers (n, 3) of a link; in a survey, they depend only on its keyframe numbers."""
         state = self._link_rng_state | {"state": {"key": [self._link_key, 0], "counter": [0, 0, number, other]}}
         with self._link_lock:  # links may be measured in several threads at once
             self._link_rng.bit_generator.state = state
@@ -532,9 +533,9 @@ class SurrogateVision:
         )  # fmt: skip
 
     def _bound_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
-        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and factors (q,) on depth errors.
+        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and two arrays of factors (q,).
 
-        The two factors are those on the true and on the reported standard deviation of depth.
+        The factors are those on the true and on the reported standard deviation of depth at these ratios.
         """
         scene = self.scene.matchability
         medium_px = scene.medium_bound_px * scene.texture.median_ratio

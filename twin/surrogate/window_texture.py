@@ -3,9 +3,9 @@
 The Cramér-Rao bound of an image contains the RMS gradient of the whole image (`matchability`). Dense matching fits a
 plane of disparities in a small Gaussian window, so the bound of a pixel contains the RMS gradient g in that window:
 it is the bound of the image times G / g, with the RMS gradient G of the image. Over even texture, such as sand, g is
-nearly the same in all windows. Over reefs, dark patches without texture and bright edges differ by several times.
-Gradients also vary with the light over the image; that part is removed here, because it belongs to the position in the
-image (`matchability.PositionDependence`).
+nearly the same in all windows. Over reefs, g is several times larger at bright edges than in dark areas without
+texture. Gradients also vary with the light over the image; that part is removed here, because it belongs to the
+position in the image (`matchability.PositionDependence`).
 """
 
 from __future__ import annotations
@@ -39,7 +39,9 @@ EVEN_TEXTURE = WindowTexture(1.0, 0.0)
 
 
 def window_texture(signal: NDArray[np.floating], relative_gradients: Array = _EVEN) -> WindowTexture:
-    """Returns the distribution of the bound over the windows of an image; `EVEN_TEXTURE` for an image without texture.
+    """Returns the distribution of the bound over the windows of an image.
+
+    It is `EVEN_TEXTURE` for an image that has no texture or is smaller than a window.
 
     Args:
         signal: (rows, cols) grey levels of the part of the image that the texture causes, without noise.

@@ -199,7 +199,7 @@ class ComparisonVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        """Returns the map from images, and adds statistics of it and of sampled maps along the same path.
+        """Returns the map from images, and adds statistics of its comparison with sampled maps along the same path.
 
         There are five sampled maps: one with pose errors alone; three with pose errors and one other kind of error of
         known size (depth errors of `UNIT_PX`, lateral errors of 1 px, or errors near walls with the gain 1); and one
@@ -242,15 +242,15 @@ class ComparisonVision:
         deviation proportional to it (a scale mixture). Two robust numbers describe this: the median of the reported
         variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The median error is
         subtracted first. The variance of errors is that of a cell with the median sigma. Near walls, where gross errors
-        are the subject, it follows from the 90th percentile of the absolute errors, which a few outliers do not change.
+        are modelled, it follows from the 90th percentile of the absolute errors, which a few outliers do not change.
 
         The third statistic is the ratio of the 90th percentile of absolute errors to the median, in the map from images
         and in the map sampled with all errors. It exceeds that of normal errors if their standard deviation varies over
         the cells.
 
-        The fourth statistic is the scatter of the logarithm of sigma in the map from images / sigma in a sampled map
-        whose depth has the same precision in all cells. The upper half of the distribution determines the largest
-        errors, so the scatter is computed from the median and the 90th percentile.
+        The fourth statistic is the scatter of ln(sigma in the map from images / sigma in the sampled map "depth"). The
+        depths of this sampled map have the same precision in all cells. The upper half of the distribution determines
+        the largest errors, so the scatter is computed from the median and the 90th percentile.
 
         Args:
             name: name of the class.
@@ -288,9 +288,10 @@ class ComparisonVision:
     def _compare_borders(self, maps: dict[str, ElevationMap]) -> None:
         """Adds the ratios of errors and of reported standard deviations near image borders, images / sampled map.
 
-        The cells are those of little roughness with no wall within a matching window, divided by their distance from
-        the image border. `border_error_ratio` is the ratio of the medians of the absolute errors, `border_sigma_ratio`
-        that of the medians of the reported standard deviations, `border_distance_px` the median distance of the cells.
+        The cells are those with a roughness below 0.08 px and no wall within a matching window, divided into classes by
+        their distance from the image border. `border_error_ratio` is the ratio of the medians of the absolute errors,
+        `border_sigma_ratio` that of the medians of the reported standard deviations, and `border_distance_px` the
+        median distance of the cells.
         """
         map_model = self.surrogate.scene.map_model
         images, sampled = maps["images"], maps["all"]
@@ -312,11 +313,11 @@ class ComparisonVision:
             self.statistics["border_distance_px"].append(float(np.median(map_model.border_distance_px[cells])))
 
     def _cell_classes(self) -> dict[str, np.ndarray]:
-        """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared.
+        """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared, by name.
 
         Level cells are divided by roughness and by the number of consecutive keyframes that observed them, cells near
-        walls by `edge_strength`. Steep smooth cells are one class. Cells near the image border belong to no class, nor
-        do other cells within a matching window of a wall or of rough cells.
+        walls by `edge_strength`. Steep smooth cells are one class. Cells near the image border belong to no class, and
+        level or steep cells belong to none if a wall or a rough cell lies within a matching window of them.
         """
         map_model = self.surrogate.scene.map_model
         rough = self._in_px(map_model.roughness_m)
@@ -333,15 +334,15 @@ class ComparisonVision:
         return classes
 
     def _in_px(self, height_m: np.ndarray) -> np.ndarray:
-        """Returns heights [m] as differences of disparity at the typical depth of the floor [px]."""
+        """Returns heights [m] converted to differences of disparity at the typical depth of the floor [px]."""
         rig, map_model = self.surrogate.rig, self.surrogate.scene.map_model
         return height_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
 
     def _count_holes(self, elevation: ElevationMap) -> None:
-        """Adds the number of observed cells and the fraction with a height, by roughness and by distance from borders.
+        """Adds the number of observed cells and the fraction of them with a height, by roughness and border distance.
 
-        The median roughness or distance of each bin is added too. The numbers by distance from the border of the images
-        (`MapModel.border_px`) count smooth cells only; those by roughness count cells far from the border only.
+        The median roughness or distance of each bin is added too. The bins of the distance from the image border
+        (`MapModel.border_px`) contain smooth cells only; those of the roughness contain cells far from the border only.
         """
         map_model = self.surrogate.scene.map_model
         roughness = self._in_px(map_model.roughness_m)
@@ -361,8 +362,9 @@ class ComparisonVision:
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
     """Returns two error models for links: "patches" without errors due to relief, "relief" with these errors alone.
 
-    In "patches", the match error ratio is 1, without growth under lamps, and the bias fraction is `BIAS_FRACTION`; in
-    "relief", the relief gain is `RELIEF_GAIN`. The parameters that are not changed are those of `model`.
+    In "patches", the relief gain is 0, the match error ratio is 1, without growth under lamps, and the bias fraction is
+    `BIAS_FRACTION`. In "relief", the relief gain is `RELIEF_GAIN`, and the match error ratio and the common bias are 0.
+    The other parameters are those of `model`.
     """
     return {
         "patches": model._replace(
@@ -378,5 +380,5 @@ def _chi2(error: Array, cov: Array) -> float:
 
 
 def _sigma_ratio(cov: Array, other: Array) -> float:
-    """Returns the ratio of the standard deviations of two covariances (n, n), the geometric mean over n directions."""
+    """Returns the ratio of the standard deviations of two covariances (n, n), as geometric mean over n directions."""
     return float(np.exp((np.linalg.slogdet(cov)[1] - np.linalg.slogdet(other)[1]) / (2 * len(cov))))

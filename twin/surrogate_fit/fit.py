@@ -3,8 +3,8 @@
 The laws of the reported standard deviations of matching, F2F and F2M (`SigmaLaw`) are fitted to the ratios of the
 standard deviations reported for image measurements to those reported by the surrogate. The error ratios are fitted to
 squared errors normalised by reported covariances. Medians and trimmed means make the fit robust against a few failed
-measurements. Every survey has the same weight, except in the fits of `match_bias_fraction`, `border_error`,
-`edge_half_px` and the laws of depth.
+measurements. Every survey has the same weight, except in the fits of `match_bias_fraction`, `border_error` and
+`edge_half_px`.
 """
 
 from __future__ import annotations
@@ -150,7 +150,10 @@ def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
-    """Fits a `SigmaLaw` to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px]; residuals are log ratios."""
+    """Returns the `SigmaLaw` fitted to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px].
+
+    Residuals are differences of logarithms.
+    """
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
@@ -160,7 +163,9 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
 
 
 def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarray) -> tuple[SigmaLaw, float]:
-    """Fits `match_sigma_px` and `stereo_relief_gain` of the error model; residuals are log ratios.
+    """Returns `match_sigma_px` and `stereo_relief_gain` of the error model, fitted to reported standard deviations.
+
+    Residuals are differences of logarithms.
 
     Args:
         bounds: (n,) Cramér-Rao bounds [px].
@@ -177,7 +182,7 @@ def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarra
 
 
 def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float = 1.0) -> FractionLaw:
-    """Fits a `FractionLaw` with exponent 4 to fractions (n,) at Cramér-Rao bounds (n,) [px].
+    """Returns the `FractionLaw` with exponent 4 fitted to fractions (n,) at Cramér-Rao bounds (n,) [px].
 
     Residuals much larger than `outlier` have less weight.
     """
@@ -192,7 +197,7 @@ def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float 
 
 
 def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
-    """Fits the anticorrelation u of consecutive frame-to-frame motions to the error accumulated over n frames.
+    """Returns the anticorrelation u of consecutive frame-to-frame motions, fitted to the summed error of n motions.
 
     If each motion cancels the fraction u of the independent error of the previous motion, the variance of the sum of n
     motions is (1 + (n - 1) (1 - u)^2) / (n (1 + u^2)) times that of n uncorrelated motions of equal variance.
@@ -215,18 +220,18 @@ class _LinkErrors(NamedTuple):
 def _fit_link_errors(
     surveys: Sequence[SurveyStatistics], match_ratios: np.ndarray, lamp_share: np.ndarray, compared: ErrorModel
 ) -> _LinkErrors:
-    """Separates link errors into contributions of patch matching, of relief and of a bias of each keyframe.
+    """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe.
 
     Errors due to relief grow with the unevenness of the floor and with the distance between the keyframes. The links of
     each survey are therefore sorted by distance and divided into thirds. Match error ratio, relief gain and the growth
     of both under lamps are fitted to the mean squared errors of all thirds of all surveys. Residuals are differences of
-    logarithms; large ones have less weight. Over smooth floors the errors do not determine the relief gain, so the gain
-    of the compared model, but at least `RELIEF_GAIN`, is a weak prior.
+    logarithms; large ones have less weight. Over smooth floors the errors do not determine the relief gain. The gain of
+    the compared model, or `RELIEF_GAIN` if that is larger, is therefore a weak prior.
 
-    A keyframe's bias makes the errors of two consecutive links cancel partly, because the keyframe ends the first link
-    and starts the second. Relief adds equal errors to both. The bias fraction is fitted to the scalar products of the
-    errors of consecutive links. Loops of three keyframes do not determine the bias, because links from the same
-    keyframe have correlated errors.
+    Due to the bias of a keyframe, the errors of two consecutive links cancel partly, because the keyframe ends the
+    first link and starts the second. Relief causes equal errors in both. The bias fraction is fitted to the scalar
+    products of the errors of consecutive links. Loops of three keyframes do not determine the bias, because links from
+    the same keyframe have correlated errors.
 
     Args:
         surveys: statistics of n surveys.
@@ -258,7 +263,7 @@ def _fit_link_errors(
 def _fit_lamp_growth(ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
     """Fits c and k of the law c sqrt(1 + (k lamp_share)^2) to ratios of standard deviations.
 
-    Residuals are log ratios; large ones have less weight.
+    Residuals are differences of logarithms; large ones have less weight.
 
     Args:
         ratios: (n,) ratios, one per survey.
@@ -296,8 +301,8 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
     1 + (growth * distance)^2 / 2. The distance is that of `SurrogateVision.distance_in_depths`.
 
     Returns:
-        Growth; and the ratio (n,) of the standard deviation reported for a survey's links from images to the one that
-        the surrogate reports, extrapolated to distance zero.
+        The growth; and, for each of n surveys, the ratio of the standard deviation of links reported for image
+        measurements to the one that the surrogate reports, extrapolated to distance zero.
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [
@@ -329,7 +334,7 @@ def _matched_without_relief(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
 
 
 def _known_smooth_fraction(statistics: SurveyStatistics) -> float | None:
-    """Returns the fraction of the smooth cells away from image borders with a height; None without such cells."""
+    """Returns the fraction of smooth cells, far from the image borders, that have a height; None without such cells."""
     if not len(statistics.get("hole_px", ())) or statistics["hole_px"][0] >= ROUGH_PX:
         return None
     return max(statistics["hole_known"][0], 1e-6)
@@ -347,7 +352,7 @@ def _fit_completeness(surveys: Sequence[SurveyStatistics], compared: FractionLaw
 def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> float:
     """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey.
 
-    Surveys without smooth cells do not take part. Returns the value of the compared model if no other survey has rough
+    Surveys without smooth cells are left out. Returns the value of the compared model if none of the others has rough
     cells.
     """
     roughness, fractions, weights = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
@@ -422,7 +427,7 @@ def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) 
 
 
 class _Limits(NamedTuple):
-    """Limits, typical values and start values (n,) of the parameters of a fit."""
+    """Limits, typical values and start values of the n parameters of a fit."""
 
     lowest: tuple[float, ...]
     highest: tuple[float, ...]
@@ -431,7 +436,7 @@ class _Limits(NamedTuple):
 
 
 class _MapErrors(NamedTuple):
-    """Parameters of the errors of a map, or of its reported variances.
+    """Parameters of the errors of maps, or of their reported variances.
 
     Args:
         depth: law of the standard deviation of depth.
@@ -471,15 +476,15 @@ class _MapClasses(NamedTuple):
         pose: (m,) variance due to pose errors alone.
         depth: (m,) variance that an error of depth of 1 px adds.
         lateral: (m,) variance that a lateral shift of 1 px adds.
-        edge: (m,) variance that errors near walls of unit gain add.
-        views, step_baselines: (m,) number of keyframes, and distance between them [stereo baselines].
+        edge: (m,) variance that errors near walls add if their gain is 1.
+        views, step_baselines: (m,) mean number of keyframes, and distance between them [stereo baselines].
         roughness_px: (m,) roughness of the cells [px of disparity].
         bound_px, window_px: (m,) Cramér-Rao bound of the image, and of the median window [px].
         lamp_share: (m,) fraction of the reflected light that comes from the lamps.
         metres_per_px: (m,) height per pixel of disparity.
         binning: (m,) binning of the images.
         survey: (m,) number of the survey.
-        weight: (m,) weight with which every survey has the same weight.
+        weight: (m,) weights of the residuals, with which every survey has the same total weight.
     """
 
     images: np.ndarray
@@ -510,7 +515,7 @@ class _MapClasses(NamedTuple):
 
 
 def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClasses:
-    """Returns the classes of cells of all surveys; see `comparison.MAP_STATISTICS`.
+    """Returns the classes of cells of all surveys, with the quantities of `comparison.MAP_STATISTICS`.
 
     Args:
         surveys: statistics of n surveys.
@@ -534,22 +539,24 @@ def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClas
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
     """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
 
-    The model variance of a class is that of the map with pose errors alone, plus a term each for depth (`DepthLaw`),
-    lateral shift, relief within the matching window, and walls. A term is the variance that a unit error adds to a
-    sampled map, times a fitted factor. The relief error is common to all views of a cell, so the fusion of several
-    tracks does not reduce it, and its variance follows from the height per pixel of disparity. The reported variances
-    of the map with pose errors alone already contain the effects of a lateral shift and of relief.
+    The model variance of a class is that of the map with pose errors alone, plus one term for each of depth
+    (`DepthLaw`), lateral shift, relief within the matching window, and walls. The terms for depth, lateral shift and
+    walls are the variance that a unit error adds to a sampled map, times a fitted factor. The relief error is common to
+    all views of a cell, so the fusion of several tracks does not reduce it, and its variance follows from the height
+    per pixel of disparity. The reported variances of the map with pose errors alone already contain the effects of a
+    lateral shift and of relief.
 
-    Variances do not add up: the map computes part of its variance from the heights around a cell, whose errors
-    count as relief. The model variance is therefore multiplied by the ratio of the variance in the map sampled from
-    the compared model to the model variance with the compared parameters. Repeated fits converge, each with the
-    result of the former as compared model. Residuals are differences of logarithms. All parameters but those of
-    `_MapErrors.binned` are fitted to the surveys without binning, and the latter then to those with binned images.
+    The sum is not exact, because the map computes part of its variance from the heights around a cell, and errors of
+    these heights have the effect of relief. The model variance is therefore multiplied by the ratio of the variance in
+    the map sampled from the compared model to the model variance with the compared parameters. Repeated fits converge
+    if each uses the result of the previous fit as the compared model. Residuals are differences of logarithms. The
+    parameters of `_MapErrors.binned` are fitted to the surveys with binned images, after all others have been fitted to
+    the surveys without binning.
 
     Args:
         surveys: statistics of n surveys.
         quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-        compared: error model whose values are the start of the fit, and a weak prior of the fitted parameters.
+        compared: compared error model; its values are the start of the fit and a weak prior of the parameters.
     """
     is_error = quantity == "error"
     edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
@@ -605,11 +612,11 @@ def _robust_scatter(departures: np.ndarray) -> float:
 
 
 def _fit_texture_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw) -> ScatterLaw:
-    """Fits the `ScatterLaw` of the depth over the cells of a map; the law is the compared one if no map has cells.
+    """Fits the `ScatterLaw` of the reported standard deviation of depth over the cells of a map.
 
-    The scatter of a survey is the median over its classes of level cells. Residuals much larger than
-    `_OUTLIER` have less weight. Surveys with binned images take part: their bounds and textures are those of the binned
-    images.
+    The scatter of a survey is the median over its classes of level cells. Returns the compared law if no survey has
+    such a class. Residuals much larger than `_OUTLIER` have less weight. Surveys with binned images are included: their
+    bounds and textures are those of the binned images.
 
     Args:
         surveys: statistics of n surveys.
@@ -636,8 +643,9 @@ def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> 
     """Fits `error_scatter_share` to the tails of the height errors of level cells.
 
     If the logarithm of the standard deviation of normal errors varies with the standard deviation s, the logarithm of
-    the ratio of their 90th percentile to their median grows in proportion to s^2. The tail of a survey is the median
-    over its classes. The result is the compared value if no sampled map has tails.
+    the ratio of the 90th percentile of their absolute values to the median grows in proportion to s^2 for small s. The
+    tail of a survey is the median of this logarithm over its classes, minus that of normal errors. Returns the compared
+    value if no sampled map has heavier tails than normal errors.
 
     Args:
         surveys: statistics of n surveys.

@@ -65,10 +65,10 @@ def comparison_model(model: ErrorModel) -> ErrorModel:
 
 
 def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveyStatistics]) -> dict[str, Range]:
-    """Returns the smallest and the largest value of each condition, by name of `QUANTITIES`.
+    """Returns the smallest and the largest value of each condition in the complete surveys, by name of `QUANTITIES`.
 
-    If the survey with the largest Cramér-Rao bound was lost, the bound has no upper limit: all surveys with larger
-    bounds are lost as well.
+    If a lost survey has a larger Cramér-Rao bound than these, the bound has no upper limit, because surveys with even
+    larger bounds would be lost as well. Conditions without a value are left out.
 
     Args:
         complete: surveys to which the model is fitted.
@@ -83,16 +83,20 @@ def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveySta
 
 
 def _is_complete(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey has links and a map, is not lost, and has the binning of the surrogate.
+    """Returns whether a survey has links and a map, is not lost, and has the same binning as the surrogate.
 
-    A map of rough ground may have no level cells, and thus no statistics of height errors.
+    The fraction of cells with a height shows that there is a map: statistics of height errors may be missing, because a
+    map of rough ground may have no level cells.
     """
     has_both = "consecutive_product_images" in statistics and "hole_known" in statistics
     return has_both and _binned_alike(statistics) and not _is_lost(statistics)
 
 
 def _is_lost(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey lost too many frames or links; its remaining links are mostly gross errors."""
+    """Returns whether a survey lost more than 20 % of its frames or of its links.
+
+    The remaining links of such a survey mostly have gross errors.
+    """
     return any(float(np.mean(statistics.get(name, 0.0))) > _MAX_LOST for name in ("frame_lost", "link_failed_images"))
 
 
@@ -105,7 +109,7 @@ def _binned_alike(statistics: SurveyStatistics) -> bool:
 def all_statistics(
     surveys: Sequence[tuple[Scenario, Path]], compared: ErrorModel, jobs: int = 1
 ) -> Iterator[SurveyStatistics]:
-    """Yields the statistics of rendered surveys in their order, flown in `jobs` processes; see `survey_statistics`.
+    """Yields the statistics of rendered surveys, in the order of the surveys; see `survey_statistics`.
 
     Args:
         surveys: description and run folder of each survey.
@@ -131,6 +135,9 @@ def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) ->
         scenario: description of the survey.
         folder: run folder of the survey.
         compared: error model of the surrogate to compare with.
+
+    Raises:
+        ScenarioError: the survey cannot be flown.
     """
     return _load(scenario, folder, compared) or _fly(scenario, folder, compared)
 

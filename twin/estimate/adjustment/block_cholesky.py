@@ -10,8 +10,8 @@ Blocks of the inverse are computed from the last panel to the first (Takahashi e
 cov(own) = (L1 L1')^-1 + W' cov(below) W. The later panels already hold blocks of the inverse, among them
 cov(below), in place of the factor.
 
-In the kernels, s is the `SymbolicFactor`, `panels` the array of `CholeskyFactor`, p a panel and `_D` the size of a
-block.
+In the kernels, s is the `SymbolicFactor`, `panels` the array of the same name in `CholeskyFactor` and `BlockMatrix`, p
+the number of a panel, and `_D` the number of rows of a block.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class CholeskyFactor(NamedTuple):
     panels: Array
 
     def solve(self, right: Array) -> Array:
-        """Returns the solution (n, 6) of the linear system with a right-hand side (n, 6)."""
+        """Returns the solution (n, 6) of the linear system of the factorised matrix with a right-hand side (n, 6)."""
         s = self.symbolic
         x = np.empty_like(right)
         x[s.permutation] = right
@@ -105,10 +105,13 @@ class BlockMatrix(NamedTuple):
         _add(self.symbolic, first, blocks, self.panels)
 
     def factorise(self, diagonal: Array) -> CholeskyFactor:
-        """Returns the Cholesky factor. Overwrites the matrix, which has to be cleared and filled before the next use.
+        """Returns the Cholesky factor, which overwrites the matrix.
+
+        Matrix and factor share the array `panels`. The matrix has to be cleared and filled before it is used again,
+        and the factor is then lost.
 
         Args:
-            diagonal: (n, 6, 6) diagonal blocks.
+            diagonal: (n, 6, 6) diagonal blocks, which replace those of the matrix.
 
         Raises:
             LinAlgError: the matrix is not numerically positive definite.
@@ -132,7 +135,7 @@ def _set_diagonal(s, diagonal, panels):
 
 @njit(cache=True, nogil=True)
 def _add(s, start, blocks, panels):
-    """Adds `blocks` (k, 6, 6) element by element to the k off-diagonal blocks that start at index `start`."""
+    """Compiled kernel of `BlockMatrix.add`: adds `blocks` (k, 6, 6) to the off-diagonal blocks from index `start`."""
     for k in range(len(blocks)):
         row, column = s.off_diagonal[start + k]
         p = s.panel_of[column]
@@ -147,7 +150,7 @@ def _add(s, start, blocks, panels):
 
 @njit(cache=True, nogil=True)
 def _panel_matrix(s, panels, p):
-    """Returns a panel as a matrix (a view)."""
+    """Returns the panel p as a matrix, a view of `panels`."""
     return panels[s.offset[p] : s.offset[p + 1]].reshape(-1, _D * (s.panel_start[p + 1] - s.panel_start[p]))
 
 
@@ -155,7 +158,7 @@ def _panel_matrix(s, panels, p):
 def _factorise(s, original, panels):
     """Factorises the matrix in the panels: each then holds L1^-1 above L2 (see the module).
 
-    Returns False if the matrix is not numerically positive definite.
+    Returns whether the matrix is numerically positive definite; if it is not, the factorisation is incomplete.
 
     Args:
         s, panels: see the module.
@@ -183,10 +186,10 @@ def _factorise(s, original, panels):
 def _invert_root(matrix, original, inverse):
     """Computes the inverse of the lower Cholesky factor of a dense matrix, row by row.
 
-    Returns False if the matrix is not numerically positive definite.
+    Returns whether the matrix is numerically positive definite; if it is not, `inverse` is incomplete.
 
     Args:
-        matrix: (n, n), only the lower triangle is read.
+        matrix: (n, n) symmetric matrix, of which only the lower triangle is read.
         original: (n,) diagonal before elimination; a pivot that is tiny relative to its diagonal entry counts as zero.
         inverse: (n, n) zeros, filled with the lower triangular inverse.
     """
@@ -214,17 +217,17 @@ def _invert_root(matrix, original, inverse):
 
 @njit(cache=True, nogil=True)
 def _next_ancestor(s, positions, start):
-    """Finds the panel that holds positions[start], and where all remaining positions are stored in that panel.
+    """Finds the panel that holds positions[start], and the block rows of positions[start:] in this panel.
 
     Args:
         s: see the module.
-        positions: (m,) positions below a panel, ascending.
-        start: index of the first remaining position.
+        positions: (m,) positions of the rows below an earlier panel, ascending.
+        start: index of the first position to process.
 
     Returns:
-        end: positions[start:end] are the panel's own positions; later ones are below the panel.
-        panel: number of that panel.
-        at: (m - start,) block row of each remaining position in that panel.
+        end: positions[start:end] are the found panel's own positions; positions[end:] are below it.
+        p: number of the found panel.
+        at: (m - start,) block row in the found panel of each of positions[start:].
     """
     p, end = s.panel_of[positions[start]], start
     while end < len(positions) and positions[end] < s.panel_start[p + 1]:
@@ -245,7 +248,7 @@ def _subtract(product, at, panel):
     """Subtracts the lower block triangle of `product` from a panel.
 
     Args:
-        product: (6 m, 6 w), m x w blocks.
+        product: (6 m, 6 w) matrix of m x w blocks.
         at: (m,) block rows in the panel; the first w are also the block columns.
         panel: matrix of the panel, changed in place.
     """
@@ -270,7 +273,7 @@ def _gather(panel, at, width):
 
 @njit(cache=True, nogil=True)
 def _invert(s, panels, diagonal):
-    """Replaces the factor by the blocks of the inverse with the same sparsity pattern.
+    """Replaces the factor by the blocks of the inverse that lie within its sparsity pattern.
 
     Args:
         s, panels: see the module.

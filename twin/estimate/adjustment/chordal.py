@@ -32,7 +32,7 @@ _ANCHOR_SIGMA = 1e-6  # prior standard deviation of the first pose [rad, m]
 
 
 class PoseGraphSolution(NamedTuple):
-    """Optimal poses (4, 4) by node number, and their cost F as defined in `pose_graph`."""
+    """Poses (4, 4) by node number at a local minimum of the cost F (see `pose_graph`), and the value of F there."""
 
     poses: dict[int, Array]
     cost: float
@@ -41,7 +41,9 @@ class PoseGraphSolution(NamedTuple):
 def solve_pose_graph(
     links: Sequence[Link], start: dict[int, Array] | None = None, huber: float | None = None
 ) -> PoseGraphSolution:
-    """Returns the optimal poses of a pose graph; the node with the lowest number is fixed at its initial pose.
+    """Returns the poses that minimise the cost of a pose graph; the node with the lowest number keeps its initial pose.
+
+    The minimum is the local one that `pose_graph.optimise` reaches from the initial poses.
 
     Args:
         links: measured motions; they have to connect all nodes.
@@ -66,8 +68,9 @@ def solve_pose_graph(
 def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
     """Returns initial poses (4, 4) by node number, computed from the links alone.
 
-    The pose of the node with the lowest number is the identity. The weight of a link is the inverse of its mean
-    rotation variance when solving for the rotations, and of its mean translation variance for the positions.
+    The pose of the node with the lowest number is the identity. In the equations of the rotations, a link is weighted
+    by the inverse of the mean of its three rotation variances; in those of the positions, by the inverse of the mean of
+    its three translation variances.
 
     Raises:
         RuntimeError: the links do not connect all nodes.
@@ -92,7 +95,7 @@ def chordal_start(links: Sequence[Link]) -> dict[int, Array]:
 
 
 def _least_squares(i: Indices, j: Indices, by_i: Array, right: Array, first: Array, weights: Array) -> Array:
-    """Returns the weighted least-squares solution x (n, d, 3) of x_j = by_i x_i + right with x_0 = first.
+    """Returns the weighted least-squares solution x (n, d, 3) of the equations x_j = by_i x_i + right, x_0 = first.
 
     Args:
         i, j: (m,) indices of the unknowns of each equation.

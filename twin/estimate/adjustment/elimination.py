@@ -23,19 +23,22 @@ _MAX_EXTRA_BLOCKS = 8  # explicit zero blocks that merging a node into a panel m
 
 
 class SymbolicFactor(NamedTuple):
-    """Sparsity pattern and memory layout of a Cholesky factor. Positions count nodes in elimination order.
+    """Sparsity pattern and memory layout of a Cholesky factor.
+
+    The position of a node is its index in the elimination order, from 0.
 
     Args:
         permutation: (n,) position of each node.
         panel_start: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1.
-        row_start, rows: (s + 1,), (r,) the positions below panel p are rows[row_start[p] : row_start[p + 1]],
-            ascending.
-        offset: (s + 1,) start of each panel in one long array, and the length of this array; a panel is a row-major
-            matrix whose block rows are the panel's own positions and those below it, and whose block columns are its
-            own positions.
-        panel_of: (n,) panel of each position.
+        row_start, rows: (s + 1,), (r,) the positions of the nonzero block rows below panel p are
+            rows[row_start[p] : row_start[p + 1]], ascending.
+        offset: (s + 1,) index of the first element of each panel in one long array, and the length of this array. A
+            panel is a row-major matrix; its block rows are the panel's own positions and those below it, its block
+            columns are its own positions.
+        panel_of: (n,) number of the panel that holds each position.
         off_diagonal: (m, 2) row and column position of each off-diagonal block, row > column.
-        transposed: (m,) true where block (i, j) has to be transposed because node i is eliminated before node j.
+        transposed: (m,) true where the off-diagonal block (i, j) given to `analyse` has to be transposed, because node
+            i is eliminated before node j.
     """
 
     permutation: Indices
@@ -65,8 +68,8 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
     """Returns the symbolic factor of a matrix of n x n blocks.
 
     Args:
-        n: number of nodes, the block rows of the matrix.
-        i, j: (m,) nodes of the off-diagonal blocks (i, j); a pair may occur more than once.
+        n: number of nodes; each is one block row and one block column of the matrix.
+        i, j: (m,) nodes of the off-diagonal blocks (i, j), i not equal to j; a pair may occur more than once.
     """
     permutation = _minimum_degree(n, i, j)
     panels = _supernodes(n, np.minimum(permutation[i], permutation[j]), np.maximum(permutation[i], permutation[j]))
@@ -101,11 +104,11 @@ def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:
 
 
 def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], Indices]]:
-    """Returns the nodes of each supernode and the nodes below it.
+    """Returns, for each supernode in elimination order, its nodes and the nodes of the nonzero rows below it.
 
     Args:
         n: number of nodes.
-        early, late: (m,) nodes of each off-diagonal block, numbered in elimination order, early < late.
+        early, late: (m,) the two nodes of each off-diagonal block, numbered in elimination order, early < late.
     """
     order = np.argsort(early, kind="stable")
     start, below = _fill_in(n, np.searchsorted(early[order], np.arange(n + 1)), late[order])
@@ -129,11 +132,11 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
 def _fill_in(n, start, later):
     """Returns the nonzero rows below the diagonal of each column of the factor (Davis 2006, chapter 4).
 
-    The rows of column k are below[at[k] : at[k + 1]], ascending. They are the later neighbours of node k in the matrix,
-    later[start[k] : start[k + 1]], and the rows of the children of k in the elimination tree except k (the fill-in).
+    They are the later neighbours of node k in the matrix, later[start[k] : start[k + 1]], and the rows of the columns
+    of its children in the elimination tree, except k itself (the fill-in).
 
     Returns:
-        The arrays `at` (n + 1,) and `below`.
+        The arrays `at` (n + 1,) and `below`: the rows of column k are below[at[k] : at[k + 1]], ascending.
     """
     at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
     last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists

@@ -1,9 +1,10 @@
 """Factor graph of poses and its maximum-likelihood solution, the core of the global alignment.
 
 The cost F of the poses X is the sum of rho(r) over the binary factors and of r^2 / 2 over the unary factors, where r is
-the norm of a factor's residual, whitened by its covariance. The residual of a measured motion Z_ij is
+the norm of a factor's residual, whitened by the covariance of that residual. The residual of a measured motion Z_ij is
 log(Z_ij^-1 X_i^-1 X_j). rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt
-damping after a step that increased the cost. The increment d of a pose is a motion in the camera's own axes, X exp(d).
+damping after a step that increased the cost. The increment d of a pose X is a motion in the camera's own axes: X exp(d)
+replaces X.
 
 One scalar parameter may be shared by binary factors (the scale error of the DVL); F then includes its zero-mean
 Gaussian prior. The parameter adds one row and one column, the border, to the normal equations of the poses. The
@@ -54,12 +55,12 @@ class BinaryFactors(NamedTuple):
     """Factors of one kind that each constrain the relative pose of two nodes.
 
     Args:
-        i, j: (m,) indices of the poses.
+        i, j: (m,) indices of the two poses of each factor.
         information: (m, d, d) information matrices.
         residuals: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
-        jacobians: function of i_from_j, the shared parameter and the residuals that returns the Jacobians (m, d, 6)
-            with respect to the increment of pose j, and (m, d) with respect to the shared parameter, or None if the
-            factors do not depend on it. It is called for a part of the factors at a time.
+        jacobians: function of i_from_j, the shared parameter and the residuals that returns two Jacobians: with respect
+            to the increment of pose j (m, d, 6), and with respect to the shared parameter (m, d), None if the factors
+            do not depend on it. It is called for a part of the factors at a time.
         huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
 
@@ -87,7 +88,7 @@ class FactorGraph(NamedTuple):
 
 
 class GraphState(NamedTuple):
-    """Values of all unknowns of a factor graph: poses (n, 4, 4) and the shared parameter. Not modified in place."""
+    """Values of all unknowns of a factor graph: poses (n, 4, 4) and the shared parameter (0 if not used)."""
 
     poses: Array
     shared: float = 0.0
@@ -117,8 +118,8 @@ class _NormalEquations(NamedTuple):
     Args:
         diagonal: (n, 6, 6) diagonal blocks.
         gradient: (n, 6) gradient of F with respect to the poses.
-        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter (Gauss-Newton
-            approximation, as all second derivatives here).
+        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter. All second
+            derivatives are in the Gauss-Newton approximation.
         corner: second derivative of F with respect to the shared parameter; 0 if there is no such parameter.
         shared_gradient: derivative of F with respect to the shared parameter.
     """
@@ -178,7 +179,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
     Args:
         graph: factors of the graph.
         start: initial values of the unknowns.
-        max_iterations: largest number of steps, accepted or rejected; at least one.
+        max_iterations: largest number of steps, accepted or rejected; one step is always made.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -209,7 +210,7 @@ class _Step(NamedTuple):
     """Solution of the damped normal equations.
 
     Args:
-        damping: damping relative to the diagonal.
+        damping: the diagonal of the pose block was multiplied by 1 + damping.
         poses: (n, 6) increments of the poses.
         shared: increment of the shared parameter.
         cholesky, border: as in `Solution`, but of the damped equations.
@@ -223,7 +224,12 @@ class _Step(NamedTuple):
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
-    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites the matrix.
+    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites `matrix`.
+
+    Args:
+        matrix: off-diagonal blocks of the poses.
+        equations: the other parts of the normal equations.
+        damping: the diagonal of the pose block is multiplied by 1 + damping.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -264,7 +270,10 @@ def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
 
 
 def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Returns the losses rho (m,) and robust weights (m,), given the squared norms (m,) of the whitened residuals."""
+    """Returns the losses rho (m,) and robust weights (m,), given the squared norms (m,) of the whitened residuals.
+
+    `huber` is the norm above which the loss is linear; None: least squares.
+    """
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)
@@ -315,7 +324,7 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
         first, second: (m,) indices i and j of the poses.
         by_j: (m, d, 6) Jacobians with respect to the increment of pose j.
         information, weights, residuals: (m, d, d) information matrices, (m,) robust weights and (m, d) residuals.
-        i_from_j: (m, 4, 4) poses of j in i.
+        i_from_j: (m, 4, 4) poses of camera j in camera i.
         diagonal: (n, 6, 6) diagonal blocks, changed in place.
         off_diagonal: (m, 6, 6), filled with the blocks (i, j).
         gradient: (n, 6) gradient, changed in place.
@@ -350,12 +359,12 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
 
 @njit(cache=True, nogil=True)
 def _add_border(first, second, by_j, weighted, i_from_j, border):
-    """Adds the mixed second derivatives of binary factors (poses and shared parameter) to the border (n, 6).
+    """Adds the mixed second derivatives (poses and shared parameter) of binary factors to the border.
 
     Args:
         first, second, by_j: see `_add_binary`.
         weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
-        i_from_j: (m, 4, 4) poses of j in i.
+        i_from_j: (m, 4, 4) poses of camera j in camera i.
         border: (n, 6), changed in place.
     """
     for m in range(len(first)):
@@ -405,7 +414,7 @@ def prior_factors(pose_index: Sequence[int], poses: Array, covs: Array) -> Unary
 
 @njit(cache=True, nogil=True)
 def pose_residuals(measured, estimated):
-    """Returns log(measured^-1 estimated) (m, 6) of poses (m, 4, 4)."""
+    """Returns the residuals log(measured^-1 estimated) (m, 6) of m measured and m estimated poses (m, 4, 4)."""
     residuals = np.empty((len(estimated), 6))
     for k in range(len(estimated)):
         geometry.copy_into(residuals[k], geometry.log(geometry.compose(geometry.inverse(measured[k]), estimated[k])))
@@ -414,7 +423,11 @@ def pose_residuals(measured, estimated):
 
 @njit(cache=True, nogil=True)
 def pose_residual_jacobians(residuals):
-    """Returns the Jacobians (m, 6, 6) of `pose_residuals` (m, 6) with respect to increments of the estimated poses."""
+    """Returns the Jacobians (m, 6, 6) of `pose_residuals` with respect to increments of the estimated poses.
+
+    Args:
+        residuals: (m, 6) residuals at these poses.
+    """
     jacobians = np.empty((len(residuals), 6, 6))
     for k in range(len(residuals)):
         geometry.copy_into(jacobians[k], geometry.log_derivative(residuals[k]))
@@ -423,7 +436,7 @@ def pose_residual_jacobians(residuals):
 
 @njit(cache=True, nogil=True)
 def _retract(poses, increments):
-    """Returns poses (n, 4, 4) moved by increments (n, 6) in their own axes."""
+    """Returns the poses (n, 4, 4), each moved by its increment (n, 6) in its own axes."""
     moved = np.empty_like(poses)
     for k in range(len(poses)):
         geometry.copy_into(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
@@ -432,7 +445,7 @@ def _retract(poses, increments):
 
 @njit(cache=True, nogil=True)
 def _relative_poses(poses, i, j):
-    """Returns i_from_j (m, 4, 4) of pairs of poses with indices i, j (m,)."""
+    """Returns the relative poses i_from_j (m, 4, 4) of the pairs of poses with the indices i and j (m,)."""
     relative = np.empty((len(i), 4, 4))
     for k in range(len(i)):
         geometry.copy_into(relative[k], geometry.compose(geometry.inverse(poses[i[k]]), poses[j[k]]))
@@ -455,6 +468,6 @@ def _squared_norms(residuals: Array, information: Array) -> Array:
 
 
 def _sum_by_index(n: int, index: Indices, values: Array) -> Array:
-    """Returns the sums (n, ...) of the values (m, ...) with the same index."""
+    """Returns the sums (n, ...) of the values (m, ...) that have the same index, for the indices 0 to n - 1."""
     selection = sparse.csr_array((np.ones(len(index)), (index, np.arange(len(index)))), shape=(n, len(index)))
     return (selection @ values.reshape(len(index), int(np.prod(values.shape[1:])))).reshape(n, *values.shape[1:])

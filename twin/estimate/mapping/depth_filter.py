@@ -2,8 +2,8 @@
 
 State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step
 propagates the state to the next keyframe and fuses it with the stereo depth of that keyframe and with the depth from
-the motion between the two keyframes. Pixels that are not propagated leave the filter and are fused into the map
-(`elevation`), each exactly once.
+the motion between the two keyframes. The depths of pixels that are not propagated are fused into the map (`elevation`),
+so that each depth enters the map exactly once.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ Mask = NDArray[np.bool_]
 #: A measured depth z of variance R is accepted at a pixel where the filter has depth h of variance P if its innovation
 #: z - h satisfies (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square, one degree of freedom.
 GATE = 10.83
-#: Neighbouring pixels whose disparities differ by more than this [px] are on different surfaces; depth is not
-#: interpolated between them.
+#: Neighbouring pixels whose disparities differ by more than this [px] are taken to lie on different surfaces; depth is
+#: not interpolated between them.
 JUMP_PX = 1.2
 #: Standard deviation of depth from motion due to errors other than image noise and pose [px of stereo disparity].
 MOTION_MIN_SIGMA_PX = 0.03
@@ -50,7 +50,7 @@ class PropagatedDepth(NamedTuple):
 
     Args:
         fused: depth map of the new keyframe.
-        inherited: (H, W) bool, pixels whose depth contains information from the old map.
+        inherited: (H, W) bool, true where the depth contains information from the old map.
     """
 
     fused: DepthMap
@@ -58,9 +58,10 @@ class PropagatedDepth(NamedTuple):
 
 
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
-    """Returns the depth map of a disparity map: Z = f b / d, sigma_Z = Z^2 / (f b) sigma_d.
+    """Returns the depth map of a disparity map: Z = f b / d with the standard deviation Z^2 / (f b) sigma_d.
 
-    f is the focal length [px], b the baseline [m] and d the disparity [px]; disparities below 0.5 px are set to 0.5 px.
+    f is the focal length [px], b the baseline [m], d the disparity [px] and sigma_d its standard deviation [px].
+    Disparities below 0.5 px are set to 0.5 px.
     """
     focal_baseline = np.float32(rig.focal_px * rig.baseline_m)
     depth = focal_baseline / np.maximum(disparity.disparity_px, np.float32(0.5))
@@ -69,10 +70,10 @@ def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
 
 
 def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
-    """Fuses two depth maps of the same camera by scalar Kalman updates.
+    """Returns the fusion of two depth maps of the same image, by a scalar Kalman update of each pixel.
 
-    A pixel is updated if its innovation passes the gate (see `GATE`); otherwise it keeps its prior depth. A pixel that
-    is known in only one of the maps is taken from that map.
+    A pixel is updated if its innovation passes the gate (see `GATE`); otherwise it keeps its prior depth. A pixel whose
+    depth is known in only one of the maps is taken from that map.
     """
     depth, variance = prior.depth_m.copy(), prior.variance_m2.copy()
     _fuse(depth, variance, measured.depth_m, measured.variance_m2, GATE)
@@ -80,20 +81,20 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 
 
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
-    """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth.
+    """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth (as `fuse` does).
 
     For each pixel of the new image, the propagation is linearised at the point given by its new stereo depth. This
     point is projected into the old image, where the old map is interpolated bilinearly, except across depth
     discontinuities (backward warping leaves no holes and needs no rounding). The difference between the old depth and
-    the depth of the point in the old camera is converted, with the surface normal at the point, to a difference in
-    depth along the ray of the new pixel. For a pixel without new stereo depth, the linearisation point has the depth of
-    the nearest old point that projects to it.
+    the depth of the point in the old camera is converted, with the surface normal at the point, to a difference of the
+    depth in the new camera along the ray of the pixel. For a pixel without new stereo depth, the linearisation point
+    has the smallest depth in the new camera of the old points that project to the pixel.
 
     Args:
         old: filtered depth of the old keyframe.
         new: stereo depth of the new keyframe.
         new_from_old: (4, 4) pose of the old camera in the new camera.
-        step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
+        step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
         rig: calibration of the images, with square pixels.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
@@ -112,7 +113,7 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
 def motion_depth(
     gray: Map, old_gray: Map, current: DepthMap, old_from_new: Array, step_cov: Array, rig: StereoRig
 ) -> DepthMap:
-    """Computes depth from the optical flow between two keyframes.
+    """Returns the depth of the new keyframe from the optical flow between it and the old keyframe.
 
     This is the exact two-view form of eq. 1 of Negahdaripour & Madjidi (2003). The relative pose and the current depth
     predict the flow. The difference between the actual and the predicted flow along the epipolar line is measured with
@@ -129,7 +130,7 @@ def motion_depth(
         gray, old_gray: (H, W) float32 grey levels of the left images of the new and the old keyframe.
         current: depth of the new keyframe, used as prediction.
         old_from_new: (4, 4) pose of the new camera in the old camera.
-        step_cov: (6, 6) covariance of the relative pose [rotation, translation], in the new camera (rad, m).
+        step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
         rig: calibration of the images, with square pixels.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
@@ -149,7 +150,7 @@ def motion_depth(
 
 @njit(cache=True, nogil=True)
 def _fuse(depth, variance, measured, measured_variance, gate):
-    """Compiled kernel of `fuse`: updates `depth` and `variance` in place; returns which pixels were updated (H, W)."""
+    """Compiled kernel of `fuse`: updates `depth` and `variance` in place; returns a mask (H, W) of updated pixels."""
     updated = np.zeros(depth.shape, np.bool_)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -169,7 +170,16 @@ def _fuse(depth, variance, measured, measured_variance, gate):
 
 @njit(cache=True, nogil=True)
 def _forward_project(old, rotation, translation, guess, camera):
-    """Fills unknown pixels of `guess` (H, W), in place, with the depth of the nearest old point projected to them."""
+    """Fills unknown pixels of the new depth map `guess` (H, W), in place, from the old depth map.
+
+    A pixel receives the smallest depth, in the new camera, of the old points that project to it.
+
+    Args:
+        old: (H, W) old depth map [m].
+        rotation, translation: (3, 3), (3,) pose of the old camera in the new one [m].
+        guess: (H, W) depth map of the new image [m], NaN where unknown.
+        camera: focal length, column and row of the principal point [px].
+    """
     height, width = old.shape
     focal, cx, cy = camera
     filled = np.zeros(old.shape, np.bool_)
@@ -190,7 +200,10 @@ def _forward_project(old, rotation, translation, guess, camera):
 
 @njit(cache=True, nogil=True, inline="always")
 def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
-    """Returns x, y, z, in the other camera [m], of the point at pixel (u, v) and `depth` in the first camera."""
+    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth `depth` [m] in the first camera.
+
+    `rotation` and `translation` are the pose of the first camera in the other one.
+    """
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],
@@ -201,11 +214,12 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 
 @njit(cache=True, nogil=True, inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
-    """Returns depth and variance at pixel (x, y); NaN if one of its four neighbours is unknown or on another surface.
+    """Returns depth and variance at column x and row y, interpolated between the four neighbouring pixels.
 
-    Both are also NaN outside the image. Inverse depth is interpolated, because it is linear on planes. The variance is
-    interpolated linearly; it does not decrease as for independent errors, because the matching windows of neighbouring
-    pixels overlap.
+    Both are NaN if a neighbour is unknown, if the neighbours lie on different surfaces (disparities that differ by
+    `jump` [px] or more), and outside the image. Inverse depth is interpolated, because it is linear on planes. The
+    variance is interpolated linearly; it does not decrease as for independent errors, because the matching windows of
+    neighbouring pixels overlap.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -225,7 +239,7 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 
 @njit(cache=True, nogil=True, inline="always")
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
-    """Returns the surface normal at a pixel, scaled so that normal . ray = 1 / depth.
+    """Returns the surface normal (x, y, z) at a pixel, scaled so that normal . ray = 1 / depth, for a ray with z = 1.
 
     The gradient of inverse depth is set to zero across a depth discontinuity, next to an unknown pixel and at the
     image border.
@@ -247,7 +261,11 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
 
 @njit(cache=True, nogil=True)
 def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
-    """Returns depth and variance (H, W) of the old map in the new image, linearised at the depths `guess` (H, W)."""
+    """Returns depth and variance (H, W) of the old map in the new image, linearised at the depths `guess` (H, W).
+
+    They are NaN where the old map gives no depth. `rotation` and `translation` are the pose of the new camera in the
+    old one.
+    """
     height, width = old.shape
     focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
@@ -293,11 +311,12 @@ def _quadratic(row, cov):
 
 @njit(cache=True, nogil=True)
 def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
-    """Returns the variance (H, W) of disparity from motion due to the error of the relative pose: J cov J' [px^2].
+    """Returns the variance (H, W) [px^2] of the disparity from motion that is due to the error of the relative pose.
 
     A pose error displaces the image point; the component of this displacement along the epipolar line has the same
-    effect as an error of depth. NaN where a change of depth does not displace the image point: at the epipole, and
-    everywhere without translation. 0 at pixels without disparity, and everywhere if `step_cov` is zero.
+    effect as an error of depth. The variance is J cov J', with J the derivative of the disparity with respect to the
+    pose. It is NaN where a change of depth does not displace the image point: at the epipole, and everywhere without
+    translation. It is 0 at pixels without disparity, and everywhere if `step_cov` is zero.
     """
     height, width = disparity.shape
     focal, cx, cy = camera

@@ -17,7 +17,8 @@ Map = NDArray[np.float32]
 _VARIANCE_RATIO = 10.0
 #: Measured probability that the chosen hypothesis of a cell with two hypotheses is wrong.
 _WRONG_CHOICE = 0.16
-#: Number of neighbours on its own side of a cell at a right-angled corner of a step; at a straight step, there are 5.
+#: For a cell at a right-angled corner of a step, number of its eight neighbours on its own side of the step. At a
+#: straight step, it is 5.
 _NEIGHBOURS_AT_CORNER = 3
 #: Connected groups of known cells with fewer cells than this are removed.
 MIN_CELLS = 12
@@ -28,24 +29,25 @@ class ElevationMapper:
 
     A cell keeps up to two hypotheses of its height, because a steep cell is measured at its lower edge in one view and
     at its upper edge in another. The height z in a patch, of variance R, updates the best-fitting hypothesis h, of
-    variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes the second hypothesis,
-    or replaces the hypothesis with the larger depth variance if that of z is smaller. The lower hypothesis is the
-    result unless the depth variance of the higher one is more than ten times smaller, because a matching window at an
-    edge often assigns the height of the nearer surface to the floor behind it. In the cells of the horseshoe reef with
-    two hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %, and the one chosen by
-    this rule in 84 %. Where this choice agrees with fewer than three of the eight neighbours, the other hypothesis is
-    the result (`_isolated`).
+    variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes another hypothesis; if
+    the cell has two already, z replaces the one with the larger depth variance if that of z is smaller. The lower
+    hypothesis is the result unless the depth variance of the higher one is more than ten times smaller, because a
+    matching window at an edge often assigns the height of the nearer surface to the floor behind it. In the cells of
+    the horseshoe reef with two hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %,
+    and the one chosen by this rule in 84 %. Where fewer than three of the neighbours support this choice, the other
+    hypothesis is the result (`_isolated`).
 
     The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their
     part, the depth variance, decreases with each fusion. Errors due to the pose and to the smoothing of slopes are
-    common to all cells of a leg and mostly to all legs, so their part is the weighted mean of the variances of the
+    common to all patches of a leg and mostly to all legs, so their part is the weighted mean of the variances of the
     patches, which does not decrease with the number of patches.
 
     The variance of the result has three further terms. With f the standard deviation of the lateral error divided by
     two cell sizes, these are f^2 times the squared range of heights around the cell, f times the squared height step
     across the cell (only for steps larger than a cell, where the cell may be on the wrong side of an edge), and the
     variance due to the choice between two hypotheses. Without the term for steps, the standard deviation was 1.9 times
-    too small over the whole map of a reef, because 1 % of the cells, all at edges, have the height of the wrong side.
+    too small over the whole map of a reef, because 1 % of the cells, all at edges, had the height of the wrong side of
+    the edge.
 
     Args:
         grid: grid of the map.
@@ -63,8 +65,8 @@ class ElevationMapper:
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
         """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
 
-        A cell was propagated if the successor covers it with a pixel that inherited information from this keyframe, and
-        the two heights agree. The information on each cell therefore enters the map exactly once.
+        A cell was propagated if the successor has a height for it, at a pixel whose depth contains information from
+        this keyframe, and the two heights agree. The information on each cell therefore enters the map exactly once.
 
         Args:
             patch: heights of a keyframe.
@@ -80,17 +82,17 @@ class ElevationMapper:
         _fuse_cells(patch.row, patch.col, height, *patch[3:5], GATE, self._height, self._variance, self._systematic)
 
     def add_colours(self, patch: HeightPatch, rgb: Image, gain: Map) -> None:
-        """Adds an image to the orthomosaic, a weighted mean of the images with larger weights near their centres.
+        """Adds an image to the orthomosaic, a weighted mean of images whose weights decrease from their centres.
 
         Args:
             patch: heights of the keyframe, with the pixel of each cell.
             rgb: (H, W, 3) left image of the keyframe.
-            gain: (H, W, 3) factor that makes the illumination uniform.
+            gain: (H, W, 3) factors by which the image is multiplied to make its illumination uniform.
         """
         _add_colours(patch.row, patch.col, patch.height_m, patch.pixel, rgb, gain, self._colour)
 
     def _choice(self) -> NDArray[np.int64]:
-        """Returns the index (1, rows, cols) of the chosen hypothesis of each cell."""
+        """Returns the index (1, rows, cols), 0 or 1, of the chosen hypothesis of each cell."""
         low, high = np.argsort(self._height, axis=0)[:, None]
         height_m, variance_m2 = (
             [np.take_along_axis(layers, which, 0)[0] for which in (low, high)]
@@ -121,11 +123,11 @@ class ElevationMapper:
 
 
 def _isolated(height: Map, other: Map) -> Mask:
-    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis.
+    """Returns a mask (rows, cols) of the cells whose neighbours do not support the chosen hypothesis but the other one.
 
-    These are the cells with two hypotheses and at least five known neighbours, of which fewer than
-    `_NEIGHBOURS_AT_CORNER` are at least as near to `height` as to `other`. Such a height is usually a mismatch, because
-    a cell beside a step has more neighbours on its own side.
+    These are the cells with two hypotheses and at least five known neighbours, where fewer than `_NEIGHBOURS_AT_CORNER`
+    of the neighbours are at least as near to `height` as to `other`. Such a height is usually a mismatch, because a
+    cell next to a real step has more neighbours on its own side of the step.
 
     Args:
         height, other: (rows, cols) chosen and other hypothesis [m]; NaN where unknown.
@@ -140,7 +142,7 @@ def _isolated(height: Map, other: Map) -> Mask:
 
 
 def _small_groups(known: Mask) -> Mask:
-    """Returns a mask (rows, cols) of the cells in connected groups of fewer than `MIN_CELLS` known cells.
+    """Returns a mask (rows, cols) of the known cells in connected groups of fewer than `MIN_CELLS` known cells.
 
     Such groups are usually mismatches at image borders.
     """
@@ -150,7 +152,7 @@ def _small_groups(known: Mask) -> Mask:
 
 
 def _relief(height: Map) -> Map:
-    """Returns the range of the known heights in the 3 x 3 cells around each cell (rows, cols) [m]."""
+    """Returns the range (rows, cols) of the known heights in the 3 x 3 cells around each cell [m]; 0 without any."""
     block = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)
     high = cv2.dilate(np.where(np.isnan(height), -far, height), block)
@@ -158,9 +160,9 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest absolute second difference of height across each cell (rows, cols), over four directions [m].
+    """Returns the largest absolute second difference (rows, cols) of height across each cell, over four directions [m].
 
-    It is 0 for the cells at the edge of the grid, and in directions in which a height is unknown.
+    Directions in which a height is unknown are left out; the result is 0 if all are, and at the edge of the grid.
     """
     step = np.zeros_like(height)
     inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
@@ -175,7 +177,11 @@ def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
 ):  # fmt: skip
-    """Sets to NaN, in place, the cells of `remaining` (rows, cols) that were propagated to the next keyframe."""
+    """Sets to NaN, in place, the cells of `remaining` (rows, cols) that were propagated to the next keyframe.
+
+    The arguments from `row` to `systematic` and from `new_row` to `pixel` are fields of the patches of this keyframe
+    and of the next one (`HeightPatch`); `inherited` is as in `ElevationMapper.fuse`.
+    """
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col
@@ -190,8 +196,9 @@ def _remove_propagated(
 def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances, systematics):
     """Fuses each height of a height patch (rows, cols) with one hypothesis of its cell, in place.
 
-    The hypothesis is the one that fits best within the gate. A height that fits none becomes a hypothesis itself; where
-    the cell has two, it replaces the one with the larger depth variance if its own is smaller.
+    The hypothesis is the one that fits best within the gate. A height that fits none becomes a hypothesis itself. If
+    the cell has two already, the height replaces the one with the larger depth variance, or is ignored if its own depth
+    variance is not smaller.
     """
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):

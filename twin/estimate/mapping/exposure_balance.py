@@ -1,14 +1,14 @@
 """Relative exposures of the images of an orthomosaic, so that an exposure step leaves no seam.
 
-If the cameras report their exposures, an image is multiplied by the geometric mean of all exposures divided by its own.
-Otherwise the factors are estimated where images overlap: the logarithm of the mean colour that image k shows of a patch
-c of the floor at the normalised image coordinates (u, v) is modelled as
+If the cameras report their exposures, each image is multiplied by the geometric mean of all exposures divided by its
+own exposure. Otherwise the factors are estimated where images overlap: let y_kc be the logarithm of the mean colour of
+a patch c of the floor in image k, where the patch is at the normalised image coordinates (u, v). It is modelled as
 
     y_kc = a_c + g_k + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2,
 
-with a_c the colour of the patch, g_k the logarithm of the exposure, and b the illumination pattern of the lamps, which
-is the same in all images. The sum of squared residuals is minimised with weak priors g_k = 0 and b = 0, for each colour
-band separately.
+with a_c the logarithm of the colour of the patch, g_k the logarithm of the exposure, and b1 to b5 the coefficients of
+the illumination pattern of the lamps, which is the same in all images. The sum of squared residuals is minimised, with
+weak priors of mean 0 on g_k and on b1 to b5, for each colour band separately.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class PatchColours(NamedTuple):
 
     Args:
         patch: (n,) number of each patch.
-        log_colour: (n, 3) logarithm of the mean colour of each patch.
+        log_colour: (n, 3) natural logarithm of the mean colour of each patch [grey levels].
         position: (n, 2) normalised image coordinates of the centre of each patch.
     """
 
@@ -47,7 +47,10 @@ class PatchColours(NamedTuple):
 
 
 def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
-    """Returns the factors (n, 3) by which to multiply n images with these exposures; None if any is unknown."""
+    """Returns the factors (n, 3) by which to multiply n images so that the given exposures become equal.
+
+    None if any exposure is unknown, or without images.
+    """
     known = [exposure for exposure in exposures if exposure is not None]
     if not known or len(known) < len(exposures):
         return None
@@ -56,10 +59,10 @@ def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
 
 
 def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Array:
-    """Returns points (n, 3) of the map [m], the centres of the patches.
+    """Returns the centres (n, 3) of the patches, in the axes of the map [m].
 
-    They are mapped cells on a square grid with a spacing of about `_PATCH_PX` pixels of an image at the depth
-    `depth_m`.
+    They are known cells of the map on a square grid, whose spacing is about `_PATCH_PX` pixels in an image at the depth
+    `depth_m` [m].
     """
     step = max(1, round(_PATCH_PX * depth_m / rig.focal_px / elevation.grid.cell_m))
     x, y = elevation.grid.centres()
@@ -69,7 +72,7 @@ def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Arr
 
 
 def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points: Array) -> PatchColours:
-    """Returns the mean colours in an image of the patches around points (n, 3) [m] of the map.
+    """Returns the mean colours of patches of the floor in one image.
 
     The mean is weighted by a Gaussian. Patches that are not completely in the image, or are too dark, are left out.
 
@@ -77,7 +80,7 @@ def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points
         image: (H, W, 3) image.
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
         rig: calibration of the image.
-        points: (n, 3) centres of the patches (`patch_points`).
+        points: (n, 3) centres of the patches in the axes of the map [m] (`patch_points`).
     """
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)
     last = np.array([rig.width_px - 1, rig.height_px - 1]) - _PATCH_PX / 2
@@ -93,9 +96,9 @@ def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points
 
 
 def estimated_factors(colours: Iterable[PatchColours]) -> Array:
-    """Returns the factors (n, 3) by which to multiply n images, from the colours of the patches that they share.
+    """Returns the factors (n, 3) by which to multiply n images so that their exposures are equal.
 
-    They are 1 if no image shows a patch.
+    They are estimated from the colours of the patches in each image, and are 1 if no image shows a patch.
     """
     views = list(colours)
     image = np.repeat(np.arange(len(views)), [len(view.patch) for view in views])

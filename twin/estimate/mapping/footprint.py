@@ -40,7 +40,7 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MO
     `most_cells` cells.
 
     Args:
-        result: result of a survey with at least one keyframe.
+        result: result of a survey with at least one keyframe, whose final trajectory is in the axes of the map.
         rig: calibration of the images.
         most_cells: largest number of cells.
     """

@@ -44,9 +44,9 @@ class KeyframePath(NamedTuple):
 
     Args:
         world_from_camera: (n, 4, 4) poses of the left camera.
-        pose_cov: (n, 6, 6) covariance of each pose [rotation, translation], in camera axes (rad, m).
-        step_cov: (n, 6, 6) covariance of each pose relative to the previous pose, in camera axes (the first is not
-            used); None if the relative poses are exact.
+        pose_cov: (n, 6, 6) covariance of each pose [rotation, translation] (rad, m), in camera axes.
+        step_cov: (n, 6, 6) covariance of each pose relative to the previous pose, in the same units and axes (the first
+            is not used); None if the relative poses are exact.
     """
 
     world_from_camera: Array
@@ -92,7 +92,7 @@ def build_map(
     progress: Callable[[int], None] | None = None,
     pattern: LightPattern | None = None,
 ) -> ElevationMap:
-    """Builds the elevation map, its standard deviation and the orthomosaic.
+    """Returns the elevation map with its standard deviation and orthomosaic, built from the keyframes along the path.
 
     Args:
         keyframes: stereo pairs along the path, read one at a time.
@@ -127,7 +127,7 @@ def build_map(
 
 
 def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    """Yields the items in order, while a second thread computes the next one."""
+    """Yields the items in order, while a second thread computes the following item."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -136,7 +136,7 @@ def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
 
 
 def gray_levels(pair: KeyframeImages) -> tuple[Map, Map]:
-    """Returns the grey levels (H, W) of both images, not rounded to whole levels."""
+    """Returns the grey levels (H, W) of the left and the right image, not rounded to whole levels."""
     left, right = (np.asarray(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), np.float32) for image in pair)
     return left, right
 
@@ -169,12 +169,12 @@ def _advance(
 
 
 class MeanIllumination:
-    """Illumination pattern, estimated as the mean of all images added so far.
+    """Illumination pattern of the lamps, estimated as the mean of all images added so far.
 
     The lamps are fixed to the camera, so their pattern remains in the mean, and the texture of the floor averages out.
 
     Args:
-        rig: calibration, for the size of the images.
+        rig: calibration of the images, of which only the image size is used.
     """
 
     def __init__(self, rig: StereoRig) -> None:

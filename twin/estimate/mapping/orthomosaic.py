@@ -1,9 +1,9 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
-It is made in tiles of at most `TILE_PX` x `TILE_PX` pixels, one after the other; an image is read once for each tile
-that it touches, and once more if its exposure has to be estimated. Memory is that of one tile and of two images and
-does not depend on the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`) take 24 bytes
-per pixel, 114 MB for a whole tile.
+It is made in tiles of about 2048 x 2048 pixels (`twin.core.orthomosaic.tile_side_px`), one after the other. An image is
+read once for each tile that it touches, and once more if its exposure has to be estimated. One tile and two images are
+in memory at a time, whatever the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`)
+take 24 bytes per pixel, 114 MB for a whole tile.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from twin.estimate.mapping.orthophoto import Colours, OrthoLayers, add_view, emp
 
 Map = NDArray[np.float32]
 
-#: Extent of the floor around a tile that may hide its pixels [px].
+#: Width of the margin around a tile: the floor in it is taken into account as it may hide pixels of the tile [px].
 _MARGIN_PX = 64
 #: Unmapped cells are filled up to this distance from mapped ones, so that small holes of the map have a colour [cells].
 _FILLED_CELLS = 3
 
 
 class Views(NamedTuple):
-    """Images of an orthomosaic.
+    """Images from which an orthomosaic is made.
 
     Args:
-        world_from_camera: (n, 4, 4) poses in the axes of the map.
+        world_from_camera: (n, 4, 4) poses of the cameras in the axes of the map.
         depth_m: (n,) median depth of the floor in each image [m].
         exposures: exposure of each image, None where the cameras did not report it.
-        load: returns an image (H, W, 3) by its number; its pixels are square.
+        load: function that returns the image (H, W, 3) with a given number, from 0; its pixels are square.
     """
 
     world_from_camera: Array
@@ -46,9 +46,10 @@ class Views(NamedTuple):
 
 
 class Restore(Protocol):
-    """Removes the effects of lamps and water from an image: returns the albedo (H, W, 3) float32, 255 = white.
+    """Function that removes the effects of lamps and water from an image.
 
     Its arguments are the image (H, W, 3) uint8, its exposure, and the pose (4, 4) of the camera in the axes of the map.
+    It returns the albedo (H, W, 3) float32, 255 = white.
     """
 
     def __call__(self, image: Image, exposure: Exposure | None, world_from_camera: Array, /) -> Map: ...
@@ -61,7 +62,7 @@ def orthomosaic(
     restore: Restore | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Iterator[OrthoTile]:
-    """Yields the tiles of the orthomosaic, from north-west to south-east; tiles without any colour too.
+    """Yields all tiles of the orthomosaic, row by row from the north-west, also those without any colour.
 
     The pixels divide the cells of the map and are not larger than the median ground sample distance of the images.
 
@@ -69,7 +70,7 @@ def orthomosaic(
         views: the images.
         elevation: the estimated map.
         rig: calibration of the images, with square pixels.
-        restore: removes the effects of lamps and water. None: colours as seen, at equal exposure.
+        restore: function that removes the effects of lamps and water. None: colours as seen, at equal exposure.
         progress: called with the finished fraction, 0 to 1.
     """
     grid = ortho_grid(views, elevation, rig)
@@ -95,16 +96,20 @@ def orthomosaic(
 def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid:
     """Returns the grid of an orthomosaic, whose pixels divide the cells of the map.
 
-    They are not larger than the ground sample distance of the images at the median of their depths.
+    A pixel is not larger than the ground sample distance of the images at the median of their depths.
     """
     return finer_grid(elevation.grid, float(np.median(views.depth_m)) / rig.focal_px)
 
 
 def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
-    """Returns the heights (rows, cols) of a map at the pixels of a finer grid, linearly interpolated.
+    """Returns the heights (rows, cols) [m] of a map at the pixels of a finer grid, linearly interpolated.
 
     Small holes of the map are filled with the height of the nearest mapped cell; other holes and pixels outside the map
     are NaN.
+
+    Args:
+        elevation: the map.
+        part: grid whose pixels divide the cells of the map; it may extend beyond the map.
     """
     grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
     first = np.array([grid.north_m - part.north_m, part.west_m - grid.west_m]) / grid.cell_m
@@ -122,7 +127,10 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
 
 
 def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
-    """Returns heights with NaN replaced by the nearest known height, and a mask of known cells and small holes."""
+    """Returns heights with NaN replaced by the nearest known height, and a mask of known cells and small holes.
+
+    Without a known height, all heights are 0 and the mask is false.
+    """
     unknown = np.isnan(height)
     if unknown.all():
         return np.zeros_like(height), ~unknown
@@ -137,7 +145,7 @@ def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
 
 
 def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> Array:
-    """Returns the factors (n, 3) by which to multiply the images, so that they have equal exposure."""
+    """Returns the factors (n, 3) by which to multiply the n images so that their exposures are equal."""
     reported = exposure_balance.reported_factors(views.exposures)
     if reported is not None:
         return reported
@@ -149,7 +157,13 @@ def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> 
 
 
 def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
-    """Returns the grid of the pixels of a tile and of a margin on all its sides."""
+    """Returns the grid of the pixels of a tile and of a margin of `_MARGIN_PX` on all its sides.
+
+    Args:
+        grid: grid of the whole orthomosaic.
+        row, col: first pixel of the tile.
+        side: side of a tile [px]; tiles at the east and south edges of the grid are smaller.
+    """
     rows, cols = min(side, grid.rows - row), min(side, grid.cols - col)
     return window(grid, row - _MARGIN_PX, col - _MARGIN_PX, rows + 2 * _MARGIN_PX, cols + 2 * _MARGIN_PX)
 
@@ -158,7 +172,7 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
     """Returns the indices of the images whose footprints overlap a part of the grid.
 
     Args:
-        boxes: (n, 4) bounding boxes of the footprints, see `footprint`.
+        boxes: (n, 4) bounding boxes of the footprints, see `orthophoto.footprint`.
         part: the part of the grid.
     """
     west, south, east, north = boxes.T
@@ -169,7 +183,14 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
 def _prepared(
     views: Views, numbers: NDArray[np.int64], factors: Array, restore: Restore | None
 ) -> Iterator[tuple[int, Colours]]:
-    """Yields the numbers and the colours of images, while a second thread prepares the next one."""
+    """Yields the number and the colours of each of the images `numbers`, while a second thread prepares the next one.
+
+    Args:
+        views: all images.
+        numbers: numbers of the images to prepare.
+        factors: (n, 3) factors by which to multiply the images; not used with `restore`.
+        restore: see `orthomosaic`.
+    """
 
     def colours(k: int) -> Colours:
         image = views.load(k)
@@ -190,7 +211,7 @@ def _prepared(
 
 
 def _rgba(layers: OrthoLayers) -> NDArray[np.uint8]:
-    """Returns the colours of finished layers with their alpha band (rows, cols, 4)."""
+    """Returns the colours and alpha (rows, cols, 4) of layers; alpha is 255 where there is a colour, else 0."""
     known = layers.weight > 0
     rgba = np.zeros((*known.shape, 4), np.uint8)
     rgba[known, :3] = np.clip(layers.colour[known] / layers.weight[known][:, None] + 0.5, 0, 255)

@@ -5,11 +5,11 @@ bicubically. Where several images show a pixel, their colours are averaged with 
 
     w = r exp(-K tan^2(n)),
 
-with n the angle of the view from the vertical (zero at nadir) and r a ramp from 0.001 at the border of the image to 1.
-K is so large that a pixel shows the view nearest to nadir, except in a narrow seam between two views, where they are
-blended. Near nadir, errors of the height displace a colour least. The weight of a saturated pixel is multiplied by
-exp(-60), so that it is used only where other images do not show the floor, or show it far from nadir. A view of a pixel
-is discarded where nearer floor hides it.
+with n the angle of the line of sight from the vertical (zero at nadir) and r a factor that rises from 0.001 at the
+border of the image to 1 at a distance of 12 pixels from it. K (`SHARPNESS`) is so large that a pixel shows the view
+nearest to nadir, except in a narrow seam between two views, where they are blended. Near nadir, errors of the height
+displace a colour least. The weight of a saturated pixel is multiplied by exp(-60), so that it is used only where other
+images do not show the floor, or show it far from nadir. An image is not used for pixels hidden in it by nearer floor.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ class OrthoLayers(NamedTuple):
     Args:
         grid: grid of the pixels of this part.
         height_m: (rows, cols) height of each pixel, NaN where unknown.
-        colour: (rows, cols, 3) sum of the weighted colours.
-        weight: (rows, cols) sum of the weights relative to exp(-best).
-        best: (rows, cols) least value of -log w so far; inf without a view.
+        colour: (rows, cols, 3) sum of the colours, multiplied by their weights w / exp(-best).
+        weight: (rows, cols) sum of the weights w / exp(-best).
+        best: (rows, cols) smallest value of -log w so far; inf without a view.
     """
 
     grid: MapGrid
@@ -56,7 +56,7 @@ class OrthoLayers(NamedTuple):
 
 
 def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
-    """Returns layers of a grid without colours, for pixels of these heights (rows, cols)."""
+    """Returns the layers of a grid before the first view, given the heights (rows, cols) of its pixels [m]."""
     shape = grid.rows, grid.cols
     best = np.full(shape, np.inf, np.float32)
     return OrthoLayers(grid, height_m, np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), best)
@@ -65,12 +65,12 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
     """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
 
-    It is the box around the parts of the four corner rays between the highest and the lowest floor. If the camera is
-    lower than the highest floor, these parts begin at the camera. The box is infinite if the camera is not above the
-    lowest floor, or if a corner ray does not point downwards.
+    It is the box around those parts of the rays through the four image corners that lie between the highest and the
+    lowest floor. If the camera is lower than the highest floor, these parts begin at the camera. The box is infinite if
+    the camera is not above the lowest floor, or if one of these rays does not point downwards.
 
     Args:
-        world_from_camera: (4, 4) pose of the camera.
+        world_from_camera: (4, 4) pose of the camera in the axes of the map.
         rig: calibration, with square pixels.
         heights_m: heights of the lowest and of the highest floor.
     """
@@ -89,8 +89,9 @@ class Colours(NamedTuple):
     """Colours of an image.
 
     Args:
-        rgb: (H, W, 3) float32.
-        saturated: (H, W) uint8, 1 where the colour is not known because the image is saturated, else 0.
+        rgb: (H, W, 3) float32 red, green and blue, 0 to 255 (values above are possible).
+        saturated: (H, W) uint8, 1 where the colour is not reliable because the image is saturated there or at a
+            neighbouring pixel, else 0.
     """
 
     rgb: Map
@@ -109,7 +110,7 @@ def add_view(
     Args:
         layers: part of the orthomosaic.
         colours: the image.
-        world_from_camera: (4, 4) pose of the camera.
+        world_from_camera: (4, 4) pose of the camera in the axes of the map.
         rig: calibration, with square pixels.
         heights_m: heights of the lowest and of the highest floor.
     """
@@ -133,7 +134,12 @@ def add_view(
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
-    """Returns first and end row, first and end column (exclusive) of the pixels of a grid in a box, see `footprint`."""
+    """Returns first row, end row, first column and end column of the pixels of a grid within a box; ends are exclusive.
+
+    Args:
+        box_m: (4,) west, south, east, north [m] (`footprint`).
+        grid: grid of the pixels.
+    """
     west, south, east, north = box_m
     rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
     cols = np.clip([(west - grid.west_m) / grid.cell_m, (east - grid.west_m) / grid.cell_m + 1], 0, grid.cols)
@@ -142,9 +148,9 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
-    """Fills `nearest` (H, W), for each pixel of an image, with the smallest depth of orthomosaic pixels imaged there.
+    """Writes to `nearest` (H, W), for each pixel of an image, the smallest depth of orthomosaic pixels imaged there.
 
-    The arguments are those of `_blend`.
+    It remains infinite where none is imaged. The other arguments are those of `_blend`.
     """
     focal, cx, cy = camera
     for i in range(first, end):
@@ -171,13 +177,14 @@ def _blend(
 
     Args:
         height, colour, weight, best: see `OrthoLayers`.
-        first, end, left, right: first and end row, first and end column (exclusive) of the pixels to process.
-        steps: (3, 3) change of the point in camera axes by one column, one row and one metre of height.
-        origin: (3,) point of pixel (0, 0) at height 0 in camera axes.
-        camera_at: x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].
+        first, end, left, right: first row, end row, first column and end column of the pixels to process; ends are
+            exclusive.
+        steps: (3, 3) columns: displacement in camera axes per column, per row and per metre of height [m].
+        origin: (3,) position of pixel (0, 0) at height 0, in camera axes [m].
+        camera_at: (4,) x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].
         camera: focal length, column and row of the principal point [px].
         image, clipped: see `Colours`.
-        nearest: (H, W) smallest depth in each pixel of the image.
+        nearest: (H, W) smallest depth in each pixel of the image [m], from `_mark_nearest`.
     """
     focal, cx, cy = camera
     rows, cols, _ = image.shape

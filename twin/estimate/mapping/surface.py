@@ -17,9 +17,9 @@ Map = NDArray[np.float32]
 #: Smallest cosine of the angle between the normal of a triangle and the ray from the triangle to the camera; with a
 #: smaller cosine, the triangle may connect two separate surfaces.
 MIN_COSINE = 0.05
-#: Standard deviation of the lateral error of the surface [px]; on the floor it is this value times depth / focal
-#: length. Fusion does not reduce it, because the matching window smooths relief and displaces edges in similar ways in
-#: all views. On a surface of slope s it causes a height error of s times the lateral error.
+#: Standard deviation of the lateral error of the surface [px of the image]; in metres, it is this value times depth /
+#: focal length. Fusion does not reduce it, because the matching window smooths relief and displaces edges in similar
+#: ways in all views. On a surface of slope s it causes a height error of s times the lateral error.
 LATERAL_SIGMA_PX = 0.35
 
 
@@ -27,11 +27,12 @@ class HeightPatch(NamedTuple):
     """Heights computed from one depth map, in a rectangular window of the grid.
 
     Args:
-        row, col: grid position of the first (north-west) cell of the window.
+        row, col: row and column, in the grid, of the first (north-west) cell of the window.
         height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
         variance_m2: (rows, cols) variance due to errors of depth. These are independent between the heights that
-            different keyframes add to the map, because each depth leaves the filter only once.
-        systematic_m2: (rows, cols) variance due to the pose and to the smoothing of slopes, errors common to all views.
+            different keyframes add to the map, because each depth enters the map only once.
+        systematic_m2: (rows, cols) variance due to the errors of the pose and to the smoothing of slopes, which are
+            common to all views.
         pixel: (rows, cols, 2) position (u, v) of the cell centre in the image [px].
         lateral_m: standard deviation of the lateral error at the mean depth of the depth map [m].
     """
@@ -48,17 +49,17 @@ class HeightPatch(NamedTuple):
 def rasterise(
     depth_map: DepthMap, world_from_camera: Array, pose_cov: Array, rig: StereoRig, grid: MapGrid
 ) -> HeightPatch | None:
-    """Computes heights at the cell centres of a grid from a depth map, by linear interpolation in triangles of pixels.
+    """Returns the heights at the cell centres of a grid, interpolated linearly in triangles of pixels of a depth map.
 
-    Each square of four pixels is divided into two triangles. Triangles across a depth discontinuity and triangles seen
-    from below or at a grazing angle are omitted, so that no surface appears between the edge of a reef and the floor
-    behind it. The variance of depth along the ray and the covariance of the pose are propagated to the height at the
-    cell centre; on a slope, this includes the effect of horizontal errors.
+    Each square of four pixels is divided into two triangles. Triangles across a depth discontinuity, downward-facing
+    triangles and triangles seen at a grazing angle are omitted, so that no surface appears between the edge of a reef
+    and the floor behind it. The variance of the depth and the covariance of the pose are propagated to the height at
+    the cell centre; on a slope, this includes the effect of horizontal errors.
 
     Args:
         depth_map: depth in the left camera.
         world_from_camera: (4, 4) pose of the left camera.
-        pose_cov: (6, 6) covariance of the pose [rotation, translation], in the camera (rad, m).
+        pose_cov: (6, 6) covariance of the pose [rotation, translation] (rad, m), in camera axes.
         rig: calibration of the image, with square pixels.
         grid: grid of the map.
 
@@ -101,7 +102,8 @@ class _ViewGeometry(NamedTuple):
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
         cell_m: cell size [m].
         focal_px: focal length [px].
-        max_jump: largest difference of inverse depth between the corners of a triangle on one surface [1/m].
+        max_jump: largest difference of inverse depth between the corners of a triangle [1/m]; with a larger one, the
+            triangle is omitted.
     """
 
     position: Array
@@ -119,7 +121,7 @@ def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """Returns first row and column, and number of rows and columns, of the cells within `bounds`; None without cells.
+    """Returns first row, first column, number of rows and number of columns of the cells within `bounds`; None if none.
 
     Args:
         bounds: (4,) lowest row and column, highest row and column, from `_grid_points`.
@@ -136,6 +138,12 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 @njit(cache=True, nogil=True)
 def _grid_points(depth, pose, camera, west, north, cell):
     """Converts a depth map to grid coordinates.
+
+    Args:
+        depth: (H, W) depth [m].
+        pose: (4, 4) world_from_camera.
+        camera: focal length, column and row of the principal point [px].
+        west, north, cell: north-west corner and cell size of the grid [m].
 
     Returns:
         Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; bounds (4,) of the
@@ -166,9 +174,14 @@ def _contains_integer(a, b, c, e):
 
 @njit(cache=True, nogil=True)
 def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
-    """Rasterises the triangles of a depth map, except those that `rasterise` omits, in place.
+    """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch.
 
-    It fills `height`, `height_variance`, `systematic` and `pixel`.
+    Args:
+        points: (H, W, 3) points of the depth map in grid coordinates (`_grid_points`).
+        depth, variance: (H, W) depth map [m] and its variance [m^2].
+        view: `_ViewGeometry`.
+        row, col, height, height_variance, systematic, pixel: fields of the `HeightPatch`; the last four are changed in
+            place.
     """
     out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
     for v in range(depth.shape[0] - 1):
@@ -190,7 +203,10 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
-    """Writes the cells inside the triangle of pixels a, b, c; where triangles overlap, the greatest height is kept."""
+    """Writes the cells inside the triangle of the pixels a, b, c, given as rows v and columns u, unless it is omitted.
+
+    Where triangles overlap, the greatest height is kept. The other arguments are those of `_triangles`.
+    """
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)
@@ -230,7 +246,7 @@ def _triangle(
 
 @njit(cache=True, nogil=True, inline="always")
 def pose_variance(px, py, pz, sx, sy, cov):
-    """Returns the variance of a surface's height at a point due to the error of the camera pose [m^2].
+    """Returns the variance [m^2] of a surface's height at the x and y of a point, due to the error of the camera pose.
 
     Args:
         px, py, pz: point relative to the camera, in world axes [m].

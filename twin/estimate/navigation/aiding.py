@@ -27,8 +27,10 @@ from twin.estimate.vision.keyframes import Keyframe
 def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> list[UnaryFactors]:
     """Returns the factors of pressure, attitude, position fixes, beacons and verticals, in this order.
 
+    All residuals are predicted minus measured.
+
     Args:
-        nodes: keyframes, in the order of the poses in the graph.
+        nodes: nodes, in the order of the poses in the graph.
         rig: believed calibration.
         noise: believed noise of the navigation sensors.
     """
@@ -105,7 +107,7 @@ def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFac
 def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
     """Returns the factors of the beacons seen in the left image.
 
-    The residuals are the predicted minus the detected positions [px].
+    The residuals are the predicted minus the detected positions [px]; 0 for a beacon predicted behind the camera.
     """
     sightings = [(k, sighting) for k, node in enumerate(nodes) for sighting in node.readings.beacons or ()]
     beacon_m = np.array([noise.beacons_m[sighting.beacon] for _, sighting in sightings]).reshape(-1, 3)
@@ -153,10 +155,10 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
     """Returns the factors of the displacements between nodes measured by the DVL: measured = (1 + s) d + noise.
 
     d is the displacement of the body's origin, in the body axes at the earlier node; s is the scale error of the DVL,
-    one parameter shared by all factors.
+    one parameter shared by all factors. A displacement whose earlier node is not in `nodes` is left out.
 
     Args:
-        nodes: keyframes, in the order of the poses in the graph.
+        nodes: nodes, in the order of the poses in the graph.
         rig: believed calibration.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
@@ -178,7 +180,7 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
 @njit(cache=True, nogil=True)
 def _body_displacements(motions, body_from_camera):
-    """Returns displacements (m, 3) [m] and Jacobians (m, 3, 6) of `body_displacement` for camera motions (m, 4, 4)."""
+    """Returns the displacements (m, 3) [m] and Jacobians (m, 3, 6) from `body_displacement` for motions (m, 4, 4)."""
     displacements, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
     for k in range(len(motions)):
         displacement, jacobian = body_displacement(motions[k], body_from_camera)

@@ -15,12 +15,14 @@ from twin.estimate.navigation.pose_filter import PressureAhrsModel, fuse_pressur
 
 
 class DeadReckoningState(NamedTuple):
-    """State of dead reckoning after a frame: poses (4, 4) and covariances (6, 6), which are not modified in place.
+    """State of dead reckoning after a frame. The arrays are not modified in place.
+
+    The covariances refer to [rotation, translation] (rad, m) in the axes of the current camera.
 
     Args:
-        f2f: world_from_camera from frame-to-frame motion alone.
-        online, cov: online estimate of world_from_camera and its covariance.
-        since_node, since_node_cov: motion since the last node from vision and DVL, and its covariance.
+        f2f: (4, 4) world_from_camera from frame-to-frame motion alone.
+        online, cov: (4, 4), (6, 6) online estimate of world_from_camera, and its covariance.
+        since_node, since_node_cov: (4, 4), (6, 6) motion since the last node from vision and DVL, and its covariance.
     """
 
     f2f: Array
@@ -68,11 +70,12 @@ def dead_reckon(
     """Advances dead reckoning by one frame.
 
     Args:
-        last: `DeadReckoningState` of the previous frame.
+        last: state at the previous frame.
         aiding: error models of the sensors, and the state of the DVL integration, which is modified in place.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
-        height_m, rpy_rad, velocity_mps: height (pressure), roll, pitch and yaw (3,) (AHRS) and velocity (3,) in body
-            axes (DVL) of this frame [m], [rad], [m/s]; NaN where there is no reading.
+        height_m: height measured by the pressure sensor at this frame [m]; NaN if there is no reading.
+        rpy_rad: (3,) roll, pitch and yaw measured by the AHRS [rad]; NaN if there is no reading.
+        velocity_mps: (3,) velocity measured by the DVL, in body axes [m/s]; NaN if there is no reading.
 
     Returns:
         The new state, and the motion (4, 4) of this frame after fusion with the DVL.

@@ -35,12 +35,12 @@ class DvlState(NamedTuple):
 
     Args:
         velocity: (3,) last reading, in body axes [m/s]; NaN if the last frame had none.
-        node_from_body, rotation_cov: (3, 3) rotation of the body since the node, and its covariance in the body axes
-            at the node [rad^2].
-        displacement_m, cov: (3,), (3, 3) displacement in the body axes at the node [m], and its covariance due to
-            white noise [m^2].
+        node_from_body, rotation_cov: (3, 3), (3, 3) rotation of the body since the node, and its covariance in the body
+            axes at the node [rad^2].
+        displacement_m, cov: (3,), (3, 3) displacement of the body's origin since the node, in the body axes at the node
+            [m], and its covariance due to white noise [m^2].
         path_m: (1,) path length since the node [m].
-        complete: (1,) false if a reading at the node or since is missing.
+        complete: (1,) false if the reading at the node or at a frame after it is missing.
     """
 
     velocity: Array
@@ -57,7 +57,8 @@ class DvlIntegrator:
 
     Each reading contributes with half weight to the displacements of two consecutive frames, whose errors are therefore
     correlated. The sum of n displacements has the variance (n - 1/2) (sigma dt)^2 in each component, with sigma the
-    standard deviation of a reading and dt the interval between frames; (sigma dt)^2 per displacement is used.
+    standard deviation of a reading and dt the interval between frames. As an approximation, each displacement is given
+    the variance (sigma dt)^2 and treated as independent.
 
     Args:
         rig: believed calibration, for the pose of the camera in the body.
@@ -92,7 +93,7 @@ class DvlIntegrator:
             number: number of the current node.
 
         Returns:
-            The displacement, or None if a reading is missing, at the last node or since.
+            The displacement, or None if the reading at the last node or at a frame after it is missing.
         """
         node, self._node, state = self._node, number, self.state
         complete = state.complete[0]
@@ -103,7 +104,7 @@ class DvlIntegrator:
 
 @njit(cache=True, nogil=True)
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
-    """Computes the displacement of the body's origin for a motion of the camera.
+    """Computes the displacement of the body's origin that corresponds to a motion of the camera.
 
     Args:
         a_from_b: (4, 4) motion of the camera: the pose of the later camera in the earlier camera.
@@ -111,7 +112,7 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
     Returns:
         Displacement (3,) [m] in the body axes before the motion, and its Jacobian (3, 6) with respect to an increment
-        [rotation, translation] of the motion, in the axes of the later camera.
+        [rotation, translation] (rad, m) of the motion, in the axes of the later camera.
     """
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
@@ -126,7 +127,7 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
 @njit(cache=True, nogil=True)
 def fuse_dvl(state, model, a_from_b, cov, velocity):
-    """Fuses the visual motion since the previous frame with the DVL, and continues the integration.
+    """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
     Args:
         state: `DvlState`, modified in place.
@@ -136,7 +137,7 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
 
     Returns:
         The fused motion (4, 4) and its covariance (6, 6). If the reading of this frame or of the previous one is
-        missing, these are `a_from_b` and `cov` unchanged.
+        missing, these are `a_from_b` and `cov` unchanged, and the integration becomes incomplete.
     """
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
@@ -206,14 +207,14 @@ def _accumulate(state, model, step, a_from_b, cov):
 
 @njit(cache=True, nogil=True)
 def _displacement_cov(state):
-    """Returns the covariance (3, 3) of the displacement since the node due to white noise and attitude error."""
+    """Returns the covariance (3, 3) [m^2] of the displacement since the node due to white noise and attitude error."""
     lever = geometry.skew(state.displacement_m)  # conservative: applies the final attitude error to the whole path
     return state.cov + geometry.product(geometry.product(lever, state.rotation_cov), lever.T)
 
 
 @njit(cache=True, nogil=True)
 def _restart(state):
-    """Resets the integration at a node; the last reading is kept."""
+    """Resets the integration at a node, in place; the last reading is kept."""
     geometry.copy_into(state.node_from_body, np.eye(3))
     state.rotation_cov[:], state.displacement_m[:], state.cov[:], state.path_m[:] = 0.0, 0.0, 0.0, 0.0
     state.complete[:] = True

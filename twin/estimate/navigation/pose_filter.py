@@ -1,6 +1,7 @@
 """Extended Kalman filter of the online pose.
 
-Frame-to-frame motion predicts the pose; registrations with the mosaic (F2M) and navigation sensors correct it.
+Frame-to-frame motion predicts the pose; registrations with the mosaic (F2M) and navigation sensors correct it. All
+covariances of poses and motions refer to [rotation, translation] (rad, m) in camera axes.
 """
 
 from __future__ import annotations
@@ -41,18 +42,18 @@ class PoseFilter:
         self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
 
     def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
-        """Fuses a pose measured relative to an earlier pose, such as a registration with the mosaic.
+        """Fuses a pose measured relative to an earlier pose, such as the result of a registration with the mosaic.
 
-        The mosaic contains the error of the pose from which it was recorded, so the measurement constrains only the
-        motion since that pose. With the covariances S of this motion and R of the measurement, the gain is
-        S (S + R)^-1. The covariance of the pose decreases by the gain times S, which is less than for a measurement of
-        an absolute pose (Schmidt-Kalman filter, with the earlier pose as consider parameter).
+        The mosaic contains the error of the earlier pose at which its cells were recorded, so the measurement
+        constrains only the motion since that pose. With the covariances S of this motion and R of the measurement, the
+        gain is S (S + R)^-1. The covariance of the pose decreases by the gain times S, which is less than for a
+        measurement of an absolute pose (Schmidt-Kalman filter, with the earlier pose as consider parameter).
 
         Args:
             measured: (4, 4) measured world_from_camera.
             cov: (6, 6) covariance R of the measurement.
-            motion_cov: (6, 6) covariance of the motion since the earlier pose; S is this matrix, limited to at
-                most the covariance of the pose (`clip_covariance`).
+            motion_cov: (6, 6) covariance of the motion since the earlier pose; S is this matrix, limited to at most the
+                covariance of the pose (`clip_covariance`).
 
         Returns:
             (6, 6) decrease of the covariance of the pose; None if the measurement was rejected as an outlier.
@@ -64,7 +65,7 @@ class PoseFilter:
         return decrease
 
     def fuse_position_fixes(self, readings: Readings) -> None:
-        """Fuses the readings that are taken only at keyframes: an acoustic position fix and the beacons in view."""
+        """Fuses the readings that are taken only at keyframes: an acoustic position fix, and the beacons detected."""
         if readings.usbl_m is not None:
             rotation = self.world_from_camera[:3, :3]
             residual = readings.usbl_m - self.world_from_camera[:3, 3]
@@ -115,8 +116,8 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
     """Projects a beacon, at the position (3,) in the world [m], into the left image.
 
     Returns:
-        Column and row (2,) [px], NaN for a beacon at a depth up to 1 mm or behind the camera, and their Jacobian (2, 6)
-        with respect to an increment [rotation, translation] of the pose in camera axes.
+        Column and row (2,) [px], NaN for a beacon behind the camera or at a depth of up to 1 mm, and their Jacobian
+        (2, 6) with respect to an increment [rotation, translation] (rad, m) of the pose in camera axes.
     """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
@@ -140,7 +141,7 @@ class PressureAhrsModel(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
-    """Fuses readings of height and attitude into a pose.
+    """Updates a pose with readings of height and attitude (Kalman update).
 
     Args:
         world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
@@ -168,7 +169,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
 def predict(world_from_camera, cov, a_from_b, motion_cov):
     """Returns the pose (4, 4) and its covariance (6, 6) after a motion `a_from_b` with covariance `motion_cov`.
 
-    Equations (3) to (5) of Negahdaripour & Madjidi (2003).
+    These are equations (3) to (5) of Negahdaripour & Madjidi (2003).
     """
     return geometry.compose(world_from_camera, a_from_b), transport_covariance(cov, a_from_b) + motion_cov
 
@@ -177,7 +178,7 @@ def predict(world_from_camera, cov, a_from_b, motion_cov):
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
     """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
-    The limits apply to the generalised eigenvalues of `cov` with respect to `reference`.
+    The limits apply to the eigenvalues of L^-1 cov L^-T, with L L^T = reference (Cholesky factor L).
 
     Raises:
         LinAlgError: the reference covariance is not positive definite.
@@ -191,7 +192,12 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
 
 @njit(cache=True, nogil=True)
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of the pose of b, rigidly attached to a, from the covariance of the pose of a."""
+    """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
+
+    Args:
+        cov: (6, 6) covariance of the pose of a, in the axes of a; the result is in the axes of b.
+        a_from_b: (4, 4) pose of b in a.
+    """
     return geometry.transform_covariance(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
@@ -201,8 +207,8 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
     Args:
         world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
-        residual, jacobian, cov: (k,), (k, 6), (k, k) residual of the observation, Jacobian of the predicted
-            observation, and covariance of the observation.
+        residual, jacobian, cov: (k,), (k, 6), (k, k) observation minus its prediction, Jacobian of the prediction with
+            respect to an increment of the pose, and covariance of the observation.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -225,7 +231,7 @@ def _gain(prior, jacobian, cov):
 
     Args:
         prior: (6, 6) covariance P of the pose.
-        jacobian: (k, 6) derivative J of the predicted observation.
+        jacobian: (k, 6) derivative J of the predicted observation with respect to an increment of the pose.
         cov: (k, k) covariance R of the observation.
     """
     size = len(cov)
@@ -255,10 +261,10 @@ def _gain(prior, jacobian, cov):
 
 @njit(cache=True, nogil=True)
 def _correct(world_from_camera, prior, measured, cov, motion_cov):
-    """Computes the update of `PoseFilter.correct_pose`.
+    """Compiled kernel of `PoseFilter.correct_pose`, without the gate; `prior` (6, 6) is the covariance of the pose.
 
     Returns:
-        chi2 of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the pose covariance.
+        Chi-square of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the pose covariance.
     """
     motion_cov = clip_covariance(motion_cov, prior, 0.0, 1.0)
     residual = geometry.log(geometry.inverse(world_from_camera) @ measured)
@@ -282,7 +288,7 @@ def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise)
 
 @njit(cache=True, nogil=True)
 def _camera_attitude(rpy, camera_from_body, sigmas):
-    """Compiled kernel of `camera_attitude`."""
+    """Compiled kernel of `camera_attitude`, for a rotation `camera_from_body` (3, 3) and `sigmas` (3,) [rad]."""
     to_camera = np.ascontiguousarray(camera_from_body)
     root = to_camera * sigmas
     return geometry.rotation_from_rpy(rpy[0], rpy[1], rpy[2]) @ to_camera.T, root @ root.T

@@ -14,8 +14,8 @@ from twin.estimate.vision import epipolar
 Gray = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
-#: Block size of semi-global matching [px]. In turbid water, a block of 5 px matches more pixels than one of 3 px; the
-#: refinement restores the sharpness of edges.
+#: Block size of semi-global matching [px]. In turbid water, more pixels are matched with a block of 5 px than with one
+#: of 3 px; the refinement restores the sharpness of edges.
 BLOCK_PX = 5
 #: Connected regions of at most this many pixels are removed as mismatches.
 SPECKLE_PX = 60
@@ -55,18 +55,19 @@ class Disparity(NamedTuple):
 
 
 def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) -> Disparity:
-    """Computes the disparity of every pixel of the left image that is visible in both images.
+    """Returns the disparity of the pixels of the left image that are matched in the right one; NaN elsewhere.
 
     Semi-global matching (Hirschmueller 2008; OpenCV's variant with three path directions) of images with locally
     normalised contrast gives an initial disparity; a left-right consistency check removes occlusions and mismatches.
     The sub-pixel interpolation of semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation
     0.17 px on a rendered reef), so `epipolar.refine` refines the disparity (bias 0.002 px, standard deviation 0.06 px).
-    The returned standard deviation excludes the prior of the refinement, so it increases where texture is weak compared
-    with noise.
+    The returned standard deviation is that without the prior of the refinement, so it increases where texture is weak
+    compared with noise.
 
     Args:
         left, right: (H, W) uint8 or float32 rectified grey images.
-        max_disparity_px: number of whole-pixel disparities searched, from 0 on; rounded up to a multiple of 16.
+        max_disparity_px: number of whole-pixel disparities that are searched, from 0 on; it is rounded up to a multiple
+            of 16.
     """
     coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
@@ -75,7 +76,9 @@ def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) 
 
 
 class SearchRange:
-    """Range of the disparity search: the widest one at first, then adapted to the largest disparities of the last pair.
+    """Range of the disparity search, at first the widest one, then adapted to the largest disparities of the last pair.
+
+    The widest range is `MAX_DISPARITY_FRACTION` of the image width.
 
     Args:
         rig: calibration at the scale of the images.
@@ -95,13 +98,14 @@ class SearchRange:
 
 
 def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """Computes the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
+    """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
 
     The images are padded on the left; otherwise the left margin, as wide as the search range, would have no disparity.
 
     Args:
         left, right: (H, W) uint8 rectified images with normalised contrast.
-        max_disparity_px: number of whole-pixel disparities searched, from 0 on; rounded up to a multiple of 16.
+        max_disparity_px: number of whole-pixel disparities that are searched, from 0 on; it is rounded up to a multiple
+            of 16.
     """
     count = -(-max_disparity_px // 16) * 16
     matcher = cv2.StereoSGBM.create(
@@ -124,7 +128,7 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 
 
 def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
-    """Computes the disparity as `search` does; pixels that fail the left-right consistency check are set to NaN."""
+    """Returns the disparity from `search`, with NaN at the pixels that fail the left-right consistency check."""
     disparity = search(left, right, max_disparity_px)
     mirrored = search(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), max_disparity_px)
     v, u = np.nonzero(np.isfinite(disparity))
@@ -137,7 +141,7 @@ def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 
 
 def _normalise_contrast(image: Gray | Map) -> Gray:
-    """Normalises local mean and contrast of an image, so that illumination and backscatter do not affect matching.
+    """Returns an image with normalised local mean and contrast, because illumination and backscatter disturb matching.
 
     Areas of low contrast are amplified less, because their contrast is mostly noise.
     """

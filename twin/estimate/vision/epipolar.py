@@ -1,8 +1,8 @@
 """Sub-pixel disparity from two views, a stereo pair or two keyframes: dense Lucas-Kanade along the epipolar lines.
 
-Depth Z is expressed as disparity of the stereo pair, d = f b / Z [px], with focal length f and baseline b. In
-homogeneous coordinates, the projection into the other image is linear in d; the disparity of a plane in space is linear
-in the pixel coordinates u and v.
+Depth Z is expressed as disparity of the stereo pair, d = f b / Z [px], with focal length f [px] and baseline b [m]. In
+homogeneous coordinates, the projection into the other image is linear in d. The disparity of a plane in space is a
+linear function of the pixel coordinates u and v.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Marks unknown disparity inside the kernels; so far from any real disparity that such a pixel never supports others.
+#: Value of an unknown disparity in the kernels; it differs so much from any real disparity that such a pixel never
+#: supports the fit at another one.
 UNKNOWN_PX = np.float32(-1e4)
 #: A neighbour supports the fit at a pixel if their disparities differ by less than this [px]; otherwise it is on
 #: another surface.
@@ -28,12 +29,12 @@ SUPPORT_PX = 1.2
 #: Standard deviations of the priors of the disparity correction [px] and of the slopes of the disparity plane [px/px];
 #: the priors only matter where there is no texture.
 PRIOR_PX, PRIOR_SLOPE = 0.5, 0.3
-#: Standard deviation of the Gaussian window at low noise, its largest value, and largest median standard
-#: deviation of disparity that counts as low noise [px].
+#: Standard deviation of the Gaussian window at low noise; its largest value; and the median standard deviation of the
+#: disparity up to which noise counts as low [px].
 WINDOW_PX, WIDEST_PX, LOW_NOISE_SIGMA_PX = 1.5, 2.5, 0.08
 #: Side of the window in which brightness and contrast of the two images are equalised [px of images at half size].
 BALANCE_PX = 13
-#: Windows with a smaller correlation of the two images are treated as mismatches.
+#: Windows in which the correlation between the two images is smaller are treated as mismatches.
 MIN_CORRELATION = 0.4
 #: Variance of the difference of two images due to rounding to grey levels alone [grey levels squared].
 MIN_NOISE_VARIANCE = 1 / 6
@@ -44,8 +45,8 @@ _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 class TwoView(NamedTuple):
     """Two-view geometry: pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image.
 
-    K is the camera matrix, f the focal length, b the baseline of the stereo pair; the relative pose has rotation R and
-    translation t.
+    K is the camera matrix, f the focal length [px], b the baseline of the stereo pair [m]; the pose of the reference
+    camera in the other camera has rotation R and translation t [m]. p is in homogeneous pixel coordinates.
 
     Args:
         matrix: (3, 3) K R K^-1, the infinite homography other_from_reference.
@@ -63,11 +64,11 @@ class Refinement(NamedTuple):
         disparity_px: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed.
         sigma_px: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard
             deviation `PRIOR_PX` [px].
-        gain: (H, W) fraction of an error of the disparity that the last iteration removes: 1 on texture, 0 without
-            texture.
+        gain: (H, W) fraction of an error of the disparity that the last iteration removes: near 1 on texture, near 0
+            without texture.
         noise: standard deviation of the image noise in the difference of both images [grey levels].
-        variance_inflation: factor by which correlated noise of neighbouring pixels increases the variance; not included
-            in `sigma_px`.
+        variance_inflation: factor by which the correlation of the noise of neighbouring pixels increases the variance;
+            not included in `sigma_px`.
     """
 
     disparity_px: Map
@@ -101,22 +102,23 @@ def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> T
 def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterations: int = 2) -> Refinement:
     """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
 
-    I is the reference image, and O the other image warped to it by the current disparities d. Each pixel measures the
-    error of its disparity, e = d_true - d = (I - O) / (dO/dd). A plane is fitted to the values d + e in a window,
+    Let I be the reference image, and O the other image warped to it by the current disparities d. Each pixel measures
+    the error of its disparity, e = d_true - d = (I - O) / (dO/dd). A plane is fitted to the values d + e in a window,
     weighted by (dO/dd)^2 and the weights of the window; its value at the centre is the refined disparity. This value is
     unbiased on inclined surfaces and not biased towards whole or half pixels (`_warp`); neighbours on another surface
-    are excluded. Brightness and contrast of O are first matched locally to I, because backscatter and illumination
-    change with the viewpoint.
+    are excluded. Brightness and contrast of O are first matched locally to those of I, because backscatter and
+    illumination change with the viewpoint.
 
     The variance is the least-squares variance for a noise variance estimated from nearby residuals, or from the
     residuals of the window itself if that estimate is larger. With strong noise, the iterations after the first use a
     larger window. Image gradients dO/dd that noise alone can produce are not treated as texture. `measurement_sigma_px`
-    agrees with the standard deviation of the error to 15 % in clear water; the error (mismatches included) is 1.3
-    times this value if the noise is one fifth of the image contrast, and 1.7 times if it is half of the contrast.
+    agrees with the standard deviation of the error to 15 % in clear water; the standard deviation of the error,
+    mismatches included, is 1.3 times `measurement_sigma_px` if the noise is one fifth of the image contrast, and 1.7
+    times if it is half of the contrast.
 
     Args:
         reference, other: (H, W) float32 grey images.
-        disparity_px: (H, W) float32 initial disparity, NaN where unknown.
+        disparity_px: (H, W) float32 initial disparity [px], NaN where unknown.
         view: two-view geometry of the images.
         iterations: number of Gauss-Newton iterations.
     """
@@ -157,7 +159,13 @@ def _measurement_sigma(sigma: Map, gain: Map) -> Map:
 
 
 def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
-    """Returns the standard deviation of the Gaussian window of the next iteration [px], larger if noise is high."""
+    """Returns the standard deviation [px] of the Gaussian window of the next iteration, which is larger for more noise.
+
+    Args:
+        sigma: (H, W) standard deviation of the disparity [px].
+        fitted: (H, W) disparity [px], `UNKNOWN_PX` where unknown.
+        window_px: the present value, which is returned if no disparity is known.
+    """
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
         return window_px
@@ -165,17 +173,17 @@ def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
 
 
 def _contrast(image: Map) -> Map:
-    """Returns the local variance (H, W) of an image, in a window about as large as that of the plane fit."""
+    """Returns the local variance (H, W) of an image, in windows about as large as that of the plane fit."""
     mean = cv2.boxFilter(image, -1, (7, 7))
     return np.maximum(cv2.boxFilter(image * image, -1, (7, 7)) - mean * mean, 0)
 
 
 def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Map, Mask]:
-    """Warps the other image O to the reference I and equalises its local mean and standard deviation.
+    """Warps the other image O to the reference image I, and adapts its local mean and standard deviation to those of I.
 
     Returns:
-        Residual I - O, image gradient dO/dd, pixel locking (see `_warp`), and a mask of the pixels that are visible in
-        O, each (H, W).
+        Residual I - O, 0 at pixels not visible in O; gradient dO/dd and pixel locking, both from `_warp`; and a mask
+        of the pixels that are visible in O. Each is (H, W).
     """
     warped, slope, locking = np.zeros_like(reference), np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope, locking)
@@ -188,7 +196,10 @@ def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) ->
 
 
 def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
-    """Returns the gain and offset (H, W) that give `other` the local mean and standard deviation of `image`."""
+    """Returns the gain and the offset (H, W) that give `other` the local mean and standard deviation of `image`.
+
+    Pixels are weighted by `weight` (H, W). Where there is little texture, the gain is kept near 1.
+    """
     count = _mean(weight) + 1e-3
     mean_i, mean_o = _mean(image * weight) / count, _mean(other * weight) / count
     power_i, power_o = _mean(image * image * weight) / count, _mean(other * other * weight) / count
@@ -203,7 +214,7 @@ def _mean(image: Map) -> Map:
 
 
 def _gaussian_window(window_px: float) -> Map:
-    """Returns the weights (n,) of a Gaussian window along one axis; `window_px` is its standard deviation."""
+    """Returns the weights (n,) of a Gaussian window along one axis, with the standard deviation `window_px`."""
     half = int(np.ceil(2 * window_px))
     return np.exp(-0.5 * (np.arange(-half, half + 1) / window_px) ** 2).astype(np.float32)
 
@@ -211,7 +222,7 @@ def _gaussian_window(window_px: float) -> Map:
 def _noise_variance(residual: Map, visible: Mask) -> float:
     """Returns a robust variance of the residuals from their median absolute value, at least `MIN_NOISE_VARIANCE`.
 
-    Returns 1 if fewer than 100 of the sampled pixels are visible.
+    Every second pixel of every second row is used. The result is 1 if fewer than 100 of them are visible.
     """
     sample = np.abs(residual[::2, ::2][visible[::2, ::2]])
     if sample.size < 100:
@@ -220,18 +231,21 @@ def _noise_variance(residual: Map, visible: Mask) -> float:
 
 
 def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor by which correlated noise of neighbouring pixels increases the variance of a window's fit.
+    """Returns the factor by which the correlation of the noise of neighbouring pixels increases the variance of a fit.
 
-    It is computed from the autocorrelation of the residuals that remain after the fit. The interpolated colours of a
-    Bayer sensor, for example, have correlated noise: with pixels treated as independent, the standard deviation of the
-    disparity was 1.6 times too small.
+    It is computed from the correlation between neighbouring residuals that remain after the fit. The interpolated
+    colours of a Bayer sensor, for example, have correlated noise: with pixels treated as independent, the standard
+    deviation of the disparity was 1.6 times too small.
     """
     along, across = _correlations(remaining, visible, variance)
     return (1 + 2 * max(along, 0.0)) * (1 + 2 * max(across, 0.0))
 
 
 def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float, float]:
-    """Returns the correlations of the residuals of neighbouring pixels, in the same row and in the same column."""
+    """Returns the correlation of the residuals of neighbouring pixels in a row, and that of neighbours in a column.
+
+    The absolute values of the residuals are limited to three times the root of `variance`.
+    """
     noise = np.where(visible, np.clip(residual, -3 * variance**0.5, 3 * variance**0.5), 0)
     power = float(np.mean(noise * noise)) + 1e-6
     along, across = (float(np.mean(a * b)) / power for a, b in ((noise[:, 1:], noise[:, :-1]), (noise[1:], noise[:-1])))
@@ -239,36 +253,37 @@ def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float,
 
 
 def _locking_factor(residual: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor by which correlated noise of neighbouring pixels reduces pixel locking, 0 to 1.
+    """Returns the factor, 0 to 1, by which the correlation of the noise of neighbouring pixels reduces pixel locking.
 
-    Interpolation between pixels whose noise has the correlation c^k at a distance of k pixels reduces the variance of
-    the noise less than between independent pixels: halfway between two pixels by a factor of
-    1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3). c is measured across the rows, along which a stereo pair is not
-    interpolated.
+    Let c^k be the correlation of the noise of pixels at a distance of k pixels. Interpolation then reduces the variance
+    of the noise less than for independent pixels: halfway between two pixels, the variance is multiplied by
+    1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3). The result is the expression in parentheses. c is the correlation
+    between neighbours in a column, because a stereo pair is not interpolated along the columns.
     """
     c = float(np.clip(_correlations(residual, visible, variance)[1], 0.0, 1.0))
     return max(1 - 1.367 * c + 0.391 * c * c - 0.022 * c**3, 0.0)
 
 
 def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
-    """Returns the local mean square (H, W) of the residuals, clipped to [`MIN_NOISE_VARIANCE`, `max_variance`]."""
+    """Returns the local mean square (H, W) of the residuals, limited to `MIN_NOISE_VARIANCE` to `max_variance`."""
     count = _mean(visible.astype(np.float32)) + 1e-3
     return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 
 
 @njit(cache=True, nogil=True)
 def _warp(reference, other, disparity, matrix, epipole, warped, slope, locking):
-    """Warps the other image O to the reference image, and returns which pixels are visible in O (H, W).
+    """Warps the other image O to the reference image, and returns a mask (H, W) of the pixels that are visible in O.
 
-    Writes the warped image to `warped`, its gradient dO/dd to `slope` and the expected product of residual and gradient
-    due to noise alone, for a residual of variance 1, to `locking`, each (H, W). The gradient is the mean of the
-    gradients of both images, because the gradient of a single image is biased by its noise and by interpolation.
+    Writes the warped image to `warped`, its gradient dO/dd with respect to the disparity to `slope`, and the expected
+    product of residual and gradient due to noise alone, for a residual of variance 1, to `locking`, each (H, W). The
+    gradient is the mean of the gradients of both images, because the gradient of a single image is biased by its noise
+    and by interpolation.
 
     Interpolated noise n has the variance s^2 V at a position between pixels, with s^2 the variance of the noise of a
-    pixel and V the sum of the squared weights: 1 at a pixel, 0.64 halfway between two pixels. Residual and gradient
-    contain -n and (dn/dd) / 2, and the residual has the variance s^2 (1 + V), so their product has the mean
-    -(dV/dd) / 4 / (1 + V) times the variance of the residual. Without subtraction of this mean, least squares prefers
-    disparities at which the interpolation is halfway between two pixels.
+    pixel and V the sum of the squared weights: 1 at a pixel, 0.64 halfway between two pixels in a row. The residual
+    contains -n and the gradient (dn/dd) / 2, and the residual has the variance s^2 (1 + V), so their product has the
+    mean -(dV/dd) / 4 / (1 + V) times the variance of the residual. Unless this mean is subtracted, least squares is
+    biased towards disparities at which the interpolation is halfway between two pixels.
     """
     height, width = reference.shape
     visible = np.zeros((height, width), np.bool_)
@@ -312,7 +327,8 @@ def _interpolated_noise(t):
 def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
     """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fit at each pixel.
 
-    `sums` is modified in place. The loop is written so that the compiler can vectorise it.
+    `sums` is modified in place. `centre` (n,) are the disparities of the pixels; `disparity`, `residual`, `slope` and
+    `locking` (n,) are the values of their neighbours. The loop is written so that the compiler can vectorise it.
     """
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11, s12 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11], sums[12]
@@ -345,9 +361,16 @@ def _fit_planes(disparity, residual, slope, locking, noise, window, support, pri
     The expected product of residual and slope due to noise alone is subtracted: `locking` times the mean squared
     residual of the window, or times `noise` if that is smaller.
 
+    Args:
+        disparity, residual, slope, locking: (H, W) results of `_balanced_warp` and the current disparity [px].
+        noise: (H, W) noise variance [grey levels squared].
+        window: (n,) weights of the window along one axis.
+        support: see `SUPPORT_PX`.
+        priors: see `_PRIORS`.
+
     Returns:
-        Disparity at the centre, its variance for a noise variance of 1, gain (see `Refinement`) and mean squared
-        residual, each (H, W).
+        Disparity at the centre (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (see
+        `Refinement`) and mean squared residual, each (H, W).
     """
     height, width = disparity.shape
     half = window.size // 2

@@ -2,8 +2,8 @@
 
 In a rectified pair every point lies in the same row of both images. Let w [rad] be the rotation vector (pitch, yaw,
 roll about the x, y and z axes of the camera) of the right camera from its ideal to its actual attitude, and e an offset
-of the row of the principal point. They change the row of a point at the normalised coordinates (x, y) of the right
-image by
+of the row of the principal point [focal lengths]. At the normalised coordinates (x, y) of the right image, they change
+the normalised row of a point by
 
     dy = w_x (1 + y^2) - w_y x y - w_z x + e
 
@@ -11,8 +11,9 @@ image by
 from the right image. Yaw is estimated, but not removed: a lens distortion error causes nearly the same pattern, and a
 wrong yaw would shift all disparities.
 
-Row differences that none of these four explains are either matching noise, which averages out in each region of the
-image, or errors of the calibration (distortion, a port), which do not. `RegionMeans` separates the two.
+Row differences that these four errors do not explain are due either to matching noise, which averages out in each
+region of the image, or to errors of the calibration (distortion, a port), which do not average out. `RegionMeans`
+separates the two.
 """
 
 from __future__ import annotations
@@ -43,12 +44,12 @@ _REGIONS = (4, 3)  # regions of the image along columns and rows
 
 
 class RegionMeans(NamedTuple):
-    """Sums over the row differences in each of m regions of the image.
+    """Weighted sums of the row differences in each of m regions of the image, from which their means follow.
 
     Args:
-        weight: (m,) sum of the weights, the inverse variance of the mean.
+        weight: (m,) sum of the weights, which is the inverse variance of the mean row difference.
         rows: (m,) weighted sum of the normalised row differences.
-        jacobian: (m, 4) weighted sum of their derivatives (`row_jacobian`).
+        jacobian: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`).
     """
 
     weight: Array
@@ -59,10 +60,10 @@ class RegionMeans(NamedTuple):
         """Returns the sums with n more row differences.
 
         Args:
-            region: (n,) numbers of the regions in which they lie.
+            region: (n,) numbers of the regions in which the points lie.
             weight: (n,) weights.
             rows: (n,) normalised row differences.
-            jacobian: (n, 4) their derivatives (`row_jacobian`).
+            jacobian: (n, 4) derivatives of the row differences (`row_jacobian`).
         """
         terms = np.column_stack([weight, weight * rows, weight[:, None] * jacobian])
         sums = np.zeros((len(self.weight), terms.shape[1]))
@@ -72,8 +73,9 @@ class RegionMeans(NamedTuple):
     def pattern(self, estimate: Array) -> float:
         """Returns the weighted RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
 
-        The expected contribution of matching noise is subtracted: the weighted sum of squares of the means has the
-        expectation m - 4, for m regions and four estimated parameters. In focal lengths; 0 without observations.
+        The expected contribution of matching noise is subtracted first: the weighted sum of the squared means has the
+        expectation m - 4 for m regions with observations and four estimated parameters. The unit is the focal length;
+        the result is 0 without observations.
         """
         seen = self.weight > 0
         weight = self.weight[seen]
@@ -83,7 +85,7 @@ class RegionMeans(NamedTuple):
 
 
 def _no_regions() -> RegionMeans:
-    """Returns the sums before the first observation."""
+    """Returns the sums before the first observation, which are zero."""
     n = _REGIONS[0] * _REGIONS[1]
     return RegionMeans(np.zeros(n), np.zeros(n), np.zeros((n, 4)))
 
@@ -107,7 +109,7 @@ class EpipolarCalibration:
         Args:
             points: matched points of the pair.
             rig: calibration at the scale of the images.
-            patch_px: side of the matched patches, for the correlation between overlapping patches.
+            patch_px: side of the matched patches [px], for the correlation between overlapping patches.
         """
         x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]
         jacobian = row_jacobian(x, y)
@@ -132,11 +134,14 @@ class EpipolarCalibration:
     def update(self, rig: StereoRig) -> bool:
         """Sets pitch, roll and offset of `removed` to their estimates if this changes a row significantly.
 
-        At a corner of the image, the row must change by more than 4 standard deviations and 0.02 px. Returns whether
-        `removed` was changed.
+        The condition is that the row changes by more than 4 standard deviations and by more than 0.02 px in at least
+        one corner of the image.
 
         Args:
             rig: calibration at full image size.
+
+        Returns:
+            Whether `removed` was changed.
         """
         change = (self.estimate - self.removed) * CORRECTED
         x, y = np.meshgrid(*((np.array([0, side - 1]) - c) / rig.focal_px for side, c in _sides(rig)))
@@ -151,10 +156,10 @@ class EpipolarCalibration:
         return True
 
     def rectify(self, right: Image, rig: StereoRig) -> Image:
-        """Returns the right image (H, W, 3) without the errors in `removed`; the image itself if there are none.
+        """Returns the right image (H, W, 3) corrected for the errors `removed`; the image itself if these are zero.
 
         Args:
-            right: right image at full size.
+            right: (H, W, 3) right image at full size.
             rig: calibration at full image size.
         """
         if not self.removed.any():
@@ -176,25 +181,28 @@ class EpipolarCalibration:
 
 
 def row_jacobian(x: Array, y: Array) -> Array:
-    """Returns the derivatives (n, 4) of the normalised rows of the right image at normalised (x, y).
+    """Returns the derivatives (n, 4) of the normalised rows of points in the right image.
 
     They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset.
+
+    Args:
+        x, y: (n,) normalised coordinates of the points in the right image.
     """
     return np.column_stack([1 + y**2, -x * y, -x, np.ones_like(x)])
 
 
 def _region(pixels: NDArray[np.floating], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the number of the region of the image (n,) that contains each of the pixels (n, 2)."""
+    """Returns the number (n,) of the image region that contains each of the pixels (n, 2)."""
     columns, rows = _REGIONS
     column = np.clip(pixels[:, 0] * columns / rig.width_px, 0, columns - 1).astype(np.int64)
     return column + columns * np.clip(pixels[:, 1] * rows / rig.height_px, 0, rows - 1).astype(np.int64)
 
 
 def row_sigma(points: StereoPoints) -> Array:
-    """Returns the standard deviation (n,) of the row differences that follows from `points.cov`, normalised.
+    """Returns the standard deviation (n,) of the normalised row differences that follows from `points.cov`.
 
-    `stereo.fuse` averages the rows of a point in the two images, which halves the variance. The variance of their
-    difference is four times the variance of their average.
+    `stereo.fuse` averages the rows of a point in the two images, so `points.cov` has the variance of their average. The
+    variance of their difference is four times as large.
     """
     return 2 * np.sqrt(points.cov[:, 1, 1])
 

@@ -28,9 +28,9 @@ class _Reference(NamedTuple):
     """Image with which frames are matched, and its points.
 
     Args:
-        image: (height, width) normalised image.
+        image: (height, width) normalised left image.
         pixels: (n, 2) positions of the points in the image [px].
-        measured: (n, 3) normalised (x, y, disparity).
+        measured: (n, 3) normalised (x, y, disparity) of the points.
         cov: (n, 3, 3) covariance of each row of `measured`.
     """
 
@@ -40,7 +40,7 @@ class _Reference(NamedTuple):
     cov: Array
 
     def xyz(self, baseline_m: float) -> Array:
-        """Returns the points (n, 3) in the reference camera [m]."""
+        """Returns the positions (n, 3) of the points in the axes of the reference camera [m]."""
         x, y, disparity = self.measured.T
         return np.column_stack([x, y, np.ones_like(x)]) * (baseline_m / disparity[:, None])
 
@@ -69,13 +69,13 @@ class FrameToFrame:
     Every frame is matched with a reference image: the last keyframe, or a later frame once too few of the points are
     tracked. Structure is estimated together with motion (`two_view_motion.pair_motion`); the motion between two frames
     follows from their poses relative to the reference. The alternative is to match each frame with the previous one and
-    to take depth as exact, as in eq. (2) of Negahdaripour & Madjidi (2003). There, matching errors accumulate over the
-    15 frames between two keyframes: the bias of pitch is 1.25 mrad over fine texture (this method: 0.1 +- 0.1) and
-    4 mrad over coarse texture, where depth is noisy (this method: 0.5 +- 0.7). The standard deviation of the rotation
-    is 0.6 mrad (this method: 0.35).
+    to take depth as exact, as in eq. (2) of Negahdaripour & Madjidi (2003). With the alternative, matching errors
+    accumulate over the 15 frames between two keyframes: the bias of pitch was 1.25 mrad over fine texture (this method:
+    0.1 +- 0.1 mrad) and 4 mrad over coarse texture, where depth is noisy (this method: 0.5 +- 0.7 mrad). The standard
+    deviation of the rotation was 0.6 mrad (this method: 0.35 mrad).
 
     A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
-    acceleration of a vehicle is limited, whereas the error of a pose from few and noisy pixels is not. A step fails if
+    acceleration of a vehicle is limited, whereas a pose from few and noisy pixels may have any error. A step fails if
     too few points are tracked, if too few of them are inliers, if their residuals are too large, or if the measured
     pose contradicts the prediction. The predicted motion is then returned, with a large covariance and the reason for
     the failure.
@@ -118,9 +118,9 @@ class FrameToFrame:
             interval_s: time since the last frame [s]; by default that of the frame rate.
 
         Returns:
-            The motion, and "ok" or the reason for a failure; at the first frame, the identity and "ok". The covariance
-            of a measured motion is that of the pose of this frame in the reference camera. The errors of successive
-            motions partly cancel, so the sum of their covariances is an upper bound.
+            The motion, and "ok" or the reason for a failure; at the first frame, the identity and "ok". As covariance
+            of a measured motion, that of the pose of this frame in the reference camera is returned. The errors of
+            successive motions partly cancel, so the sum of these covariances is an upper bound.
         """
         if not self.started:
             self.started = True
@@ -168,12 +168,12 @@ class FrameToFrame:
         self.filter.restart()
 
     def _pyramid_levels(self, depth_m: Array) -> int:
-        """Returns the number of pyramid levels with which the tracker bridges the error of the predicted positions.
+        """Returns the number of pyramid levels above the full image that the error of the predicted positions requires.
 
-        A window finds a point up to about half its side away; each further level doubles this distance. The variance of
-        the predicted positions is that of the filter's rotation about the x and y axes, plus that of its translation
-        across the optical axis at the median depth. At 15 frames per second one level is sufficient; at 5, the
-        acceleration of the vehicle moves the points by about 10 px more than predicted.
+        The tracker finds a point at a distance of up to about half the side of its window; each level doubles this
+        distance. The variance of the predicted positions follows from the filter's variances of the rotation about the
+        x and y axes and of the translation across the optical axis, at the median depth. At 15 frames per second one
+        level is sufficient; at 5, the acceleration of the vehicle moves the points by about 10 px more than predicted.
 
         Args:
             depth_m: (n,) depths of the points [m].
@@ -188,7 +188,7 @@ class FrameToFrame:
         """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
 
         Returns:
-            The pose with its points, or None if there are too few inliers.
+            The pose with the tracked points, or None if too few points are tracked or are inliers.
         """
         current_from_reference = geometry.inverse(predicted)
         points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))
@@ -222,11 +222,14 @@ class FrameToFrame:
 
 
 def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns normalised (x, y, disparity) (n, 3) of stereo points at their left pixels, and its covariance (n, 3, 3).
+    """Returns normalised (x, y, disparity) (n, 3) of stereo points, with (x, y) of their pixels in the left image.
 
     `stereo.fuse` moves a point by half its row difference between the two images. Frames are matched with the left
-    image alone, however, and a systematic row difference (a pitch of one camera) must not appear as motion. The
-    covariance of (x, y) is that before the fusion, which halves the variance of the row.
+    image alone, however, and a systematic row difference (a pitch of one camera) must not appear as motion.
+
+    Returns:
+        The coordinates (n, 3) and their covariance (n, 3, 3). That of (x, y) is the covariance before the fusion, which
+        halves the variance of the row.
     """
     measured, cov = points.measured.copy(), points.cov.copy()
     measured[:, :2] = rig.normalised(points.pixels)
@@ -238,7 +241,12 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
 
 
 def _transported(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of the pose of b, rigidly attached to a, from the covariance of the pose of a."""
+    """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
+
+    Args:
+        cov: (6, 6) covariance of the pose of a, in the axes of a; the result is in the axes of b.
+        a_from_b: (4, 4) pose of b in a.
+    """
     adjoint = geometry.adjoint(geometry.inverse(a_from_b))
     return adjoint @ cov @ adjoint.T
 
@@ -246,9 +254,11 @@ def _transported(cov: Array, a_from_b: Array) -> Array:
 def constant_velocity_motion(
     motion: Array, status: str = "too few points matched"
 ) -> tuple[two_view_motion.Motion, str]:
-    """Returns a motion (4, 4), predicted at constant velocity, as a `Motion` with large covariance, and `status`.
+    """Returns a motion predicted at constant velocity as a `Motion` with a large covariance, and `status` unchanged.
 
-    The status is the reason why the motion was not measured.
+    Args:
+        motion: (4, 4) predicted motion.
+        status: reason why the motion was not measured.
     """
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])

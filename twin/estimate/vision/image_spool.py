@@ -20,8 +20,8 @@ _CACHE_BYTES = 384 * 2**20
 class ImageSpool:
     """Stores stereo pairs on disk as lossless PNG, with a cache of the most recently used grey levels in memory.
 
-    The cache has a fixed size, so memory does not grow with the length of the survey. `gray` may be called from several
-    threads.
+    The size of the cache is limited, so memory does not grow with the length of the survey. `gray` may be called from
+    several threads.
 
     Args:
         folder: folder of the images; created if missing.
@@ -37,11 +37,11 @@ class ImageSpool:
         self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
 
     def put(self, row: int, left: Image, right: Image, gray: tuple[matching.Gray, matching.Gray]) -> None:
-        """Stores the stereo pair of a keyframe.
+        """Stores the stereo pair of a keyframe; another thread writes it to disk.
 
         Args:
             row: index of the frame in the trajectories.
-            left, right: (height, width, 3) images.
+            left, right: (height, width, 3) RGB images at full size.
             gray: grey levels of both images at the binning of the spool (`matching.gray`).
 
         Raises:
@@ -65,7 +65,7 @@ class ImageSpool:
     def close(self) -> None:
         """Waits until all pairs are written, and ends the thread that writes them.
 
-        An error in writing the last pair is not raised.
+        If the last pair cannot be written, no error is raised.
         """
         self._writer.shutdown()
 
@@ -113,7 +113,7 @@ class ImageSpool:
             self._gray.popitem(last=False)
 
     def _write(self, row: int, left: Image, right: Image) -> None:
-        """Writes both images of a pair as PNG."""
+        """Writes both images of a pair to disk as PNG files."""
         for side, image in (("left", left), ("right", right)):
             data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             self._path(row, side).write_bytes(data.tobytes())

@@ -21,14 +21,14 @@ class Keyframe:
         number: index of the keyframe, from 0.
         row: index of its frame in the trajectories.
         track: number of its track, from 1.
-        world_from_camera: (4, 4) best pose estimate so far.
+        world_from_camera: (4, 4) latest estimate of the pose.
         points: matched stereo points; None once a newer keyframe has been added.
         readings: readings of the navigation sensors.
         dvl_displacement: displacement since the previous node, measured by the DVL; None if it was not measured, or if
-            the link to the previous node is the F2F motion, which already includes the DVL.
-        accumulated_cov: (6, 6) sum of the covariances of all motions since the start, minus the part that registrations
-            with the mosaic removed; in world axes [rotation, translation] (rad, m). The difference between the values
-            of two keyframes is the covariance of the motion between them.
+            the link to the previous node is the F2F motion, which already includes the DVL readings.
+        accumulated_cov: (6, 6) sum of the covariances of all motions since the start, minus the decreases due to
+            registrations with the mosaic; in world axes [rotation, translation] (rad, m). The difference between the
+            values of two keyframes is the covariance of the motion between them.
         depth_m: median depth of the matched points [m].
         exposure: exposure of its images; None if it was not reported.
     """

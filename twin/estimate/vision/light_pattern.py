@@ -1,9 +1,9 @@
-"""Light pattern of the cameras: the smooth part of the images that lamps and backscatter fix to the cameras.
+"""Light pattern of the cameras: the smooth part of the images that is due to lamps and backscatter.
 
 The pattern moves with the cameras, not with the floor. In turbid water its gradient exceeds that of the texture of the
-floor, above all where the light of the lamps ends. A matcher that takes the pattern for texture finds the disparity of
-the pattern. The pattern is therefore estimated from the images of many keyframes and subtracted before dense matching,
-unless the texture dominates the pattern.
+floor, above all at the edge of the area that the lamps light. Dense matching would then find the disparity of the
+pattern instead of that of the floor. The pattern is therefore estimated from the images of many keyframes and
+subtracted before dense matching, unless the texture dominates the pattern.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 
 #: Degree, along the rows and along the columns, of the polynomial that describes the pattern. Texture is finer than the
-#: pattern, so the polynomial removes little of it.
+#: pattern, so little of it is removed with the polynomial.
 DEGREE = 6
 
 
@@ -37,6 +37,8 @@ class LightPattern(NamedTuple):
 def pattern_fit(pair: tuple[Map, Map]) -> Array:
     """Returns the coefficients (2, `DEGREE` + 1, `DEGREE` + 1) of Legendre polynomials fitted to each image of a pair.
 
+    The second axis is the degree along the columns of the image, the third axis that along its rows.
+
     Args:
         pair: (H, W) float32 grey levels of the left and the right image.
     """
@@ -49,18 +51,18 @@ def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern
 
     A coefficient of the pattern is its mean m over the n keyframes, multiplied by max(0, 1 - v / m^2), a shrinkage as
     in the positive-part estimator of James & Stein (1961), with v the variance of the mean. A coefficient whose mean
-    does not exceed the standard deviation of this mean is due to texture and relief and is therefore left in the
-    images. Images of neighbouring keyframes overlap, so v = s^2 / n (1 + r) / (1 - r), with s^2 the variance of the
-    coefficient over the keyframes and r the correlation of consecutive keyframes, as in a first-order autoregressive
-    process.
+    does not exceed the standard deviation of this mean is attributed to texture and relief, and is therefore left in
+    the images. Images of neighbouring keyframes overlap, so v = (s^2 / n) (1 + r) / (1 - r), with s^2 the variance of
+    the coefficient over the keyframes and r the correlation of consecutive keyframes, as in a first-order
+    autoregressive process.
 
     The pattern misleads the matching only where it dominates the texture. The result is therefore None if the sum of
-    m^2 over all coefficients, except the mean grey levels, does not exceed the sum of s^2: an image then varies more by
-    the floor in view than by the light of the cameras, and the mean over the keyframes may be that of a part of the
-    floor which most of them show. The result is also None for fewer than two keyframes.
+    m^2 over all coefficients except the constant ones does not exceed the sum of s^2: an image then varies more by the
+    floor in view than by the light of the cameras, and the mean over the keyframes may be that of a part of the floor
+    which most of them show. The result is also None for fewer than two keyframes.
 
     Args:
-        fits: coefficients of the keyframes (`pattern_fit`), in their order.
+        fits: coefficients of the keyframes (`pattern_fit`), in chronological order.
         shape: height and width (H, W) of the images [px].
     """
     if len(fits) < 2:
@@ -77,26 +79,26 @@ def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern
 
 
 def _power_without_mean(squares: Array) -> float:
-    """Returns the sum of squared coefficients (2, d, d) without those of the constant polynomial."""
+    """Returns the sum of the squared coefficients `squares` (2, d, d) without those of the constant polynomial."""
     return float(squares.sum() - squares[:, 0, 0].sum())
 
 
 def _polynomials(n: int) -> Array:
-    """Returns the Legendre polynomials (n, `DEGREE` + 1) at n pixels."""
+    """Returns the values (n, `DEGREE` + 1) of the Legendre polynomials at n pixels that span the interval -1 to 1."""
     return np.asarray(np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, n), DEGREE), np.float64)
 
 
 @lru_cache(maxsize=8)
 def _fitting_matrix(n: int) -> Array:
-    """Returns the pseudo-inverse (`DEGREE` + 1, n) of the polynomials at n pixels."""
+    """Returns the pseudo-inverse (`DEGREE` + 1, n) of the matrix `_polynomials(n)`."""
     return np.asarray(np.linalg.pinv(_polynomials(n)), np.float64)
 
 
 def _images_per_independent_image(deviation: Array) -> float:
-    """Returns (1 + r) / (1 - r), with r the correlation of consecutive images, limited to 0 <= r <= 0.9.
+    """Returns (1 + r) / (1 - r), with r the correlation of consecutive keyframes, limited to 0 <= r <= 0.9.
 
     Args:
-        deviation: (n, 2, d, d) coefficients of the images, less their means.
+        deviation: (n, 2, d, d) coefficients of the keyframes, minus their means.
     """
     power = np.sum(deviation[1:] ** 2 + deviation[:-1] ** 2) / 2
     r = float(np.clip(np.sum(deviation[1:] * deviation[:-1]) / max(power, 1e-12), 0.0, 0.9))

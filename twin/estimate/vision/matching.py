@@ -30,13 +30,13 @@ _FORWARD_BACKWARD_PX = 0.5
 def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
     """Returns the slightly smoothed grey levels (height / binning, width / binning) in which patches are matched.
 
-    Noise limits the matching of binned images, so their grey levels are the mean of the colour bands. Over the coarse
-    floor of the scenario `paper_coarse`, the signal-to-noise ratio of this mean is 1.14 times that of luma, and the
-    final position error is a fifth smaller.
+    Without binning, they are the luma. Noise limits the matching of binned images, so their grey levels are the mean of
+    the three colour bands. Over the coarse floor of the scenario `paper_coarse`, the signal-to-noise ratio of this mean
+    is 1.14 times that of luma, and the final position error is a fifth smaller.
 
     Args:
         rgb: (height, width, 3) image.
-        binning: number of pixels that are averaged along each side.
+        binning: number of pixels along each side that are averaged to one.
     """
     if binning == 1:
         levels = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY).astype(np.float32)
@@ -46,12 +46,12 @@ def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
 
 
 def normalise(levels: Gray) -> Image:
-    """Normalises local mean and contrast of grey levels, so that the light pattern of the lamps is not tracked.
+    """Returns grey levels with normalised local mean and contrast, so that the pattern of the lamps is not tracked.
 
     Returns:
-        (height, width) uint8, local mean 128, local standard deviation about 36 grey levels. The values depend on the
-        surroundings of a pixel, which are completed by reflection at the image border. They therefore do not permit
-        matching to a hundredth of a pixel.
+        (height, width) uint8, with a local mean of about 128 and a local standard deviation of about 36 grey levels,
+        less where the texture is weak. The values depend on the window around a pixel, which is completed by reflection
+        at the image border. They therefore do not permit matching to a hundredth of a pixel.
     """
     mean, square = _local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
@@ -83,7 +83,10 @@ def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
 
 
 def binned(image: Pixels, by: int) -> Pixels:
-    """Returns an image (height, width, ...) with squares of `by` x `by` pixels averaged; they must tile the image."""
+    """Returns an image (height, width, ...) with squares of `by` x `by` pixels averaged to one pixel.
+
+    `by` must divide the height and the width.
+    """
     if by == 1:
         return image
     smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)
@@ -110,9 +113,9 @@ def _normalise(gray, mean, square, normalised):
 def corners(image: Image, count: int, patch_px: int) -> Points:
     """Returns well-textured points, spread over the image, whose patches lie inside it.
 
-    Coarse texture has few corners, and most of its information lies between them. If fewer than half of the requested
-    number of corners are found, but at least one, the points are taken from a grid instead: with texels of 12 px, this
-    reduces the rotation error over three keyframes from 7.6 to 4.5 mrad.
+    The points are corners. Coarse texture has few corners, and most of its information lies between them. If at least
+    one corner but fewer than half of `count` are found, the points are those of a square grid with the strongest
+    texture instead: with texels of 12 px, this reduces the rotation error over three keyframes from 7.6 to 4.5 mrad.
 
     Args:
         image: (height, width) normalised image.
@@ -120,7 +123,7 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
         patch_px: side of the patches [px].
 
     Returns:
-        (n, 2) float32 positions [px], strongest first.
+        (n, 2) float32 positions [px], those with the strongest texture first; none if no corner is found.
     """
     height, width = image.shape
     margin, block = patch_px // 2 + 2, 7
@@ -152,8 +155,8 @@ def track(
         levels: number of pyramid levels above the full image.
 
     Returns:
-        (n, 2) positions in the target [px], and (n,) bool, true where tracking back to the source returns to within
-        half a pixel of the point and the window is inside the target.
+        (n, 2) positions in the target [px], and a mask (n,) that is true where tracking back to the source ends less
+        than half a pixel from the point, and the window is inside the target.
     """
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
@@ -167,7 +170,7 @@ def track(
 def _lucas_kanade(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
 ) -> tuple[Points, Mask]:
-    """Returns the positions (n, 2) in the target [px], and which points were tracked (n,)."""
+    """Returns the positions (n, 2) in the target [px], and a mask (n,) of the points that were tracked."""
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(
         source,
         target,
@@ -182,16 +185,21 @@ def _lucas_kanade(
 
 
 def inside(points: NDArray[np.floating], shape: tuple[int, ...], margin_px: float) -> Mask:
-    """Returns which points (n, 2) are at least `margin_px` from the image border."""
+    """Returns a mask (n,) of the points (n, 2) at least `margin_px` inside an image of `shape` (height, width, ...)."""
     x, y = points[:, 0], points[:, 1]
     return (x >= margin_px) & (y >= margin_px) & (x < shape[1] - margin_px) & (y < shape[0] - margin_px)
 
 
 def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
-    """Returns the factor by which to multiply a covariance that was computed for independent points (n, 2).
+    """Returns the factor by which to multiply a covariance that was computed as if the points were independent.
 
     Overlapping patches share pixels, so their errors are correlated. For a mean over the points, the factor is the
     summed overlap of a patch with all patches, itself included, averaged over the patches (design effect, Kish 1965).
+    It is 1 without points.
+
+    Args:
+        points: (n, 2) centres of the patches [px].
+        patch_px: side of the patches [px].
     """
     if len(points) == 0:
         return 1.0
@@ -200,7 +208,10 @@ def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _summed_overlap(points, patch):
-    """Returns the sum of the overlap fractions over all ordered pairs of square patches, self-pairs included."""
+    """Returns the sum of the overlaps, 0 to 1, over all ordered pairs of patches; a patch also pairs with itself.
+
+    `points` (n, 2) are the centres and `patch` is the side of the patches [px].
+    """
     total = float(len(points))
     for i in range(len(points)):
         for j in range(i):

@@ -1,14 +1,14 @@
 """Local 2.5-D mosaic, and the registration of frames with it (F2M) in six degrees of freedom over any relief.
 
-The mosaic is a raster in world coordinates. Each cell has a normalised brightness, an elevation and the number of the
-keyframe that they come from. Cells are never overwritten, because the pose of the oldest keyframe has drifted least. A
+The mosaic is a raster in world coordinates. Each cell has a normalised brightness, an elevation, and the number of the
+keyframe from which both come. Cells are not overwritten, because the pose of the oldest keyframe has drifted least. A
 frame is registered by direct image alignment: textured cells are projected into the frame, and the pose is adjusted to
 minimise the differences of brightness (Gauss-Newton with Huber weights).
 
-The residuals are dominated not by pixel noise but by errors of height and by uneven illumination, which neighbouring
-cells share. Over a floor of coarse texture, with cells treated as independent, the computed standard deviation of the
-rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore computed as for clustered data
-(Liang & Zeger 1986), with blocks of the image as clusters.
+The residuals are caused less by pixel noise than by errors of height and by uneven illumination, which are correlated
+between neighbouring cells. Over a floor of coarse texture, with cells treated as independent, the computed standard
+deviation of the rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore computed as for
+clustered data (Liang & Zeger 1986), with blocks of the image as clusters.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ class Registration(NamedTuple):
     """Result of a registration with the mosaic.
 
     Args:
-        correction: estimated pose of the frame in the camera at its predicted pose (predicted_from_estimated); its
-            number of points is the number of cells, its residual is in normalised grey levels.
+        correction: pose of the camera at its estimated pose, relative to the camera at its predicted pose
+            (predicted_from_estimated); `n_points` is the number of compared cells, `residual` is in normalised grey
+            levels.
         reference_keyframe: median of the keyframe numbers of the compared cells; at least half of the cells come from
             this keyframe or older ones.
     """
@@ -50,7 +51,7 @@ class Registration(NamedTuple):
 
 
 class Mosaic:
-    """Raster of brightness, elevation and keyframe number, in tiles (`TiledRaster`), so that memory is limited.
+    """Raster of brightness, elevation [m] and keyframe number, in tiles (`TiledRaster`), so that memory is limited.
 
     Args:
         cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
@@ -68,14 +69,14 @@ class Mosaic:
     def add(
         self, number: int, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
     ) -> None:
-        """Fills empty cells of the mosaic from a keyframe.
+        """Fills empty cells of the mosaic from a keyframe; does nothing if no depth is known.
 
         Args:
             number: number of the keyframe.
             image: (height, width) normalised left image.
             depth_m: (height, width) depth [m], NaN where unknown.
             world_from_camera: (4, 4) pose of the keyframe.
-            rig: calibration at the scale of the image.
+            rig: calibration at the scale of the image, with square pixels.
 
         Raises:
             OSError: a tile could not be read or written.
@@ -107,8 +108,8 @@ class Mosaic:
             image: (height, width) normalised frame.
             depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
-            half_window_m: half the side of the square of cells that is used, centred below the camera.
-            rig: calibration at the scale of the image.
+            half_window_m: half the side of the square of cells that is used, centred below the camera [m].
+            rig: calibration at the scale of the image, with square pixels.
 
         Returns:
             The pose correction with its covariance, or None if too few cells are textured, or too few of these are
@@ -142,7 +143,7 @@ class Mosaic:
         return Registration(two_view_motion.Motion(correction, cov, n_used, sigma), int(median))
 
     def _window(self, centre: Array, half_m: float) -> tuple[int, int, int]:
-        """Returns the first row, the first column and the side, in cells, of the square around a position."""
+        """Returns first row, first column and side [cells] of the square of half side `half_m` [m] around `centre`."""
         half = int(np.ceil(half_m / self.cell_m))
         return int(centre[1] / self.cell_m) - half, int(centre[0] / self.cell_m) - half, 2 * half
 
@@ -151,7 +152,12 @@ class Mosaic:
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
         """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
 
-        If at least twice `_MAX_CELLS` cells are textured, a regular subset is returned; if too few are, None.
+        If at least twice `_MAX_CELLS` cells are textured, a regular subset of them is returned. None if fewer than
+        `_MIN_CELLS` are textured, or if the square has fewer than 8 cells along a side.
+
+        Args:
+            centre: (3,) position of the camera in the world [m]; the square is centred below it.
+            half_m: half the side of the square [m].
         """
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
@@ -170,7 +176,7 @@ class Mosaic:
 
 
 def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Returns the magnitude of the brightness gradient [grey levels per cell]; 0 where it is not known."""
+    """Returns the magnitude (rows, cols) of the brightness gradient [grey levels per cell]; 0 where it is not known."""
     strength = np.zeros_like(bright)
     across, along = bright[1:-1, 2:] - bright[1:-1, :-2], bright[2:, 1:-1] - bright[:-2, 1:-1]
     known = height[1:-1, 2:] + height[1:-1, :-2] + height[2:, 1:-1] + height[:-2, 1:-1] + height[1:-1, 1:-1]
@@ -180,10 +186,19 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
 
 @njit(cache=True, nogil=True)
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
-    """Fills empty cells with the mean height of their pixels and the image brightness at the projected cell centre.
+    """Fills the empty cells of a window, in place, from one keyframe.
 
-    With the brightness of the pixels inside the cell instead, registered positions would have a bias of 5 mm, because
-    these pixels are not at the centre of the cell.
+    A cell receives the mean height of the pixels that lie in it, and the image brightness at the projection of its
+    centre. With the brightness of the pixels in the cell instead, registered positions would have a bias of 5 mm,
+    because these pixels are not at the centre of the cell.
+
+    Args:
+        image, depth: (H, W) normalised image, and depth [m].
+        pose, inverse: (4, 4) world_from_camera and camera_from_world.
+        focal, cx, cy: focal length, column and row of the principal point [px].
+        west, south, cell: south-west corner of the window and cell size [m].
+        keyframe: number of the keyframe.
+        brightness, height, number: (rows, cols) layers of the window, NaN in empty cells.
     """
     total = np.zeros(height.shape, np.float32)
     count = np.zeros(height.shape, np.int32)
@@ -216,7 +231,10 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 
 @njit(cache=True, nogil=True)
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """Linearises the brightness residuals of the cells that are visible in the frame.
+    """Linearises the brightness residuals of the cells that are visible in the frame at a known depth.
+
+    The residual is the brightness of the cell minus that of the frame. Cells with larger residuals than `max_residual`
+    are left out.
 
     Args:
         points: (n, 3) positions of the cells in the world [m].
@@ -228,9 +246,10 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
         max_residual: largest brightness residual of an inlier [grey levels].
 
     Returns:
-        Jacobian (m, 6) of the frame's brightness at the projected cells with respect to the motion, with depth from the
-        mosaic; the same Jacobian with depth from the frame; residuals (m,); index of the image block of each residual
-        (m,); and a mask of the cells that are used (n,).
+        Jacobian (m, 6) of the frame's brightness at the projected cells with respect to an increment [rotation,
+        translation] of the pose in camera axes, with depth from the mosaic; the same Jacobian with depth from the
+        frame; residuals (m,); number of the image block of each residual (m,); and a mask (n,) of the m cells that are
+        used.
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS
@@ -269,14 +288,17 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
 
 @njit(cache=True, nogil=True)
 def _normal_equations(jacobian, frame_jacobian, residuals, block):
-    """Computes the weighted normal equations of the motion.
+    """Computes the normal equations of the increment of the pose, with Huber weights.
 
-    The Jacobian with the depth from the frame provides instrumental variables: its errors are independent of the errors
-    of the depth from the mosaic, which would otherwise bias the solution.
+    The Jacobian with the depth from the frame provides the instrumental variables: its errors are independent of the
+    errors of the depth from the mosaic, which would otherwise bias the solution.
+
+    Args:
+        jacobian, frame_jacobian, residuals, block: results of `_linearise`.
 
     Returns:
-        Normal matrix (6, 6), right-hand side (6,), scatter matrix (6, 6) of the right-hand side over the blocks of the
-        image, and the robust standard deviation of the residuals.
+        Normal matrix (6, 6), right-hand side (6,), covariance (6, 6) of the right-hand side from its scatter over the
+        blocks of the image, and the robust standard deviation of the residuals. Zeros for fewer than six residuals.
     """
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     if len(jacobian) < 6:

@@ -1,4 +1,4 @@
-"""Kalman filter of the pose and velocity of the camera between two keyframes."""
+"""Kalman filter of the pose of the camera relative to a reference image, and of its velocity, from frame to frame."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class MotionFilter:
     """Extended Kalman filter of the pose in a reference camera and of the velocity, with white-noise acceleration.
 
     The acceleration of a vehicle is limited. Where the image determines a pose well, the filter follows the measured
-    pose; where it does not (few pixels, noise), the pose follows from the velocity over many frames, and a measurement
-    that contradicts the prediction is rejected. The model is that of constant velocity (Bar-Shalom, Li & Kirubarajan
-    2001, Estimation with Applications to Tracking and Navigation, section 6.2.2). Errors of the pose are motions
-    [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
+    pose; where it does not (few pixels, noise), the pose follows mainly from the velocity estimated over many frames. A
+    measurement that contradicts the prediction is rejected. The model is that of nearly constant velocity (Bar-Shalom,
+    Li & Kirubarajan 2001, Estimation with Applications to Tracking and Navigation, section 6.2.2). Errors of the pose
+    are motions [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
 
     Attributes:
         pose: (4, 4) pose of the last frame in the reference camera.
@@ -40,14 +40,14 @@ class MotionFilter:
         return self._cov[:6, :6]
 
     def restart(self) -> None:
-        """Makes the last frame the reference; the velocity remains."""
+        """Makes the last frame the reference: its pose becomes the identity, exactly; the velocity remains."""
         self.pose = np.eye(4)
         self._cov[:6], self._cov[:, :6] = 0.0, 0.0
 
     def predict(self, interval_s: float) -> None:
-        """Predicts the pose of the next frame, `interval_s` later [s].
+        """Predicts the pose of the next frame, which is `interval_s` later [s].
 
-        The velocity is constant; after `braking.BLIND_S` without a measurement it decays.
+        The velocity is kept; after `braking.BLIND_S` without a measurement, it decays (`braking_factor`).
         """
         self.velocity = braking_factor(self._blind_s, interval_s) * self.velocity
         self._blind_s += interval_s
@@ -84,9 +84,9 @@ def _acceleration_cov(interval_s: float) -> Array:
     density is such that the standard deviation of the change of velocity is `_ACCELERATION` times the interval.
 
     An acceleration that is constant within the interval (section 6.3.2) would change the velocity by exactly twice the
-    change of position divided by the interval. With exactly measured poses, the filter would then reverse the sign of
-    its velocity error at each frame instead of reducing it (an alpha-beta filter with beta = 2), so that small
-    irregular motions would add up.
+    change of position that it causes, divided by the interval. With exactly measured poses, the filter would then
+    reverse the sign of its velocity error at each frame instead of reducing it (an alpha-beta filter with beta = 2), so
+    that small irregular motions would add up.
 
     Args:
         interval_s: length of the interval [s].

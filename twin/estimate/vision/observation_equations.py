@@ -1,8 +1,8 @@
 """Linearised observation equations of camera motion, in one image and between two stereo pairs (compiled).
 
-Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f; disparity is also divided by f, so
-depth = baseline / disparity. The functions are compiled, because a keyframe with five links needs 30 least-squares
-solutions (six iterations per link) with 500 points each.
+Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f, with the principal point (cx, cy) and the focal
+length f [px]. Disparity is also divided by f, so depth = baseline / disparity. The functions are compiled, because a
+keyframe with five links needs 30 least-squares solutions (six iterations per link) with 500 points each.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _MIN_DISPARITY = 1e-4  # keeps adjusted points in front of the camera
 class PairMeasurements(NamedTuple):
     """Measurements of the same n points in two stereo pairs, a (earlier) and b (later).
 
-    In frame-to-frame motion (`f2f`), a is the current image, without measured disparity, and b its reference.
+    In frame-to-frame motion (`f2f`), a is the current image, without measured disparity, and b the reference image.
 
     Args:
         a: (n, 3) normalised (x, y, disparity) in pair a.
@@ -39,10 +39,11 @@ class LinearisedObservations(NamedTuple):
     """Observation equations of n points in two stereo pairs, linearised at a motion and a structure.
 
     Args:
-        residual: (n, 3) measurements in a, minus their prediction from the measurements in b.
+        residual: (n, 3) measurements in a, minus their linearised prediction from the measurements in b.
         jacobian_point: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b.
-        jacobian_motion: (n, 3, p) derivative of the prediction with respect to the p unknowns: the twist of the motion
-            a_from_b (p = 6) and, after it, the amplitude of pixel locking if that is estimated (p = 7).
+        jacobian_motion: (n, 3, p) derivative of the prediction with respect to the p unknowns: the increment of the
+            motion a_from_b, a twist in the axes of b (p = 6), and the amplitude of pixel locking if that is estimated
+            too (p = 7).
         information: (n, 3, 3) inverse covariance of the residual.
         normalised_residual: (n,) Mahalanobis distance of the residual, divided by sqrt(3).
     """
@@ -77,7 +78,7 @@ def image_jacobian(x, y, depth):
 
 @njit(cache=True, nogil=True)
 def normal_equations(jacobian, weight, residual):
-    """Returns the normal matrix (6, 6) and right-hand side (6,) of weighted least squares.
+    """Returns the normal matrix (6, 6) and the right-hand side (6,) of a weighted least-squares problem.
 
     Args:
         jacobian: (n, k, 6) derivatives of k observations per point.
@@ -105,8 +106,8 @@ def transfer(points_b, a_from_b, baseline):
         baseline: baseline of the rig [m].
 
     Returns:
-        (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point (n, 3, 3) and to the
-        twist of the motion (n, 3, 6).
+        (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an
+        increment [rotation, translation] (rad, m) of the motion in the axes of b (n, 3, 6).
     """
     n = len(points_b)
     points_a, jacobian_point, jacobian_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
@@ -186,7 +187,7 @@ def _invert(m, out):
 
 @njit(cache=True, nogil=True)
 def motion_normal_equations(observations, weight):
-    """Returns the normal equations of the motion, with the structure eliminated.
+    """Returns the normal equations of the unknowns of the motion, with the structure eliminated.
 
     Args:
         observations: `LinearisedObservations`.
@@ -194,7 +195,7 @@ def motion_normal_equations(observations, weight):
 
     Returns:
         For the p unknowns of `observations`: normal matrix (p, p), right-hand side (p,), and derivative (p, 3) of the
-        right-hand side with respect to a bias in (x, y, disparity) that all points share.
+        right-hand side with respect to biases of x, y and disparity in a that are the same at all points.
     """
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     count = jacobian.shape[2]
@@ -224,10 +225,12 @@ def motion_normal_equations(observations, weight):
 def adjust_structure(observations, measured, update):
     """Returns the adjusted points (n, 3) of stereo pair b, normalised (x, y, disparity), after an update of the motion.
 
+    Disparities are at least 1e-4, so that the points stay in front of the camera.
+
     Args:
         observations: `LinearisedObservations`.
         measured: `PairMeasurements` from which `observations` were computed.
-        update: (p,) solution of the motion's normal equations.
+        update: (p,) solution of the normal equations.
     """
     b, cov_b = measured.b, measured.cov_b
     structure = b.copy()

@@ -1,4 +1,4 @@
-"""Measurement of a link: points of a keyframe are matched in an earlier one, and the relative pose is estimated."""
+"""Measurement of a link: points of a node are matched in the images of an earlier node, and the motion is estimated."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LEVELS = 2  # pyramid levels above the full image; predicted positions may be w
 
 
 class MatchedPair(NamedTuple):
-    """Points that were matched in the stereo pairs of two nodes.
+    """Points that were matched in the stereo pairs of two nodes, n of them.
 
     Args:
         measured: measurements of the points in the earlier pair a and in the later pair b.
@@ -52,7 +52,7 @@ class PairMatcher:
         self._workers.shutdown()
 
     def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[MatchedPair | None]:
-        """Matches the points of a node in both images of each of the other nodes, two nodes at a time.
+        """Matches the points of a node in both images of each of the other nodes, in two parallel threads.
 
         Returns:
             For each of the other nodes, the points measured in its stereo pair (a) and in that of `node` (b); None for
@@ -79,6 +79,12 @@ class PairMatcher:
 
         Matching starts at positions predicted from the poses and the depth. Each patch is warped according to a plane
         fitted to the disparities around its point.
+
+        Args:
+            node: node whose points are matched.
+            points: its stereo points.
+            templates: patches around the points, per pyramid level.
+            other: the other node.
         """
         rig = self.rig
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
@@ -107,10 +113,10 @@ class PairMatcher:
         )
 
     def _locking_in_node(self, points: stereo.StereoPoints) -> Array:
-        """Returns the derivative (n, 3) of (x, y, disparity), normalised, with respect to the pixel-locking amplitude.
+        """Returns the derivative (n, 3) [1/px] of a node's measurements with respect to the amplitude of pixel locking.
 
-        The unit is 1/px. The patches are centred at whole pixels of the left image, so only their positions in the
-        right image are biased.
+        The measurements are normalised (x, y, disparity). The patches are centred at whole pixels of the left image, so
+        only their positions in the right image are biased.
         """
         left_px, shift_px = self._project(points.measured)
         warp = np.tile(np.eye(2), (len(left_px), 1, 1))
@@ -127,9 +133,9 @@ class PairMatcher:
         return in_left & in_right
 
     def _project(self, points: Array) -> tuple[Array, Array]:
-        """Returns left-image positions (n, 2) of normalised points (n, 3), and offsets (disparity, 0) (n, 2) [px].
+        """Returns the left-image positions (n, 2) [px] of normalised points (n, 3), and their offsets (n, 2) [px].
 
-        The position in the right image is the position in the left image minus the offset.
+        An offset is (disparity, 0); the position in the right image is that in the left image minus the offset.
         """
         left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
@@ -137,11 +143,11 @@ class PairMatcher:
     def motion(self, node: Keyframe, other: Keyframe, matched: MatchedPair) -> two_view_motion.Motion | None:
         """Estimates the pose of `node` in the axes of `other` from their matched points, jointly with the structure.
 
-        The estimate starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the predicted poses if
-        the closed form fails.
+        The estimation starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the motion between the
+        current poses of the nodes if the closed form fails.
 
         Returns:
-            The motion, or None if too few of the matched points are inliers.
+            The motion, or None if too few points are matched or too few of them are inliers.
         """
         measured = matched.measured
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera

@@ -4,8 +4,8 @@ Systematic errors of patch matching, measured against the simulated truth, and t
 
 - A patch on a slanted surface appears sheared in the other image. A square window there covers a different part of
   the floor, with different relief, which biased the motion between legs by 0.4 mrad with patches of 21 px. Each patch
-  is therefore warped by the plane that stereo measures around its point, so that it covers the same part of the floor
-  in all images.
+  is therefore warped according to the plane that stereo measures around its point, so that it covers the same part of
+  the floor in all images.
 - The lamps move with the vehicle, so the illumination of a point changes between images. If the change varies across
   the patch, the match is shifted by about the squared correlation length of the texture times the gradient of the
   change (0.01 px on a lamp-lit reef, with the same sign at every step). Linear gradients of brightness and of contrast
@@ -13,12 +13,13 @@ Systematic errors of patch matching, measured against the simulated truth, and t
 - Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. With cubic
   B-splines the bias is 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images
   (`matching.gray`).
-- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, which cuts off its
-  window, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 to 0.6 mrad relative to the
-  next. Grey levels are therefore matched without normalisation; the nuisance parameters absorb brightness and contrast.
+- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
+  cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 to 0.6 mrad relative to the
+  next. Grey levels are therefore matched without normalisation; the nuisance parameters account for differences of
+  brightness and contrast.
 
-Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), coarse to
-fine, with cubic B-spline interpolation (Unser 1999).
+Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), from
+coarse to fine pyramid levels, with cubic B-spline interpolation (Unser 1999).
 """
 
 from __future__ import annotations
@@ -48,13 +49,13 @@ _NUISANCES = 6  # brightness, contrast, and the linear gradients of both in colu
 
 
 class PatchTemplates(NamedTuple):
-    """n patches of one image, prepared for matching, with m pixels each.
+    """Patches of one image at one pyramid level, prepared for matching: n patches of m pixels each.
 
     Args:
         half: half side of a patch, (side - 1) / 2 [px].
         offset: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
-        energy: (n,) sum of squared deviations from the patch's mean; 0 if the patch cannot be matched, because it is
-            too uniform, or not inside the image with a margin of one pixel.
+        energy: (n,) sum of squared deviations of the grey levels from the patch's mean; 0 if the patch cannot be
+            matched, because it is too uniform, or not inside the image with a margin of one pixel.
         gradient: (n, 2, m) image gradient, with the nuisance parameters projected out.
         nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients
             of both with respect to column and row.
@@ -72,9 +73,10 @@ class PatchMatches(NamedTuple):
 
     Args:
         points: (n, 2) positions in the target [px].
-        ok: (n,) bool, true if the match converged and its correlation with the template is high enough.
+        ok: (n,) bool, true if the match converged and its correlation with the template is above 0.7.
         cov: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the
-            noise of both, in the axes of the source image [px^2]; estimated from the texture and the residuals.
+            noise of both, in the pixels and axes of the source image [px^2]; estimated from the texture and the
+            residuals.
     """
 
     points: Array
@@ -111,9 +113,9 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
 
 
 def spline_coefficients(images: Sequence[Image]) -> list[Spline]:
-    """Returns the coefficients of the cubic B-spline that interpolates each image (height, width).
+    """Returns the coefficients (height, width) of the cubic B-spline that interpolates each image (height, width).
 
-    The impulse response of the prefilter decays by a factor of 0.27 per pixel, so it is truncated at 7 px.
+    The impulse response of the filter decays by a factor of 0.27 per pixel, so it is truncated at 7 px.
     """
     kernel = np.sqrt(3.0) * (np.sqrt(3.0) - 2) ** np.abs(np.arange(-7, 8))
     kernel /= kernel.sum()
@@ -149,12 +151,12 @@ def match_templates(
 
 
 def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floating], patch_px: int) -> Array:
-    """Returns the disparity gradient over each patch, from a plane fitted to the disparities.
+    """Returns the gradient of the disparity over each patch, from a plane fitted to the disparities.
 
     Args:
         disparity_px: (height, width) disparity map [px], NaN where unknown.
-        points: (n, 2) whole pixels inside the map.
-        patch_px: side of the patch.
+        points: (n, 2) patch centres, whole pixels inside the map.
+        patch_px: side of the patch (odd).
 
     Returns:
         (n, 2) derivative of the disparity with respect to column and row [px/px]; 0 where it is unknown.
@@ -204,7 +206,10 @@ def _slope(disparity, points, half):
 
 @njit(cache=True, nogil=True)
 def _extract(source, centres, half):
-    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches at `centres` (n, 2)."""
+    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches at `centres` (n, 2) [px].
+
+    See `PatchTemplates`; gradient and basis are undefined where the energy is 0.
+    """
     count, m = len(centres), (2 * half + 1) ** 2
     energy = np.zeros(count)
     gradient, nuisance = np.empty((count, 2, m), np.float32), np.empty((count, _NUISANCES, m), np.float32)
@@ -223,8 +228,8 @@ def _extract(source, centres, half):
 def _prepare(source, u0, v0, half, rows):
     """Prepares a patch of m pixels for matching: writes its nuisance basis and projected gradient to `rows` (8, m).
 
-    Gram-Schmidt orthogonalisation makes rows 0 to 5, the basis of the nuisance parameters (`PatchTemplates`),
-    orthonormal, and rows 6 and 7, the gradient in column and row, orthogonal to them.
+    By Gram-Schmidt orthogonalisation, rows 0 to 5, the basis of the nuisance parameters (`PatchTemplates`), are
+    orthonormal, and rows 6 and 7, the gradients in column and in row, are orthogonal to them.
 
     Returns:
         The sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
@@ -267,7 +272,7 @@ def _prepare(source, u0, v0, half, rows):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_REASSOCIATE)
 def _dot(a, b):
-    """Returns the dot product of two vectors, summed in double precision."""
+    """Returns the dot product of two vectors (n,), summed in double precision."""
     total = 0.0
     for m in range(len(a)):
         total += float(a[m]) * float(b[m])
@@ -276,7 +281,9 @@ def _dot(a, b):
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=True)
 def _sample(spline, u0, v0, warp, half, values):
-    """Writes the cubic B-spline values (m,) of the target under a warped patch centred at (u0, v0) to `values`.
+    """Writes the values of the target's cubic B-spline at the m pixels of a warped patch to `values` (m,).
+
+    The centre of the patch is at column u0 and row v0 of the target.
 
     For speed, positions relative to the centre are in single precision, and unsigned indices avoid a check for
     negative values.
@@ -311,8 +318,15 @@ def _sample(spline, u0, v0, warp, half, values):
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
     """Matches patches at one pyramid level.
 
+    Args:
+        energies, gradients, nuisances, half: see `PatchTemplates`.
+        spline: spline coefficients of the target at this level.
+        guess: (n, 2) expected positions [px of this level].
+        warps: (n, 2, 2) derivative of target pixels with respect to source pixels.
+        tolerance: the iteration ends at a step whose absolute column and row components sum to less [px of this level].
+
     Returns:
-        Positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zero where matching failed.
+        Positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where matching failed.
     """
     n = (2 * half + 1) ** 2
     height, width = spline.shape

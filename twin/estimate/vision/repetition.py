@@ -21,7 +21,7 @@ def repetition(image: Image, patch_px: int) -> float:
 
     Args:
         image: (height, width) normalised image (`matching.normalise`).
-        patch_px: side of the matched patches; smaller shifts belong to the main peak.
+        patch_px: side of the matched patches [px]; smaller shifts belong to the main peak.
     """
     taper, weight = _taper(*image.shape)
     correlation = _autocorrelation((image.astype(np.float64) - image.mean()) * taper)
@@ -36,16 +36,16 @@ def repetition(image: Image, patch_px: int) -> float:
 
 @lru_cache(maxsize=4)
 def _taper(height: int, width: int) -> tuple[Array, Array]:
-    """Returns the taper (height, width) for images of this size, and its autocorrelation."""
+    """Returns the taper (height, width), a Hann window, for images of this size, and its autocorrelation."""
     taper = np.outer(np.hanning(height), np.hanning(width))
     return taper, _autocorrelation(taper)
 
 
 def _autocorrelation(values: Array) -> Array:
-    """Returns the autocorrelation (rows, columns) of zero-padded values; the indices are the shifts.
+    """Returns the autocorrelation of zero-padded values (height, width), indexed by the shifts in row and in column.
 
-    Row shifts are from 0 to half the height; negative column shifts follow the positive ones, as in a discrete Fourier
-    transform.
+    Row shifts are from 0 up to half the height; negative column shifts follow the positive ones, as in a discrete
+    Fourier transform.
     """
     shape = [cv2.getOptimalDFTSize(2 * side) for side in values.shape]
     spectrum = np.abs(np.fft.rfft2(values, shape)) ** 2

@@ -23,15 +23,15 @@ class StereoPoints(NamedTuple):
 
     Args:
         pixels: (n, 2) whole pixels in the left image.
-        disparity_slope: (n, 2) derivative of the disparity around each point with respect to column and row [px/px].
+        disparity_slope: (n, 2) gradient of the disparity at each point with respect to column and row [px/px].
         mean_disparity_px: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of
             the point and is used to predict whether the point lies inside another image.
-        measured: (n, 3) normalised (x, y, disparity).
+        measured: (n, 3) normalised (x, y, disparity), with x and y in the left image.
         cov: (n, 3, 3) covariance of each point in `measured`.
-        xyz: (n, 3) positions in the left camera [m].
+        xyz: (n, 3) positions in the axes of the left camera [m].
         row_difference_px: (n,) row in the right image minus row in the left image [px].
         noise_ratio: ratio of the measured to the expected standard deviation of the row differences
-            (`row_noise_ratio`); the matching noise in `cov` includes this factor.
+            (`row_noise_ratio`); `cov` was computed with matching noise that is larger by this factor.
     """
 
     pixels: NDArray[np.float32]
@@ -53,14 +53,14 @@ class StereoPoints(NamedTuple):
 
 
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns (x, y, disparity) and its covariance from a patch's positions in both images of a rectified pair.
+    """Returns (x, y, disparity) of points and their covariance from their positions in both images of a rectified pair.
 
     The left column determines x and is also part of the disparity, so x and disparity are correlated. The rows of both
-    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if column
-    and row errors are correlated.
+    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if the
+    errors of column and row are correlated.
 
     Args:
-        left, right: (n, 2) positions [px].
+        left, right: (n, 2) positions in the left and in the right image [px].
         cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
         rig: calibration, with square pixels.
 
@@ -78,13 +78,13 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
 
 
 def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> Array:
-    """Returns the shift (n, 3) of the normalised (x, y, disparity) from `fuse` caused by shifts of its input positions.
+    """Returns the shifts (n, 3) of the results (x, y, disparity) of `fuse` that shifts of its input positions cause.
 
-    The constraint of equal rows moves each row by half their difference. It also corrects the columns by regression on
-    the rows; the regression coefficient is the ratio of two elements of the fused covariance.
+    The constraint of equal rows moves each of the two rows by half their difference. It also corrects the columns by
+    regression on the rows; the regression coefficient is the ratio of two elements of the fused covariance.
 
     Args:
-        left, right: (n, 2) shifts of the positions [px].
+        left, right: (n, 2) shifts of the positions in the left and in the right image [px].
         fused_cov: (n, 3, 3) covariance returned by `fuse`.
         rig: calibration, with square pixels.
     """
@@ -97,12 +97,12 @@ def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
     """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1.
 
     A point has the same row in both images of a rectified pair, so the row differences of a stereo pair measure the
-    matching noise. Their median, which calibration errors cause, is subtracted first; their standard deviation is the
-    normalised median absolute deviation. Returns 1 for fewer than 30 points, and for a ratio that does not exceed 1
-    significantly, i.e. by two standard errors of 1.17 / sqrt(n).
+    matching noise. Their median, which calibration errors cause, is subtracted first; the ratio is then 1.4826 times
+    the median of the absolute differences divided by their expected standard deviations. The result is 1 for fewer than
+    30 points, and for a ratio that does not exceed 1 by two standard errors of 1.17 / sqrt(n).
 
     Args:
-        left, right: (n, 2) positions of the patches [px].
+        left, right: (n, 2) positions of the patches in the left and in the right image [px].
         cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
     """
     n = len(left)
@@ -115,12 +115,16 @@ def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
 
 
 def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the matches (n, 2) with a row difference below 1 px and a disparity above 0.5 px."""
+    """Returns a mask (n,) of the matches with a row difference below 1 px and a disparity above 0.5 px.
+
+    Args:
+        left, right: (n, 2) positions in the left and in the right image [px].
+    """
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
 def margin_px(patch_px: int) -> int:
-    """Returns the minimum distance of an accepted patch's predicted centre from the image border [px]."""
+    """Returns the smallest distance from the image border that the predicted centre of a patch must have [px]."""
     return patch_px // 2 + _BORDER_PX
 
 
@@ -142,7 +146,14 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
 def corners_with_disparity(
     left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and the disparities (n,) [px]."""
+    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and their disparities (n,) [px].
+
+    Args:
+        left: (H, W) grey levels.
+        dense_px: (H, W) disparity [px], NaN where unknown.
+        count: largest number of corners.
+        patch_px: side of the patches, which lie inside the image [px].
+    """
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])
@@ -163,7 +174,7 @@ def match_stereo_points(
         left, right: (height, width) grey levels (`matching.gray`).
         dense_px: (height, width) initial disparity, NaN where unknown [px].
         rig: calibration at the scale of the images, with square pixels.
-        count: maximum number of corners.
+        count: largest number of corners.
         patch_px: side of the matched patches (odd).
     """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
@@ -185,7 +196,7 @@ def match_stereo_points(
 
 
 def _local_mean(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
-    """Returns the mean of the known disparities in a square around each pixel (H, W); 0 if none is known [px]."""
+    """Returns the mean (H, W) [px] of the known disparities in a square around each pixel; 0 if none is known."""
     known = np.isfinite(dense_px)
     total, count = (
         cv2.boxFilter(part, cv2.CV_32F, (side_px, side_px), normalize=False)

@@ -1,4 +1,4 @@
-"""Unbounded raster in square tiles: the most recently used tiles are kept in memory, the others on disk."""
+"""Raster of unlimited extent in square tiles; the most recently used tiles are kept in memory, the others on disk."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class TiledRaster:
         """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col).
 
         Raises:
-            OSError: a tile could not be read from disk, or another one could not be moved there.
+            OSError: a tile could not be read from disk, or another one could not be moved to disk.
         """
         window = np.full((self.n_layers, max(rows, 0), max(cols, 0)), np.nan, np.float32)
         for key, in_tile, in_window in _overlapping_tiles(row, col, rows, cols):
@@ -45,7 +45,7 @@ class TiledRaster:
         """Writes a window (n_layers, rows, cols) whose first cell is (row, col).
 
         Raises:
-            OSError: a tile could not be read from disk, or another one could not be moved there.
+            OSError: a tile could not be read from disk, or another one could not be moved to disk.
         """
         for key, in_tile, in_window in _overlapping_tiles(row, col, *window.shape[1:]):
             if key in self._tiles or key in self._spooled or not np.isnan(window[in_window]).all():
@@ -59,7 +59,7 @@ class TiledRaster:
         self._spooled.clear()
 
     def _tile(self, key: tuple[int, int]) -> Layers:
-        """Returns a tile (n_layers, TILE_SIDE, TILE_SIDE), not a copy; loads or creates it if it is not in memory."""
+        """Returns a tile (n_layers, `TILE_SIDE`, `TILE_SIDE`), not a copy; loads or creates it if not in memory."""
         if key not in self._tiles:
             if key in self._spooled:
                 self._tiles[key] = np.load(self._path(key))
@@ -83,7 +83,10 @@ class TiledRaster:
 def _overlapping_tiles(
     row: int, col: int, rows: int, cols: int
 ) -> Iterator[tuple[tuple[int, int], tuple[slice, ...], tuple[slice, ...]]]:
-    """Yields the key of each tile that overlaps a window, and the overlap as slices of the tile and of the window."""
+    """Yields the key of each tile that overlaps a window, and the overlap as slices of the tile and of the window.
+
+    The key is (row // `TILE_SIDE`, column // `TILE_SIDE`) of the cells of the tile.
+    """
     for i in range(row // TILE_SIDE, -(-(row + rows) // TILE_SIDE)):
         for j in range(col // TILE_SIDE, -(-(col + cols) // TILE_SIDE)):
             top, left = max(row, i * TILE_SIDE), max(col, j * TILE_SIDE)

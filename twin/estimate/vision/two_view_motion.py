@@ -38,14 +38,14 @@ class Motion(NamedTuple):
 
     Args:
         a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
-        cov: (6, 6) covariance of the motion [rotation, translation], in the axes of b (rad, m).
+        cov: (6, 6) covariance of the motion [rotation, translation] (rad, m), in the axes of b.
         n_points: number of inliers.
-        residual: robust standard deviation of the residuals, in normalised coordinates (`frame_motion`), divided by its
-            expected value (`pair_motion`) or in grey levels (`mosaic`); infinite for a predicted motion.
-        closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) that the estimate started from;
+        residual: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), divided by its
+            expected value (`pair_motion`), or in grey levels (`mosaic`); infinite for a predicted motion.
+        closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started;
             None if it started from another motion.
-        disparity_offset: offset of all disparities that the points of two stereo pairs imply (`pair_motion`); None if
-            it is not estimated.
+        disparity_offset: offset of all disparities, estimated from the points of two stereo pairs (`pair_motion`); None
+            if it is not estimated.
     """
 
     a_from_b: Array
@@ -60,11 +60,11 @@ class PairMotionSettings(NamedTuple):
     """Stochastic model and number of iterations of `pair_motion`.
 
     Args:
-        common_sigma: standard deviation of a bias that all points share in each of x, y and disparity, normalised. Its
-            effect does not average out over the points.
+        common_sigma: standard deviation of the biases of x, y and disparity, each of which is the same at all points;
+            normalised. Their effect does not average out over the points.
         variance_inflation: factor on the covariance for correlated points (`matching.variance_inflation`).
         n_measured: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has
-            a large variance in `cov_a`.
+            a large variance in `PairMeasurements.cov_a`.
         iterations: number of Gauss-Newton iterations.
         locking: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated
             with the motion; None: the amplitude is not estimated.
@@ -84,7 +84,7 @@ _DEFAULT_SETTINGS = PairMotionSettings()
 
 
 def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Array) -> tuple[Array, Array]:
-    """Returns the weighted least-squares twist from flow and depth (Negahdaripour & Madjidi 2003, eq. 2).
+    """Returns the weighted least-squares twist of the camera from flow and depth (Negahdaripour & Madjidi 2003, eq. 2).
 
     Args:
         x, y: (n,) normalised image coordinates.
@@ -93,7 +93,7 @@ def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Ar
         weight: (n,) weights of the points.
 
     Returns:
-        Twist (6,) and normal matrix (6, 6).
+        Twist (6,) [rotation, translation] (rad, m) and normal matrix (6, 6).
     """
     normal, right = normal_equations(image_jacobian(x, y, depth), weight, flow)
     return np.asarray(np.linalg.solve(normal, right), np.float64), normal
@@ -102,7 +102,7 @@ def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Ar
 def frame_motion(points: Array, observed: Array, guess: Array, iterations: int = 4) -> Motion | None:
     """Estimates the motion from 3-D points in one camera and their image positions in the next frame.
 
-    Iterates eq. (2) of Negahdaripour & Madjidi 2003 with Huber weights.
+    Iterates eq. (2) of Negahdaripour & Madjidi 2003 with Huber weights, which are 0 beyond five standard deviations.
 
     Args:
         points: (n, 3) positions in the earlier camera [m].
@@ -135,12 +135,12 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
 def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
     """Estimates the motion between two stereo pairs, taking the depth from the later pair b as exact.
 
-    Iterates the closed form of Negahdaripour & Madjidi 2003 (eq. 2) with Huber weights. This is fast, but depth errors
-    bias the estimate. The disparity in the earlier pair a is not used.
+    Iterates the closed form of Negahdaripour & Madjidi 2003 (eq. 2) with Huber weights (`frame_motion`). This is fast,
+    but depth errors bias the estimate. The disparity in the earlier pair a is not used.
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
-        baseline_m: baseline of the rig.
+        baseline_m: baseline of the rig [m].
         guess: (4, 4) initial pose of b in a.
 
     Returns:
@@ -164,7 +164,8 @@ def pair_motion(
     Both pairs measure each point as z = (x, y, disparity) with covariance C; the true point in b is unknown. Let g be
     the transfer of a point from b to a by the motion. With e = z_a - g(z_b) and G = dg/dz_b, the structure is
     eliminated: the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed adjustment
-    model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003). Residuals have Huber weights.
+    model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003). The points have Huber weights, which are 0
+    beyond `CUTOFF` standard deviations.
 
     If the estimated amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), the motion is
     estimated without it. This happens over a level floor, where all points have nearly the same sub-pixel position: a
@@ -172,7 +173,7 @@ def pair_motion(
 
     Args:
         measured: points in the earlier pair a and the later pair b.
-        baseline_m: baseline of the rig.
+        baseline_m: baseline of the rig [m].
         guess: (4, 4) initial pose of b in a.
         settings: stochastic model and number of iterations.
 
@@ -213,7 +214,7 @@ class _WeightedNormals(NamedTuple):
         normal: (p, p) normal matrix, `prior` included.
         prior: (p, p) prior information.
         right: (p,) right-hand side.
-        bias_jacobian: (p, 3) derivative of `right` with respect to a bias in x, y and disparity that all points share.
+        bias_jacobian: (p, 3) derivative of `right` with respect to the common biases of x, y and disparity.
     """
 
     observations: LinearisedObservations
@@ -228,7 +229,10 @@ class _WeightedNormals(NamedTuple):
 def _with_locking(
     observations: LinearisedObservations, locking: PixelLocking, amplitude_px: float
 ) -> LinearisedObservations:
-    """Returns the observations with the amplitude of pixel locking as seventh unknown, linearised at `amplitude_px`."""
+    """Returns the observations with the amplitude of pixel locking as seventh unknown, linearised at `amplitude_px`.
+
+    The residuals are reduced by the effect of this amplitude.
+    """
     moved = np.einsum("nij,nj->ni", observations.jacobian_point, locking.b)
     derivative = locking.a - moved  # of the predicted measurements with respect to the amplitude
     residual = observations.residual - derivative * amplitude_px
@@ -243,7 +247,7 @@ def _with_locking(
 def _weighted_normals(
     observations: LinearisedObservations, amplitude_px: float, settings: PairMotionSettings
 ) -> _WeightedNormals:
-    """Returns the normal equations with Huber weights, and with the prior on the pixel-locking amplitude."""
+    """Returns the normal equations with Huber weights and, if the pixel-locking amplitude is estimated, its prior."""
     size = observations.normalised_residual
     scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
     weight = _huber_weights(size, scale, CUTOFF)
@@ -256,7 +260,7 @@ def _weighted_normals(
 
 
 def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
-    """Returns the covariance (6, 6) of the motion due to the noise of the points and the bias that they share."""
+    """Returns the covariance (6, 6) of the motion due to the noise of the points and to their common biases."""
     bias_root = np.linalg.solve(normals.normal, normals.bias_jacobian) * settings.common_sigma
     if settings.measured_scatter:
         noise_cov = _scatter_cov(normals, settings.n_measured)
@@ -267,10 +271,11 @@ def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
 
 
 def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -> DisparityOffset | None:
-    """Returns the offset of all disparities, as an additional unknown of the last Gauss-Newton step.
+    """Returns the offset of all disparities [focal lengths], an additional unknown of the last Gauss-Newton step.
 
     The derivative of the residual z_a - g(z_b) with respect to an offset of both disparities is u - G u, with u the
-    unit vector along the disparity. None if disparity is not measured in both pairs, or if it cannot be estimated.
+    unit vector along the disparity (z, g and G as in `pair_motion`). None if disparity is not measured in both pairs,
+    or if the offset cannot be estimated.
     """
     if settings.n_measured < 3:
         return None
@@ -298,7 +303,8 @@ def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     a point in the linear part of this function contributes its weight times (k - 1) / k, the mean over the k measured
     coordinates of its residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points
     determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
-    counts as 50 points. The prior information is added to M, and times the squared scale of the residuals to S.
+    counts as 50 points. The prior information is added to M; multiplied by the squared scale of the residuals, it is
+    added to S.
 
     Args:
         normals: normal equations at the last iteration.

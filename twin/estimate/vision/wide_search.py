@@ -23,18 +23,19 @@ _CONFIDENCE, _ITERATIONS = 0.999, 500
 def coarse_motion(
     node: matching.Gray, other: matching.Gray, points: StereoPoints, rig: StereoRig, patch_px: int
 ) -> Array | None:
-    """Returns the pose (4, 4) of a node in the left camera of another one; None if too few features agree.
+    """Returns the pose (4, 4) of the left camera of a node in that of another node; None if too few features agree.
 
-    SIFT features (Lowe 2004) of the left images are matched by their descriptors. The features of the node get their
-    depth from the nearest matched stereo point within a patch side. The pose follows from the points and their pixels
-    in the other image (perspective-n-point with RANSAC). The error of the pose displaces points by one or two pixels,
-    so the pose serves as a prediction for the measurement of a link.
+    SIFT features (Lowe 2004) of the left images are matched by their descriptors. The depth of a feature of the node
+    follows from the nearest matched stereo point at a distance of up to one patch side; features without such a point
+    are left out. The pose is computed from the 3-D features and their pixels in the other image (perspective-n-point
+    with RANSAC). Its error displaces points by one or two pixels, so it serves as a prediction for the measurement of a
+    link.
 
     Args:
         node, other: (H, W) grey levels of the left images.
         points: matched stereo points of the node.
         rig: calibration at the scale of the images.
-        patch_px: largest distance of a feature from a stereo point [px].
+        patch_px: side of the patches, the largest distance of a feature from a stereo point [px].
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
     node_px, node_descriptors = _features(sift, node)
@@ -63,7 +64,7 @@ def coarse_motion(
 
 
 def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Returns positions (n, 2) [px] and descriptors (n, 128) of the features of an image."""
+    """Returns positions (n, 2) [px] and descriptors (n, 128) of the SIFT features of an image (H, W)."""
     levels = np.clip(matching.normalise(np.asarray(image, np.float32)), 0, 255).astype(np.uint8)
     found, descriptors = sift.detectAndCompute(levels, None)
     pixels = np.array([feature.pt for feature in found], np.float64).reshape(-1, 2)
@@ -73,7 +74,13 @@ def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64]
 def _at_features(points: StereoPoints, nearest: NDArray[np.int64], pixels: Array, rig: StereoRig) -> Array:
     """Returns the positions (n, 3) [m] of features at `pixels` (n, 2), in the axes of the left camera.
 
-    The disparity of a feature is extrapolated linearly from its nearest stereo point.
+    The disparity of a feature is extrapolated linearly from a stereo point, with the slope of the disparity there.
+
+    Args:
+        points: stereo points.
+        nearest: (n,) index of the nearest stereo point of each feature.
+        pixels: (n, 2) positions of the features [px].
+        rig: calibration at the scale of the image.
     """
     offset_px = pixels - points.pixels[nearest]
     disparity = points.measured[nearest, 2] * rig.focal_px + (points.disparity_slope[nearest] * offset_px).sum(axis=1)
