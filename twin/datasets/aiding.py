@@ -140,8 +140,8 @@ class Aiding:
         The motion over the first frames is estimated from the images alone. With it, each reading of the attitude gives
         a rotation of the camera at the first frame, and the start has the mean of these rotations. Without an attitude,
         each vertical gives its direction at the first frame; the start has their mean, and the heading over the plane
-        of the floor. Each recorded height gives an offset between the recorded heights and those of the world; `at` adds
-        the mean offset from now on.
+        of the floor. Each recorded height gives an offset between the recorded heights and those of the world; `at`
+        adds the mean offset from now on.
 
         If none of the first frames has a height, heights are not used from now on. If none of them has an attitude or a
         vertical and `known` is None, none of these and no heights are used from now on, and the result is None. In both
