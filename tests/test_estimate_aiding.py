@@ -283,11 +283,16 @@ def test_jacobians_of_displacement_factors_agree_with_finite_differences(scale):
     )
 
 
-@pytest.mark.parametrize("kind", ["height", "attitude", "position", "beacon"])
+def tilted_up(tilt):
+    """Returns the vertical in the body at POSE, turned by a rotation vector (3,) in body axes [rad]."""
+    return geometry.so3_exp(np.array(tilt)) @ (POSE @ geometry.inverse(MOUNT))[2, :3]
+
+
+@pytest.mark.parametrize("kind", ["height", "attitude", "position", "beacon", "vertical"])
 def test_jacobians_of_unary_factors_agree_with_finite_differences(kind):
     readings = Readings(2.3, np.array([0.05, -0.02, 0.45]), usbl_m=np.array([0.2, 0.0, 2.0]),
-                        beacons=sightings_of(pixels_of(POSE))[:1])  # fmt: skip
-    order = ["height", "attitude", "position", "beacon"]
+                        beacons=sightings_of(pixels_of(POSE))[:1], up=tilted_up([0.05, -0.02, 0.4]))  # fmt: skip
+    order = ["height", "attitude", "position", "beacon", "vertical"]
     factors = aiding.unary_factors(keyframes([POSE], [readings]), RIG, NOISE)[order.index(kind)]
     jacobians = factors.jacobians(POSE[None], factors.residuals(POSE[None]))
     expected = numeric(lambda m: factors.residuals((POSE @ geometry.exp(m))[None])[0], np.zeros(6))
@@ -341,3 +346,67 @@ def test_filter_and_alignment_agree_on_the_same_beacons():
     # corrections of 1 mm and 1 mrad: the two linearisations differ by second-order terms
     np.testing.assert_allclose(pose_filter.world_from_camera, aligned.poses[0], atol=2e-5)
     np.testing.assert_allclose(pose_filter.cov, aligned.covs[0], atol=0.02 * np.abs(pose_filter.cov).max())
+
+
+def test_the_residual_of_a_vertical_is_the_sine_of_its_angle_and_does_not_depend_on_heading():
+    factors = aiding.unary_factors(keyframes([POSE], [Readings(up=tilted_up([0.03, 0.0, 0.0]))]), RIG, NOISE)[4]
+    turned = geometry.pose(geometry.rotation_from_rpy(0.0, 0.0, 2.0), np.zeros(3)) @ POSE
+    axis = (POSE @ geometry.inverse(MOUNT))[2, :3]
+    sine = np.linalg.norm(np.cross(tilted_up([0.03, 0.0, 0.0]), axis))
+    for pose in (POSE, turned):
+        assert np.linalg.norm(factors.residuals(pose[None])[0]) == pytest.approx(sine, rel=1e-9)
+    exact = aiding.unary_factors(keyframes([POSE], [Readings(up=tilted_up([0.0, 0.0, 0.0]))]), RIG, NOISE)[4]
+    np.testing.assert_allclose(exact.residuals(turned[None]), 0, atol=1e-12)
+
+
+def test_the_alignment_of_a_chain_with_a_biased_accelerometer_is_consistent():
+    """The bias is in every reading: 20 of them give the tilt of the chain with the standard deviation of one.
+
+    NEES of the two components of the tilt over 400 biases: chi-square with 2 degrees of freedom each.
+    """
+    noise, n, rng = SensorNoise(up_rad=0.02), 20, np.random.default_rng(5)
+    poses = [geometry.pose(MOUNT[:3, :3], np.array([0.3 * k, 0.0, 2.0])) for k in range(n)]
+    links = [
+        Link(k, k + 1, geometry.inverse(a) @ b, np.eye(6) * 1e-8, 1.0, 100)
+        for k, (a, b) in enumerate(zip(poses, poses[1:], strict=False))
+    ]
+    loose = np.diag([0.5**2] * 3 + [FIXED] * 3)
+    nees, trials = [], 400
+    for _ in range(trials):
+        tilt = rng.normal(size=2) * noise.up_rad
+        up = geometry.so3_exp(np.array([*tilt, 0.0]))[:, 2]
+        aligned = align(keyframes(poses, [Readings(up=up)] * n), links, {0: loose}, RIG, noise)
+        p = aligned.poses[0][2, :3]  # the vertical in the camera; its true value is that of poses[0]
+        across = np.stack([poses[0][0, :3], poses[0][1, :3]])
+        by_error = across @ geometry.skew(p)
+        nees.append(across @ p @ np.linalg.solve(by_error @ aligned.covs[0][:3, :3] @ by_error.T, across @ p))
+    low, high = chi2.ppf([1e-4, 1 - 1e-4], 2 * trials) / trials
+    assert low < np.mean(nees) < high
+
+
+def test_however_many_verticals_are_fused_their_common_error_remains():
+    pose_filter, up = PoseFilter(POSE, RIG, NOISE), tilted_up([0.0, 0.0, 0.0])
+    pose_filter.cov = np.diag([0.1**2] * 3 + [1e-4] * 3)
+    heading = pose_filter.cov[:3, :3] @ POSE[2, :3]
+    for _ in range(500):
+        pose_filter.fuse_vertical(Readings(up=up))
+    by_error = np.stack([POSE[0, :3], POSE[1, :3]]) @ geometry.skew(POSE[2, :3])
+    np.testing.assert_allclose(
+        by_error @ pose_filter.cov[:3, :3] @ by_error.T, np.eye(2) * NOISE.up_rad**2, rtol=1e-6, atol=1e-12
+    )
+    np.testing.assert_allclose(pose_filter.cov[:3, :3] @ POSE[2, :3], heading, atol=1e-12)  # free
+    np.testing.assert_allclose(pose_filter.world_from_camera, POSE, atol=1e-12)
+
+
+def test_fusion_of_a_vertical_turns_a_tilted_pose_to_it():
+    """The error is reduced by the gain 1 - s^2 / S = 1 - (0.02 / 0.1)^2, up to the second order of 0.03 rad."""
+    tilted = POSE @ geometry.exp(np.array([0.03, 0.0, 0.0, 0, 0, 0]))
+    pose_filter = PoseFilter(tilted, RIG, SensorNoise(up_rad=0.02))
+    pose_filter.cov = np.diag([0.1**2] * 3 + [1e-4] * 3)
+    pose_filter.fuse_vertical(Readings(up=tilted_up([0.0, 0.0, 0.0])))
+    left = np.linalg.norm(np.cross(pose_filter.world_from_camera[2, :3], POSE[2, :3]))
+    before = np.linalg.norm(np.cross(tilted[2, :3], POSE[2, :3]))
+    assert left == pytest.approx(0.04 * before, rel=0.02)
+    unread = PoseFilter(tilted, RIG, NOISE)
+    unread.fuse_vertical(Readings())
+    np.testing.assert_array_equal(unread.world_from_camera, tilted)

@@ -303,6 +303,16 @@ def turned(seconds, rate_hz=120.0):
     return RecordedImu(readings, rate_hz, NOISE), path
 
 
+def test_true_heights_lie_beside_the_true_poses_of_a_euroc_folder(contents, tmp_path):
+    heights = tmp_path / "dem_truth.tif"
+    geotiff.write_elevations(heights, np.ones((3, 4), np.float32), MapGrid(0.0, 1.0, 0.1, 3, 4), "true elevation [m]")
+    euroc.export(replace(contents, true_map=heights), tmp_path / "set")
+    found = read_dataset(tmp_path / "set")[0].true_map
+    assert found.parent.name == "state_groundtruth_estimate0" and found.read_bytes() == heights.read_bytes()
+    euroc.export(contents, tmp_path / "without")
+    assert read_dataset(tmp_path / "without")[0].true_map is None
+
+
 def test_imu_readings_of_a_euroc_folder_are_those_of_the_run_and_integrate_to_its_attitudes(contents, tmp_path):
     imu, path = turned(4.0)
     euroc.export(replace(contents, imu=imu, trajectories={"truth": path}), tmp_path)

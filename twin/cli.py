@@ -152,6 +152,14 @@ TruthOption = Annotated[
         help="True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
     ),
 ]
+TrueMapOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--true-map",
+        metavar="FILE",
+        help="True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.",
+    ),
+]
 TopicsOption = Annotated[
     str | None,
     typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics of a ROS 2 bag. Default: its only stereo pair."),
@@ -493,6 +501,7 @@ def replay(
     topics: TopicsOption = None,
     estimator: EstimatorOption = None,
     aiding: AidingOption = True,
+    true_map: TrueMapOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
@@ -502,8 +511,9 @@ def replay(
     alignment, pattern = recorded.alignment_name(align), recorded.bayer_pattern(bayer)
     pair = recorded.image_topics(topics)
     options = recorded.ReplayOptions(
-        calibration, truth, alignment, pattern, topics=pair, estimator=estimator, aiding=aiding
-    )
+        calibration, truth, alignment, pattern, topics=pair, estimator=estimator, aiding=aiding,
+        true_map=true_map,
+    )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:
         file = outputs.output_file(out or Path(f"runs/{name}-preview.png"))

@@ -151,6 +151,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         imu=None if scenario is None else recorded_imu(folder, scenario),
         elevation=elevation,
         error_m=_layer(run, "dem_error", elevation),
+        true_map=folder / "dem_truth.tif" if "dem_truth" in run.rasters else None,
         orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
         georeference=_georeference(folder, options),
         true_layers=_true_layers(folder, scenario, frames),

@@ -151,7 +151,8 @@ def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
         settings.accelerometer_noise_density, settings.accelerometer_random_walk,
     )  # fmt: skip
     readings = ImuReadings(values[:, 0], values[:, 1:4], values[:, 4:])
-    return RecordedImu(readings, settings.rate_hz or motion_rate_hz(scenario), noise)
+    rate_hz = settings.rate_hz or motion_rate_hz(scenario)
+    return RecordedImu(readings, rate_hz, noise, settings.accelerometer_bias_sigma_mps2)
 
 
 def _imu_table(file: Path) -> Array:

@@ -133,6 +133,8 @@ class SensorNoise:
         usbl_m: standard deviation of each axis of an acoustic position fix [m].
         beacon_px: standard deviation of column and of row of a beacon in the image [px].
         beacons_m: (x, y, z) of each beacon in the world [m], treated as exact.
+        up_rad: standard deviation of the direction of the vertical about each horizontal axis [rad]. It is that of an
+            error which all readings share: no number of readings reduces it.
     """
 
     pressure_m: float = 0.01
@@ -143,6 +145,7 @@ class SensorNoise:
     usbl_m: float = 0.3
     beacon_px: float = 0.2
     beacons_m: tuple[tuple[float, float, float], ...] = ()
+    up_rad: float = float(np.deg2rad(1.2))
 
     @property
     def attitude_sigmas_rad(self) -> Array:
@@ -184,6 +187,8 @@ class Readings:
         usbl_m: (3,) position of the left camera in the world, at some keyframes [m].
         beacons: beacons detected in the left image, at keyframes.
         imu: readings of the IMU after the previous frame, up to the time of this frame.
+        up: (3,) unit vector that points vertically upwards, in body axes: an attitude without heading, as an IMU gives
+            it.
     """
 
     pressure_z_m: float | None = None
@@ -192,6 +197,7 @@ class Readings:
     usbl_m: Array | None = None
     beacons: tuple[BeaconDetection, ...] | None = None
     imu: ImuReadings | None = None
+    up: Array | None = None
 
 
 class Displacement(NamedTuple):

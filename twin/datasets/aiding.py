@@ -26,6 +26,7 @@ _START_FRAMES = 60  # number of frames whose readings determine the start
 #: Prior standard deviations of the first node in directions that readings determine: rotation [rad] and height [m].
 _LOOSE_RAD, _LOOSE_M = 0.1, 1.0
 _EXACT = 1e-12  # variance of the coordinates that the first node defines [m^2]
+_EXACT_RAD2 = 1e-12  # variance of its heading, if it defines that of the world [rad^2]
 
 
 class Start(NamedTuple):
@@ -60,10 +61,24 @@ class Opening(NamedTuple):
     plane_from_camera: Array
 
 
+class _FirstReadings(NamedTuple):
+    """Readings of the first frames, referred to the first frame by the visual motion since then.
+
+    Args:
+        rotations: world_from_camera (3, 3) of the first frame by each attitude.
+        verticals: direction (3,) of the vertical in camera axes at the first frame by each reading.
+        heights: each recorded height [m] with the motion (3,) since the first frame in its camera axes [m].
+    """
+
+    rotations: list[Array]
+    verticals: list[Array]
+    heights: list[tuple[float, Array]]
+
+
 class Aiding:
     """Readings that a replay uses.
 
-    Heights need the direction of gravity, so they are used only with an attitude.
+    Heights need the direction of gravity, so they are used only with an attitude or a vertical.
 
     Args:
         readings: recorded readings.
@@ -83,8 +98,9 @@ class Aiding:
         self.body_from_camera = readings.body_from_left @ left_from_rectified
         self.notes = readings.notes
         self._attitude, self._velocity = (_moved(series, start_s) for series in (readings.attitude, readings.velocity))
-        self._height = None if self._attitude is None else _moved(readings.height, start_s)
-        if readings.height is not None and self._attitude is None:
+        self._vertical = _moved(readings.vertical, start_s) if self._attitude is None else None
+        self._height = _moved(readings.height, start_s) if self.is_level else None
+        if readings.height is not None and not self.is_level:
             self.notes += ("The heights from pressure are not used: no attitude states the direction of gravity.",)
         self._limit_s = min(_MOST_S, _SHARE / frame_rate_hz)
         self.noise = self._noise(frame_rate_hz)
@@ -92,9 +108,16 @@ class Aiding:
 
     @property
     def used(self) -> list[str]:
-        """Returns the names of the sensors that are used: "pressure", "attitude", "dvl"."""
-        series = {"pressure": self._height, "attitude": self._attitude, "dvl": self._velocity}
+        """Returns the names of the sensors that are used: "pressure", "attitude", "vertical", "dvl"."""
+        series = {
+            "pressure": self._height, "attitude": self._attitude, "vertical": self._vertical, "dvl": self._velocity
+        }  # fmt: skip
         return [name for name, one in series.items() if one is not None]
+
+    @property
+    def is_level(self) -> bool:
+        """Returns whether readings state the direction of gravity."""
+        return self._attitude is not None or self._vertical is not None
 
     def at(self, time_s: float) -> Readings:
         """Returns the readings of the frame at a time [s] since the first frame.
@@ -103,56 +126,80 @@ class Aiding:
         used or has no reading near this time.
         """
         height, attitude = (_nearest(series, time_s, self._limit_s) for series in (self._height, self._attitude))
+        up = _interpolated(self._vertical, time_s)
         return Readings(
             pressure_z_m=None if height is None else float(height[0]) + self._height_m,
             ahrs_rpy_rad=attitude,
             dvl_mps=_interpolated(self._velocity, time_s),
+            up=None if up is None else up / np.linalg.norm(up),
         )
 
     def start(self, opening: Opening, known: Array | None = None) -> Start | None:
-        """Returns the start that fits the first readings of attitude and height; None without an attitude.
+        """Returns the start that fits the first readings of gravity and height; None without attitude and vertical.
 
         The motion over the first frames is estimated from the images alone. With it, each reading of the attitude gives
-        a rotation of the camera at the first frame, and the start has the mean of these rotations. Each recorded height
-        gives an offset between the recorded heights and those of the world; `at` adds the mean offset from now on.
+        a rotation of the camera at the first frame, and the start has the mean of these rotations. Without an attitude,
+        each vertical gives its direction at the first frame; the start has their mean, and the heading over the plane
+        of the floor. Each recorded height gives an offset between the recorded heights and those of the world; `at`
+        adds the mean offset from now on.
 
-        If none of the first frames has a height, heights are not used from now on. If none of them has an attitude and
-        `known` is None, neither attitudes nor heights are used from now on, and the result is None. In both cases, a
-        sentence on this is added to `notes`.
+        If none of the first frames has a height, heights are not used from now on. If none of them has an attitude or a
+        vertical and `known` is None, none of these and no heights are used from now on, and the result is None. In both
+        cases, a sentence on this is added to `notes`.
 
         Args:
             opening: the first frames.
             known: (4, 4) exact pose at the first frame, which becomes the start; None: it is found from the readings.
         """
-        if self._attitude is None:
+        if not self.is_level:
             return None
-        camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
-        rotations, heights = [], []
-        for moved, found in self._first_motions(opening):
-            if found.ahrs_rpy_rad is not None:
-                world_from_camera = geometry.rotation_from_rpy(*found.ahrs_rpy_rad) @ camera_from_body.T
-                rotations.append(world_from_camera @ moved[:3, :3].T)
-            if found.pressure_z_m is not None:
-                heights.append((found.pressure_z_m, moved[:3, 3]))
-        if not heights or (known is None and not rotations):
+        found = self._first_readings(opening)
+        known_rotation = self._first_rotation(found, opening.plane_from_camera[:3, :3]) if known is None else known
+        if not found.heights or known_rotation is None:
             self._leave_out_height()
-        if known is None and not rotations:
-            self._attitude = None
-            self.notes += (f"The attitude is not used: none of the first {_START_FRAMES} frames has one.",)
+        if known_rotation is None:
+            name = "attitude" if self._attitude is not None else "vertical"
+            self._attitude = self._vertical = None
+            self.notes += (f"The {name} is not used: none of the first {_START_FRAMES} frames has one.",)
             return None
-        mean = np.mean(rotations, axis=0) if known is None else known[:3, :3]
-        rotation = geometry.nearest_rigid(geometry.pose(mean, np.zeros(3)))[:3, :3]
+        rotation = known_rotation[:3, :3]
         height_m = float((opening.plane_from_camera if known is None else known)[2, 3])
-        offsets = [height_m + rotation[2] @ moved - height for height, moved in heights]
+        offsets = [height_m + rotation[2] @ moved - height for height, moved in found.heights]
         self._height_m = float(np.mean(offsets)) if offsets else 0.0
         if known is not None:
             return Start(known)
-        angles = np.diag(camera_from_body @ np.diag(self.noise.attitude_sigmas_rad**2) @ camera_from_body.T)
-        return Start(
-            geometry.pose(rotation, np.array([0.0, 0.0, height_m])),
-            np.diag([*(angles / len(rotations)), 1e-8, 1e-8, 1e-8]),
-            _prior_cov(rotation, bool(heights)),
-        )
+        cov = np.diag([0.0, 0.0, 0.0, 1e-8, 1e-8, 1e-8])
+        cov[:3, :3] = self._start_cov(rotation, len(found.rotations))
+        pose = geometry.pose(rotation, np.array([0.0, 0.0, height_m]))
+        return Start(pose, cov, _prior_cov(rotation, bool(found.heights), self._attitude is not None))
+
+    def _first_rotation(self, found: _FirstReadings, over_plane: Array) -> Array | None:
+        """Returns the rotation (3, 3) of the first frame from its readings; None without any.
+
+        Args:
+            found: readings of the first frames.
+            over_plane: (3, 3) rotation of the first frame over the plane of the floor, for the heading.
+        """
+        if found.rotations:
+            return geometry.nearest_rigid(geometry.pose(np.mean(found.rotations, axis=0), np.zeros(3)))[:3, :3]
+        if not found.verticals:
+            return None
+        up = over_plane @ np.mean(found.verticals, axis=0)
+        across = geometry.skew(up) @ np.array([0.0, 0.0, 1.0])
+        sine = float(np.linalg.norm(across))
+        axis = across / sine if sine > 1e-12 else np.array([1.0, 0.0, 0.0])
+        return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane
+
+    def _start_cov(self, rotation: Array, n_attitudes: int) -> Array:
+        """Returns the covariance (3, 3) of the first rotation in camera axes [rad^2], from `n_attitudes` or verticals.
+
+        The heading is exact if it defines the world.
+        """
+        if self._attitude is None:
+            return rotation.T @ np.diag([self.noise.up_rad**2, self.noise.up_rad**2, _EXACT_RAD2]) @ rotation
+        camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
+        variances = np.diag(self.noise.attitude_sigmas_rad**2)
+        return np.diag(np.diag(camera_from_body @ variances @ camera_from_body.T)) / n_attitudes
 
     def _leave_out_height(self) -> None:
         """Ends the use of the recorded heights, because their offset is unknown, and adds a note."""
@@ -162,6 +209,20 @@ class Aiding:
                 f"The heights from pressure are not used: the first {_START_FRAMES} frames do not relate them to the "
                 "start.",
             )
+
+    def _first_readings(self, opening: Opening) -> _FirstReadings:
+        """Returns what the readings of the first frames say on the first frame, by the motion since then."""
+        camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
+        found = _FirstReadings([], [], [])
+        for moved, readings in self._first_motions(opening):
+            if readings.ahrs_rpy_rad is not None:
+                world_from_camera = geometry.rotation_from_rpy(*readings.ahrs_rpy_rad) @ camera_from_body.T
+                found.rotations.append(world_from_camera @ moved[:3, :3].T)
+            if readings.up is not None:
+                found.verticals.append(moved[:3, :3] @ camera_from_body @ readings.up)
+            if readings.pressure_z_m is not None:
+                found.heights.append((readings.pressure_z_m, moved[:3, 3]))
+        return found
 
     def _first_motions(self, opening: Opening) -> list[tuple[Array, Readings]]:
         """Returns poses (4, 4) in the axes of the camera at the first frame, and the readings at these poses.
@@ -185,13 +246,15 @@ class Aiding:
         if self._attitude is not None:
             roll, pitch, yaw = (float(sigma) for sigma in self._attitude.sigmas)
             noise = replace(noise, attitude_rad=max(roll, pitch), heading_rad=yaw)
+        if self._vertical is not None:
+            noise = replace(noise, up_rad=float(self._vertical.sigmas[0]))
         if self._velocity is not None:
             frames_per_reading = max(1.0, _interval_s(self._velocity) * frame_rate_hz)
             noise = replace(noise, dvl_mps=float(self._velocity.sigmas.max() * frames_per_reading**0.5))
         return noise
 
     def residuals(self, path: Trajectory) -> dict[str, float]:
-        """Returns the RMS of (path - reading) / sigma at the frames of a path, for "pressure" and for "attitude".
+        """Returns the RMS of (path - reading) / sigma at the frames of a path: "pressure", "attitude", "vertical".
 
         About 1 is expected. A sensor without readings is left out; velocities are not compared.
 
@@ -199,7 +262,7 @@ class Aiding:
             path: poses of the rectified left camera in the world of the replay.
         """
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
-        parts: dict[str, list[Array]] = {"pressure": [], "attitude": []}
+        parts: dict[str, list[Array]] = {"pressure": [], "attitude": [], "vertical": []}
         for time_s, pose in zip(path.times_s, path.world_from_camera, strict=True):
             found = self.at(float(time_s))
             if found.pressure_z_m is not None:
@@ -207,19 +270,23 @@ class Aiding:
             if found.ahrs_rpy_rad is not None:
                 turned = geometry.rotation_from_rpy(*found.ahrs_rpy_rad).T @ pose[:3, :3] @ camera_from_body
                 parts["attitude"].append(geometry.so3_log(turned) / self.noise.attitude_sigmas_rad)
+            if found.up is not None:
+                across = geometry.skew(camera_from_body @ found.up) @ pose[2, :3]
+                parts["vertical"].append(across * 1.5**0.5 / self.noise.up_rad)  # two of its three components vary
         return {name: float(np.sqrt(np.mean(np.square(rows)))) for name, rows in parts.items() if rows}
 
 
-def _prior_cov(rotation: Array, has_height: bool) -> Array:
-    """Returns `Start.prior_cov`: large for the rotation and, if heights are used, for the height; otherwise small.
+def _prior_cov(rotation: Array, has_height: bool, has_heading: bool) -> Array:
+    """Returns `Start.prior_cov`: large for tilt and, if they are used, for height and heading; otherwise small.
 
     Args:
         rotation: (3, 3) rotation world_from_camera of the start.
-        has_height: whether recorded heights are used.
+        has_height, has_heading: whether recorded heights and headings are used.
     """
+    axes = np.diag([_LOOSE_RAD**2, _LOOSE_RAD**2, _LOOSE_RAD**2 if has_heading else _EXACT_RAD2])
     world = np.diag([_EXACT, _EXACT, _LOOSE_M**2 if has_height else _EXACT])
     cov = np.zeros((6, 6))
-    cov[:3, :3], cov[3:, 3:] = np.eye(3) * _LOOSE_RAD**2, rotation.T @ world @ rotation
+    cov[:3, :3], cov[3:, 3:] = rotation.T @ axes @ rotation, rotation.T @ world @ rotation
     return (cov + cov.T) / 2
 
 

@@ -1,4 +1,4 @@
-"""Readings of navigation sensors in a ROS 2 bag: Imu (attitude), FluidPressure and TwistWithCovarianceStamped (DVL)."""
+"""Readings of navigation sensors in a ROS 2 bag: Imu, FluidPressure and TwistWithCovarianceStamped (DVL)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from twin.core.geometry import Array
 from twin.core.pressure import PASCAL_PER_METRE
 from twin.datasets.bag import Bag
 from twin.datasets.bag_calibration import Transforms, relative_pose
+from twin.datasets.inertial import INERTIAL, USUAL_BIAS_MPS2, InertialErrorModel, vertical_series
 from twin.datasets.readings import (
     ATTITUDE,
     HEIGHT,
@@ -26,6 +27,7 @@ from twin.datasets.readings import (
     checked_series,
 )
 from twin.errors import TwinError
+from twin.estimate.navigation.vertical import InertialNoise
 
 _TYPES = {
     "sensor_msgs/msg/FluidPressure": HEIGHT,
@@ -33,6 +35,9 @@ _TYPES = {
     "geometry_msgs/msg/TwistWithCovarianceStamped": VELOCITY,
 }
 _Converter = Callable[[Any, str], tuple[Array, Array]]  # from a message and its place to values and variances
+_IMU = "sensor_msgs/msg/Imu"
+_NO_ORIENTATION = "states an orientation."  # end of the note on topics without attitude
+_USUAL_WALK = 1e-4  # random walk of the bias of a gyroscope, which messages do not state [rad/s2/sqrt(Hz)]
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
 _N_FIRST = 100  # number of messages of a topic that are searched for an orientation
 _SAME_PLACE_M = 0.01  # largest distance between the origins of two frames that count as one place
@@ -49,13 +54,14 @@ class _Recorded(NamedTuple):
 def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings | None:
     """Returns the readings in a bag; None if no topic has the type Imu, FluidPressure or TwistWithCovarianceStamped.
 
-    The body is the frame of the attitude or, if there is none, that of the velocity. If /tf_static does not join this
-    frame to the left camera, neither attitude nor velocity is used. The attitude is that of the only topic of type Imu
-    whose messages state an orientation. A sensor is also not used if there are several topics of its type, if a finite
-    reading of it has no covariance, or if it is not where it must be: the pressure sensor within 1 cm of the left
-    camera, the DVL within 1 cm of the origin of the body. Readings with a value or a covariance that is not finite are
-    left out. If all headers of a topic have the time 0, the times of its readings are those of recording. The notes of
-    the result state which readings are not used and which times are those of recording.
+    The body is the frame of the attitude or, if there is none, that of the velocity or of the IMU. If /tf_static does
+    not join this frame to the left camera, none of them is used. The attitude is that of the only topic of type Imu
+    whose messages state an orientation; without one, the only topic with angular rates and specific forces gives the
+    vertical. A sensor is also not used if there are several topics of its type, if a finite reading of it has no
+    covariance, or if it is not where it must be: the pressure sensor within 1 cm of the left camera, the DVL within
+    1 cm of the origin of the body. Readings with a value or a covariance that is not finite are left out. If all
+    headers of a topic have the time 0, the times of its readings are those of recording. The notes of the result state
+    which readings are not used and which times are those of recording.
 
     Args:
         bag: the bag.
@@ -67,15 +73,18 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     """
     notes: list[str] = []
     height, attitude, velocity = (_topic(bag, kind, quantity, notes) for kind, quantity in _TYPES.items())
-    if height is velocity is attitude is None and not notes:
+    inertial = None if attitude is not None else _inertial(bag, notes)
+    if inertial is not None:
+        notes = [note for note in notes if not note.endswith(_NO_ORIENTATION)]
+    if height is velocity is attitude is inertial is None and not notes:
         return None
-    body = attitude or velocity
+    body = attitude or velocity or inertial
     body_from_left = relative_pose(transforms, body.frame, camera) if body and body.frame and camera else None
     if body is not None and body_from_left is None:
         notes.append(
             f"The readings of {body.topic} are not used: /tf_static does not join its frame and the left camera."
         )
-        attitude = velocity = None
+        attitude = velocity = inertial = None
     if height is not None and not _same_place(relative_pose(transforms, camera, height.frame)):
         notes.append(f"The readings of {height.topic} are not used: the pressure sensor is not at the left camera.")
         height = None
@@ -83,7 +92,41 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
         velocity = _in_body(velocity, relative_pose(transforms, body.frame, velocity.frame), notes)
     heights, attitudes, velocities = (None if one is None else one.series for one in (height, attitude, velocity))
     pose = np.eye(4) if body_from_left is None else body_from_left
-    return RecordedReadings(pose, heights, attitudes, velocities, tuple(notes))
+    turned = None if inertial is None or body is None else relative_pose(transforms, body.frame, inertial.frame)
+    vertical = None if inertial is None else _vertical(inertial, turned, notes)
+    return RecordedReadings(pose, heights, attitudes, velocities, vertical, tuple(notes))
+
+
+def _inertial(bag: Bag, notes: list[str]) -> _Recorded | None:
+    """Returns angular rates and specific forces of the only topic of type Imu that has them; None if none or several.
+
+    Raises:
+        TwinError: a reading is impossible.
+    """
+    topics = [
+        name for name, kind in bag.topics.items()
+        if kind == _IMU and any(_states_motion(message) for message in islice(bag.messages(name), _N_FIRST))
+    ]  # fmt: skip
+    return _only(bag, topics, INERTIAL, _motion, notes)
+
+
+def _states_motion(message: Any) -> bool:
+    """Returns whether a message Imu has rates and specific forces, which their covariances mark by -1 if it has not."""
+    given = message.angular_velocity_covariance[0] >= 0 and message.linear_acceleration_covariance[0] >= 0
+    force = message.linear_acceleration
+    return bool(given and (force.x or force.y or force.z))
+
+
+def _vertical(inertial: _Recorded, body_from_sensor: Array | None, notes: list[str]) -> SensorSeries | None:
+    """Returns the direction of the vertical in the body; None, with a note, if the pose of the IMU is not known."""
+    if body_from_sensor is None:
+        notes.append(f"The readings of {inertial.topic} are not used: /tf_static does not join its frame and the body.")
+        return None
+    times_s, _, sigmas = inertial.series
+    root_s = float(np.sqrt(np.median(np.diff(times_s)))) if len(times_s) > 1 else 0.0  # a density is sigma / sqrt(rate)
+    noise = InertialNoise(float(sigmas[:3].max()) * root_s, _USUAL_WALK, float(sigmas[3:].max()) * root_s)
+    sensor = InertialErrorModel(inertial.topic, noise, USUAL_BIAS_MPS2, body_from_sensor[:3, :3])
+    return vertical_series(inertial.series, sensor, notes)
 
 
 def _same_place(pose: Array | None) -> bool:
@@ -123,12 +166,19 @@ def _topic(bag: Bag, kind: str, quantity: SensorQuantity, notes: list[str]) -> _
     topics = [name for name, one in bag.topics.items() if one == kind]
     if quantity is ATTITUDE:
         topics = _with_orientation(bag, topics, notes)
+    return _only(bag, topics, quantity, _CONVERT[kind], notes)
+
+
+def _only(
+    bag: Bag, topics: list[str], quantity: SensorQuantity, convert: _Converter, notes: list[str]
+) -> _Recorded | None:
+    """Returns the readings of the only one of some topics, as `_topic` does."""
     if len(topics) > 1:
         notes.append(f"The {quantity.name} is not used: several topics have it ({_listed(topics)}).")
     if len(topics) != 1:
         return None
     topic = topics[0]
-    messages = _messages(bag, topic, _CONVERT[kind], quantity.n)
+    messages = _messages(bag, topic, convert, quantity.n)
     if messages is None:
         notes.append(f"The readings of {topic} are not used: they state no covariance.")
         return None
@@ -158,7 +208,7 @@ def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str
     stated = [name for name in topics if any(_states_orientation(message) for message in first[name])]
     known = [name for name in stated if any(np.any(message.orientation_covariance) for message in first[name])]
     if topics and not any(message.orientation_covariance[0] >= 0 for name in topics for message in first[name]):
-        notes.append(f"The attitude is not used: no message of {_listed(topics)} states an orientation.")
+        notes.append(f"The attitude is not used: no message of {_listed(topics)} {_NO_ORIENTATION}")
         return []
     return known or stated or topics
 
@@ -256,6 +306,14 @@ def _velocity(message: Any, _: str) -> tuple[Array, Array]:
     linear = message.twist.twist.linear
     variances = np.array(message.twist.covariance).reshape(6, 6).diagonal()[:3]
     return np.array([linear.x, linear.y, linear.z]), variances.copy()
+
+
+def _motion(message: Any, _: str) -> tuple[Array, Array]:
+    """Returns angular rate and specific force (6,) [rad/s, m/s2] of a message Imu and their variances (6,)."""
+    rate, force = message.angular_velocity, message.linear_acceleration
+    covariances = message.angular_velocity_covariance, message.linear_acceleration_covariance
+    variances = np.concatenate([np.array(cov).reshape(3, 3).diagonal() for cov in covariances])
+    return np.array([rate.x, rate.y, rate.z, force.x, force.y, force.z]), variances
 
 
 _CONVERT: dict[str, _Converter] = {

@@ -63,6 +63,7 @@ class Dataset:
         body_from_left: (4, 4) pose of the left camera in the body that recorded poses refer to; None if unknown.
         readings: recorded readings of navigation sensors; None if the data set has none; a TwinError if they cannot be
             read, which is raised unless the user replays without them.
+        true_map: GeoTIFF of the true heights in the frame of the recorded poses; None if the data set has none.
     """
 
     folder: Path
@@ -74,6 +75,7 @@ class Dataset:
     frame_times_s: Array | None = None
     body_from_left: Array | None = None
     readings: RecordedReadings | TwinError | None = None
+    true_map: Path | None = None
 
 
 class Reader(Protocol):

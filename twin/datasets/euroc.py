@@ -13,11 +13,13 @@ from twin.core.records import Trajectory
 from twin.datasets.calibration import StereoCalibration, checked, is_rigid
 from twin.datasets.calibration_files import camera_from_kalibr, pose_of
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
-from twin.datasets.readings import read_folder
+from twin.datasets.inertial import read_vertical
+from twin.datasets.readings import RecordedReadings, read_folder
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
 _TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0")  # folders with true poses
+_TRUE_MAP = "dem_truth.tif"  # file of true heights in such a folder, as `twin export` writes it
 _POSITIONS = "leica0"  # folder with true positions of a prism, without attitude
 
 
@@ -56,8 +58,12 @@ class EurocReader:
         elif (root / _POSITIONS / "data.csv").is_file():
             notes = (f"The true positions ({_POSITIONS}) are not used: they have no attitude.",)
         times_s = np.array([image.time_s for image in left])
-        readings = None if body_from_left is None else value_or_error(lambda: read_folder(root, body_from_left))
-        return Dataset(folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left, readings)
+        readings = None if body_from_left is None else value_or_error(lambda: _readings(root, body_from_left))
+        heights = None if file is None else file.with_name(_TRUE_MAP)
+        return Dataset(
+            folder, frames, calibration, truth, n_right_only, notes, times_s, body_from_left, readings,
+            heights if heights is not None and heights.is_file() else None,
+        )  # fmt: skip
 
 
 def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:
@@ -77,6 +83,23 @@ def camera_truth(file: Path, body_from_left: np.ndarray) -> Trajectory:
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3], poses[:, :3, 3] = geometry.rotation_from_wxyz(rows[:, 4:8]), rows[:, 1:4]
     return Trajectory(rows[:, 0] * 1e-9, poses @ body_from_left)
+
+
+def _readings(root: Path, body_from_left: Array) -> RecordedReadings | None:
+    """Returns the readings in the folders of the sensors; None without any. The IMU is used without an attitude only.
+
+    Raises:
+        TwinError: a file is damaged, or a value is impossible.
+    """
+    found = read_folder(root, body_from_left)
+    if found is not None and found.attitude is not None:
+        return found
+    notes: list[str] = []
+    vertical = read_vertical(root, notes)
+    if vertical is None and not notes:
+        return found
+    others = found or RecordedReadings(body_from_left)
+    return others._replace(vertical=vertical, notes=(*others.notes, *notes))
 
 
 def _root(folder: Path) -> Path:

@@ -61,6 +61,8 @@ class RecordedReadings(NamedTuple):
         height: heights [m] of the left camera above a horizontal plane, whose level may be unknown.
         attitude: roll, pitch and yaw [rad] of the body in a world whose z axis points up.
         velocity: velocities [m/s] of the origin of the body over ground, in body axes.
+        vertical: unit vectors that point upwards, in body axes, with one standard deviation [rad]
+            (`inertial.vertical_series`); None if there is an attitude.
         notes: sentences on readings that are not used, and on assumptions about their times.
     """
 
@@ -68,6 +70,7 @@ class RecordedReadings(NamedTuple):
     height: SensorSeries | None = None
     attitude: SensorSeries | None = None
     velocity: SensorSeries | None = None
+    vertical: SensorSeries | None = None
     notes: tuple[str, ...] = ()
 
 
@@ -154,14 +157,14 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
         sigmas = _sigmas(root / quantity.folder / "sensor.yaml", quantity.n) if file.exists() else None
         if file.exists() and sigmas is None:
             notes.append(f"The readings in {quantity.folder} are not used: sensor.yaml states no `sigma`.")
-        found.append(None if sigmas is None else _read_csv(file, quantity, sigmas, notes))
+        found.append(None if sigmas is None else read_csv(file, quantity, sigmas, notes))
     height, attitude, velocity = found
     if not notes and height is attitude is velocity is None:
         return None
-    return RecordedReadings(body_from_left, height, attitude, velocity, tuple(notes))
+    return RecordedReadings(body_from_left, height, attitude, velocity, notes=tuple(notes))
 
 
-def _read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
+def read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
     """Returns the finite readings in a file data.csv; None if there are none.
 
     A sentence on the readings that are left out is appended to `notes`.

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
@@ -26,7 +27,7 @@ from twin.datasets.dataset import Dataset
 from twin.datasets.frames import RecordedFrames
 from twin.datasets.image_files import BAYER, Bayer
 from twin.datasets.readers import read_dataset
-from twin.datasets.truth_files import read_truth
+from twin.datasets.truth_files import read_true_map, read_truth
 from twin.errors import SurveyAborted, TwinError
 from twin.estimate import Navigator
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
@@ -35,6 +36,7 @@ from twin.estimate.self_check import check_survey
 from twin.estimate.stereo_vision import StereoVision
 from twin.judge import recorded
 from twin.judge.recorded import AlignmentName, ReplayEvaluation, associate, evaluate_replay, unevaluated_replay
+from twin.judge.true_map import TrueMap, true_heights
 from twin.plugin.guard import check_loadable
 from twin.plugin.loading import ESTIMATORS
 from twin.plugin.navigator import NOTE, PluginNavigator
@@ -72,7 +74,8 @@ class ReplayOptions:
         topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
         estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
             whose poses the map is built; None: the estimators of `twin.estimate`.
-        aiding: whether recorded readings of pressure, attitude and DVL are used.
+        aiding: whether recorded readings of pressure, attitude, DVL and IMU are used.
+        true_map: GeoTIFF of the true heights [m] in the frame of the true poses; None: that of the data set.
     """
 
     calibration: Path | None = None
@@ -85,6 +88,7 @@ class ReplayOptions:
     topics: tuple[str, str] | None = None
     estimator: str | None = None
     aiding: bool = True
+    true_map: Path | None = None
 
 
 class ReplayResult(NamedTuple):
@@ -117,6 +121,7 @@ class OpenedDataset(NamedTuple):
         pair: the first stereo pair.
         plane: floor plane of the first pair, in the axes of the left camera (`floor_plane`).
         aiding: readings of the navigation sensors; None if none were recorded or they are not wanted.
+        true_map: true heights in the frame of `truth`; None if they are not known.
     """
 
     name: str
@@ -127,12 +132,15 @@ class OpenedDataset(NamedTuple):
     pair: PairInspection
     plane: FloorPlane
     aiding: Aiding | None
+    true_map: TrueMap | None = None
 
     @property
     def plane_text(self) -> str:
         """Returns a phrase that states how the plane of the map was chosen; a start in the options is ignored."""
         if self.aiding is not None and "attitude" in self.aiding.used:
             return "plane of the map horizontal by the recorded attitude"
+        if self.aiding is not None and "vertical" in self.aiding.used:
+            return "plane of the map horizontal by the recorded specific forces"
         return f"plane of the map {'fitted to the floor' if self.plane.fitted else 'perpendicular to the first view'}"
 
 
@@ -176,13 +184,19 @@ def replay(
             elevation = guard.attempt(
                 "map", lambda: navigator.build_map(result, None, lambda share: progress("map", share))
             )
+            n_tiles = guard.attempt("tiles", lambda: _write_tiles(navigator, result, written, guard)) or 0
         progress("report", 0.0)
+        heights = guard.attempt("evaluation", lambda: _true_heights(opened, chosen, result, elevation))
         evaluation = _evaluation(opened, chosen, result, elevation, guard)
-        evaluation = replace(evaluation, timing=_timing(start_s, result, stopwatch))
+        timing = _timing(start_s, result, stopwatch)
+        evaluation = replace(evaluation, timing=timing, true_heights_m=heights)
+        if n_tiles:
+            evaluation = replace(evaluation, source=evaluation.source | {"tiles": n_tiles})
         metrics = guard.attempt("evaluation", lambda: evaluate_replay(evaluation)) or unevaluated_replay(evaluation)
         record = SurveyRecord(
-            result, elevation, None, None, stopwatch, metrics, recorded_truth=_truth_of_frames(opened, chosen, result)
-        )
+            result, elevation, None, None, stopwatch, metrics,
+            recorded_truth=_truth_of_frames(opened, chosen, result), recorded_heights_m=heights,
+        )  # fmt: skip
         metrics = written.finish(record, guard)
     return ReplayResult(metrics["status"], metrics, out, result, elevation)
 
@@ -308,7 +322,22 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
         problem = f"only {len(pair.points.xyz)} points of the first pair are matched"
         raise TwinError(str(folder), problem, "a rectified pair that fits the calibration; see `--preview`")
     aiding = _aiding(dataset, frames) if options.aiding else None
-    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane, aiding)
+    true_map = _true_map(dataset, truth, options)
+    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane, aiding, true_map)
+
+
+def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:
+    """Returns the true heights: those of the option, or those of the data set if the true poses are its own, too.
+
+    Raises:
+        TwinError: the file is not a height grid, or there are no true poses, in whose frame the heights are.
+    """
+    if options.true_map is None:
+        own = dataset.true_map if options.truth is None and truth is not None else None
+        return None if own is None else read_true_map(own)
+    if truth is None:
+        raise TwinError("--true-map", "the data set has no true poses, in whose frame the heights are", "--truth")
+    return read_true_map(options.true_map)
 
 
 def _aiding(dataset: Dataset, frames: RecordedFrames) -> Aiding | None:
@@ -406,12 +435,39 @@ def _evaluation(
         result,
         opened.truth,
         options.alignment,
-        None if elevation is None else elevation.grid.cell_m,
+        elevation,
         {},
         identity,
         source,
         _notes(opened, options, result),
     )
+
+
+def _write_tiles(navigator: Navigator, result: SurveyResult, written: RunFolder, guard: StageGuard) -> int:
+    """Writes the tiles of a map whose cells were enlarged, in the folder `tiles`, and returns their number.
+
+    An error of a file ends the writing; the guard records it. The tiles that are finished by then remain.
+    """
+    folder = written.tiled_map()
+    try:
+        for tile, elevation in navigator.build_tiles(result):
+            folder.add(tile.row, tile.col, elevation)
+    except OSError as error:
+        guard.cause = guard.cause or str(error)
+    finally:
+        with suppress(OSError):
+            folder.finish()
+    return folder.n_tiles
+
+
+def _true_heights(
+    opened: OpenedDataset, options: ReplayOptions, result: SurveyResult, elevation: ElevationMap | None
+) -> NDArray[np.float32] | None:
+    """Returns the true heights at the cells of the map, moved to it by the alignment; None if they are not known."""
+    if opened.true_map is None or opened.truth is None or elevation is None:
+        return None
+    moved = recorded.world_alignment(result.final, opened.truth, options.alignment)
+    return true_heights(elevation, opened.true_map, moved)
 
 
 def _unused(frames: RecordedFrames) -> list[str]:

@@ -36,7 +36,7 @@ from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate import disparity_offset
-from twin.estimate.mapping.footprint import footprint_grid
+from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator
@@ -52,6 +52,7 @@ from twin.estimate.vision_interface import Vision
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
 _DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # standard deviation due to resampling in the mosaic [rad, m]
+_TILE_MARGIN = 12  # cells around a tile that are built with it, as a cell depends on its neighbours
 _SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equal, because timestamps are rounded
 
 
@@ -154,6 +155,7 @@ class Navigator:
         aiding = readings_as_arrays(frame.readings)
         state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
+        self.filter.fuse_vertical(frame.readings)
         if self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
@@ -237,9 +239,7 @@ class Navigator:
         n_keyframes = len(result.keyframe_rows)
         if n_keyframes == 0:
             return None
-        final = result.final
-        map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
-        turned = replace(result, final=Trajectory(final.times_s, map_from_world @ final.world_from_camera))
+        turned, map_from_world = _in_map(result)
         cells = grid or footprint_grid(turned, self.rig)
 
         def report(n_done: int) -> None:
@@ -248,6 +248,45 @@ class Navigator:
 
         found = self.vision.build_map(turned, cells, result.step_cov, report)
         return replace(found, map_from_world=map_from_world)
+
+    def build_tiles(
+        self, result: SurveyResult, progress: Callable[[float], None] | None = None
+    ) -> Iterator[tuple[MapTile, ElevationMap]]:
+        """Builds the elevation map in tiles of cells that are not enlarged, if `build_map` has enlarged its cells.
+
+        Memory is that of one tile. A keyframe at the border of tiles is processed for each of them. Together the tiles
+        are the map of `build_map` on their common grid, except that the light pattern is that of the keyframes of a
+        tile, and that depth is propagated between these keyframes only.
+
+        Args:
+            result: result of the survey (`finish`).
+            progress: called with the fraction of the tiles built so far, 0 to 1.
+
+        Yields:
+            Each tile that images show, with its map; nothing if `build_map` has not enlarged the cells.
+
+        Raises:
+            OSError: an image could not be read.
+        """
+        if not len(result.keyframe_rows):
+            return
+        turned, map_from_world = _in_map(result)
+        tiles = footprint_tiles(turned, self.rig)
+        for k, tile in enumerate(tiles):
+            chosen = tile.keyframes
+            part = replace(
+                turned,
+                keyframe_rows=turned.keyframe_rows[chosen],
+                node_cov=turned.node_cov[chosen],
+                keyframe_depth_m=turned.keyframe_depth_m[chosen],
+            )
+            steps, larger = steps_between(result.step_cov, chosen), with_margin(tile.grid, _TILE_MARGIN)
+            found = self.vision.build_map(part, larger, steps, lambda _: None)
+            inner = np.s_[_TILE_MARGIN:-_TILE_MARGIN, _TILE_MARGIN:-_TILE_MARGIN]
+            layers = found.height_m[inner], found.sigma_m[inner], found.mosaic[inner]
+            yield tile, ElevationMap(tile.grid, *layers, map_from_world)
+            if progress is not None:
+                progress((k + 1) / len(tiles))
 
     def orthomosaic(
         self,
@@ -466,6 +505,14 @@ class Navigator:
         last_from_now = geometry.inverse(before) @ self.filter.world_from_camera
         self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))
         self.since_node = self.since_node._replace(cov_at_node=node_cov)
+
+
+def _in_map(result: SurveyResult) -> tuple[SurveyResult, Array]:
+    """Returns a result with its final trajectory in the frame of the map, and map_from_world (4, 4)."""
+    final = result.final
+    map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
+    turned = Trajectory(final.times_s, map_from_world @ final.world_from_camera)
+    return replace(result, final=turned), map_from_world
 
 
 def finish_in_stage(navigator: Navigator, guard: StageGuard) -> SurveyResult:

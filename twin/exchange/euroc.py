@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ _IMU_HEADER = (
     "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],"
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]"
 )
+_TRUTH = "state_groundtruth_estimate0"  # folder of the truth
 _FIRST_NS = 1_000_000_000  # timestamp of a frame at 0 s; times in EuRoC data sets are never 0
 
 
@@ -73,7 +75,7 @@ class EurocWriter:
 
     def add_truth(self, truth: Trajectory) -> None:
         """Writes the poses of the body, given the true trajectory of the left camera."""
-        folder = self.root / "state_groundtruth_estimate0"
+        folder = self.root / _TRUTH
         folder.mkdir(exist_ok=True)
         world_from_body = truth.world_from_camera @ geometry.inverse(self.rig.body_from_camera)
         lines = ["#timestamp [ns],x [m],y [m],z [m],qw [],qx [],qy [],qz []"]
@@ -104,7 +106,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     The readings are those of pressure sensor, AHRS, DVL and USBL at the recorded frames, and all readings of the IMU,
     as far as they were recorded. The truth consists of the poses of the body at all frames of the survey, including
-    those without a recorded image.
+    those without a recorded image, and of the true heights (dem_truth.tif), if the run has them.
 
     Raises:
         TwinError: an image is truncated or not a PNG image.
@@ -116,6 +118,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         contents.progress((k + 1) / len(contents.frames))
     if "truth" in contents.trajectories:
         writer.add_truth(contents.trajectories["truth"])
+        if contents.true_map is not None:
+            shutil.copyfile(contents.true_map, writer.root / _TRUTH / "dem_truth.tif")
     _write_readings(writer.root, contents)
     if contents.imu is not None:
         _write_imu(writer.root / "imu0", contents.imu)
@@ -175,6 +179,8 @@ def _write_imu(folder: Path, imu: RecordedImu) -> None:
         for time_s, row in zip(imu.readings.times_s, values.tolist(), strict=True):
             lines.write(",".join([str(timestamp_ns(time_s)), *map(repr, row)]) + "\n")
     tree = {"sensor_type": "imu", "T_BS": _matrix(np.eye(4)), "rate_hz": float(imu.rate_hz), **imu.noise._asdict()}
+    if imu.accelerometer_bias_mps2 is not None:
+        tree["accelerometer_bias_sigma"] = float(imu.accelerometer_bias_mps2)
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None)
     (folder / "sensor.yaml").write_text(text, encoding="utf-8")
 

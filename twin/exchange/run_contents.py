@@ -63,11 +63,13 @@ class RecordedImu(NamedTuple):
         readings: all readings of the run, in body axes.
         rate_hz: number of readings per second.
         noise: noise that the scenario states.
+        accelerometer_bias_mps2: standard deviation of the bias of each specific force; None if not stated.
     """
 
     readings: ImuReadings
     rate_hz: float
     noise: ImuNoise
+    accelerometer_bias_mps2: float | None = None
 
 
 class CameraIntrinsics(NamedTuple):
@@ -194,6 +196,7 @@ class RunContents:
         true_layers: function that renders the world again and returns its true layers; None for recorded data, for runs
             with the surrogate, and without recorded true poses.
         imu: readings of the IMU; None if none were recorded.
+        true_map: file of the true heights (dem_truth.tif); None without one.
         jpeg_quality: quality of the exported images as JPEG, 1 to 100; None: the PNG files are copied.
         progress: called with the completed fraction of the format that is being written, 0 to 1.
         notes: sentences on files of the run that are missing.
@@ -214,6 +217,7 @@ class RunContents:
     georeference: Georeference | None = None
     true_layers: Callable[[], TrueLayers] | None = None
     imu: RecordedImu | None = None
+    true_map: Path | None = None
     jpeg_quality: int | None = None
     progress: Callable[[float], None] = field(default=lambda _: None)
     notes: tuple[str, ...] = ()

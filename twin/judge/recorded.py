@@ -10,13 +10,14 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.nearest import nearest_index
-from twin.core.records import Array, SurveyResult, Trajectory
+from twin.core.records import Array, ElevationMap, SurveyResult, Trajectory
 from twin.judge.links import ALONG_NODES, linked_nodes, node_distance
 from twin.judge.metrics import SCHEMA, empty_metrics, timing_metrics
 from twin.judge.self_check import self_check_metrics
 from twin.judge.stereo_quality import stereo_quality
 from twin.judge.summary_statistics import finite_tree, percentile
 from twin.judge.trajectory import PathErrors, anchor, cumulative_length, trajectory_metrics
+from twin.judge.true_map import recorded_map_metrics
 from twin.judge.warnings import metric_warnings
 
 #: How an estimate is moved to the truth before the comparison. se3: by the rigid motion that minimises the squared
@@ -52,29 +53,32 @@ class ReplayEvaluation:
         result: output of the estimators.
         truth: recorded poses of the left camera; None if there is no truth.
         alignment: rigid motion that is applied to the estimates before the comparison, see `true_from_world`.
-        cell_m: cell size of the map [m]; None without a map.
+        elevation: the map; None without one.
         timing: wall_s, simulated_s, peak_rss_mb and stages, as in `metrics.EvaluationInput`.
         identity: name, seed, version, scenario_hash, status and reason.
         source: description of the data set (reader, number of skipped frames by reason, etc.), copied to `replay`.
         warnings: sentences on limits of the data set.
+        true_heights_m: (rows, cols) true heights at the cells of the map (`true_map.true_heights`); None if unknown.
     """
 
     result: SurveyResult
     truth: Trajectory | None
     alignment: AlignmentName
-    cell_m: float | None
+    elevation: ElevationMap | None
     timing: dict[str, Any]
     identity: dict[str, Any]
     source: dict[str, Any] = field(default_factory=dict[str, Any])
     warnings: tuple[str, ...] = ()
+    true_heights_m: NDArray[np.float32] | None = None
 
 
 def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
     """Returns the contents of metrics.json of a replayed survey, with the keys of `metrics.evaluate`.
 
-    Only the trajectories are compared with the truth; without one, their errors are None. The other metrics that need a
-    truth (map, links, etc.) are None, 0 or empty. The key `replay` holds the description of the data set, the
-    alignment, the number of frames with a true pose, and the consistency of the network (`network_residuals`).
+    The trajectories and, with true heights, the map are compared with the truth; without one, their errors are None.
+    The other metrics that need a truth (links, control, etc.) are None, 0 or empty. The key `replay` holds the
+    description of the data set, the alignment, the number of frames with a true pose, and the consistency of the
+    network (`network_residuals`).
     """
     result, truth = survey.result, survey.truth
     trajectories, warnings, n_associated = dict[str, Any](), list(survey.warnings), 0
@@ -89,7 +93,7 @@ def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
     metrics = empty | survey.identity | {
         "schema": SCHEMA,
         "trajectory": empty["trajectory"] | trajectories,
-        "map": empty["map"] | {"cell_m": survey.cell_m},
+        "map": empty["map"] | _map_metrics(survey),
         "links": empty["links"] | {"bridged": int((result.links.n_points == 0).sum())},
         "vision": stereo_quality(result),
         "self_check": self_check_metrics(result),
@@ -102,6 +106,13 @@ def evaluate_replay(survey: ReplayEvaluation) -> dict[str, Any]:
         },
     }  # fmt: skip
     return _with_warnings(finite_tree(metrics), warnings)
+
+
+def _map_metrics(survey: ReplayEvaluation) -> dict[str, float | None]:
+    """Returns the metrics of the map: its cell size, and errors if the true heights are known."""
+    if survey.elevation is None or survey.true_heights_m is None:
+        return {"cell_m": None if survey.elevation is None else survey.elevation.grid.cell_m}
+    return recorded_map_metrics(survey.elevation, survey.true_heights_m)
 
 
 def unevaluated_replay(survey: ReplayEvaluation) -> dict[str, Any]:
@@ -170,6 +181,15 @@ def true_from_world(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
     if alignment == "first":
         return anchor(estimate.world_from_camera[0], truth.world_from_camera[0])
     return rigid_alignment(estimate.positions, truth.positions)
+
+
+def world_alignment(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> Array:
+    """Returns the transform (4, 4) that moves an estimate to the truth, from the poses that are associated by time.
+
+    It is the identity if fewer than three frames have a true pose.
+    """
+    a, b = _associated_poses(estimate, truth)
+    return np.eye(4) if len(a) < _MIN_ASSOCIATED else true_from_world(a, b, alignment)
 
 
 def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> PathErrors:

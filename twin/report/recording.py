@@ -114,7 +114,7 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
         + [f"- **{row.label}**: {row.value} ({row.meaning})" for row in wording.key_figures(run.metrics or {})]
     )
     recording.log("summary", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
-    if "dem_truth" in run.rasters:
+    if "dem_truth" in run.rasters and np.allclose(run.keyframes.map_from_world, np.eye(4)):
         floor = recording_surfaces.floor_surface(run.rasters["dem_truth"])
         recording.log("world/true_floor", rr.Transform3D(translation=(0, 0, -TRUTH_BELOW_M)), static=True)
         recording.log("world/true_floor", surface_mesh(floor, alpha=TRUTH_ALPHA), static=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.georeference import Georeference
@@ -28,11 +29,13 @@ from twin.scenario.model import Scenario
 
 if TYPE_CHECKING:
     from twin.exchange.geotiff import OrthomosaicFile
+    from twin.exchange.tiled_map import TiledMapFolder
 
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 OPTIONAL_OUTPUTS = ("report", "recording")
 #: Glob patterns of the files that each interruptible stage of the writing creates.
 _FILES = {"maps": ("*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
+_ERROR_LAYER = "estimated minus true elevation [m]"  # description of the band of dem_error.tif
 _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
 
 
@@ -76,6 +79,8 @@ class SurveyRecord:
             it is written with the cells of the map.
         recorded_truth: recorded true poses of all frames, in the world of the estimates; None unless every frame has
             one.
+        recorded_heights_m: (rows, cols) true heights at the cells of the map, along its axis of height; None if they
+            are not known.
     """
 
     result: SurveyResult
@@ -87,6 +92,7 @@ class SurveyRecord:
     georeference: Georeference | None = None
     has_orthomosaic: bool = False
     recorded_truth: Trajectory | None = None
+    recorded_heights_m: NDArray[np.float32] | None = None
 
 
 class RunFolder:
@@ -196,6 +202,12 @@ class RunFolder:
 
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
 
+    def tiled_map(self) -> TiledMapFolder:
+        """Returns the writer of a map in tiles, in the folder `tiles`."""
+        from twin.exchange.tiled_map import TiledMapFolder
+
+        return TiledMapFolder(self.path / "tiles")
+
     def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None], kept: Collection[str] = ()) -> None:
         """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete.
 
@@ -255,8 +267,11 @@ class RunFolder:
                 geotiff.write_masks(self.path / "objects_truth.tif", masks, grid, origin)
             if elevation is not None:
                 error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
-                description = "estimated minus true elevation [m]"
-                geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, description, origin)
+                geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, _ERROR_LAYER, origin)
+        if record.recorded_heights_m is not None and elevation is not None:
+            grid, true_m = elevation.grid, record.recorded_heights_m
+            geotiff.write_elevations(self.path / "dem_truth.tif", true_m, grid, "true elevation [m]")
+            geotiff.write_layer(self.path / "dem_error.tif", elevation.height_m - true_m, grid, _ERROR_LAYER)
         if elevation is not None:
             geotiff.write_map(self.path, elevation, origin, mosaic=not record.has_orthomosaic)
             mesh.write_glb(self.path / "mesh.glb", elevation)

@@ -170,6 +170,9 @@ def replay_summary(metrics: Mapping[str, Any]) -> str:
         path = f"{length(final['ate_rmse_m'])} (RMSE) over a path of {length(final['path_m'])}"
         aligned = REPLAY_ALIGNMENTS.get(str(replay.get("alignment")), "")
         sentences.append(f"The position error of the final trajectory is {path}, {aligned}.")
+    if metrics["map"]["le90_m"] is not None:
+        error = length(metrics["map"]["le90_m"])
+        sentences.append(f"The LE90 of the heights is {error}, with the same alignment.")
     if network.get("loops"):
         residual, chi2 = length(network["loop_translation_m"]), plain(network["loop_chi2"])
         sentences.append(
@@ -280,6 +283,8 @@ def _map_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     completeness, cell = percent(elevation["completeness"]), length(elevation["cell_m"])
     area = percent(elevation.get("completeness_area"))
     mapped = f"over the mapped {completeness} of the observed floor"
+    if elevation["completeness"] is None and elevation["le90_m"] is not None:  # a replay with true heights
+        mapped = "over all cells with an estimated and a true height, moved by the alignment of the path"
     figures = [
         KeyFigure("Completeness", area, f"of the asked area; {completeness} of the observed floor; cell size {cell}"),
         KeyFigure("Map LE90, asked area", area_le90(elevation), _holes(elevation)),

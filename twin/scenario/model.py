@@ -600,7 +600,7 @@ class NavigationConfig(Section):
 
 
 class ImuConfig(Section):
-    """Inertial measurement unit (IMU) at the origin of the body; built-in estimators ignore its recorded readings.
+    """Inertial measurement unit (IMU) at the origin of the body; its readings are recorded for exports and replays.
 
     It measures angular rates and specific forces in body axes. Names and units of the noise are those of Kalibr and
     EuRoC: a noise density times the root of the rate is the standard deviation of the white noise of a reading. The

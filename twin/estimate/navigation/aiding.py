@@ -1,9 +1,10 @@
 """Factors of the navigation sensors in the graph of the global alignment.
 
-A reading of pressure, position (USBL) or attitude constrains the pose of one node. Beacons have surveyed positions, so
-their image coordinates also constrain the pose of one node. The DVL constrains the displacement between two nodes. The
-scale error of the DVL is estimated as one parameter shared by all displacements: if it were modelled as independent
-noise of each displacement, its effect would average out along the path, whereas the actual error accumulates.
+A reading of pressure, position (USBL), attitude or vertical constrains the pose of one node. Beacons have surveyed
+positions, so their image coordinates also constrain the pose of one node. The DVL constrains the displacement between
+two nodes. The scale error of the DVL is estimated as one parameter shared by all displacements: if it were modelled as
+independent noise of each displacement, its effect would average out along the path, whereas the actual error
+accumulates.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from twin.estimate.vision.keyframes import Keyframe
 
 
 def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> list[UnaryFactors]:
-    """Returns the factors of pressure, attitude, position fixes and beacons, in this order.
+    """Returns the factors of pressure, attitude, position fixes, beacons and verticals, in this order.
 
     All residuals are predicted minus measured.
 
@@ -38,6 +39,7 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
         _attitude_factors(nodes, rig, noise),
         _position_factors(nodes, noise),
         _beacon_factors(nodes, rig, noise),
+        _vertical_factors(nodes, rig, noise),
     ]
 
 
@@ -122,6 +124,31 @@ def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNois
     index = np.array([k for k, _ in sightings], np.int64)
     information = np.tile(np.eye(2) * noise.beacon_px**-2, (len(index), 1, 1))
     return UnaryFactors(index, information, lambda poses: evaluate(poses)[0], lambda poses, _: evaluate(poses)[1])
+
+
+def _vertical_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
+    """Returns the factors of the verticals measured by an IMU.
+
+    The residuals (m, 2) are the components of the predicted vertical perpendicular to the measured one, in the camera.
+    The error of the accelerometer is common to all n readings, so each has n times the variance: all together, they
+    determine the direction as precisely as one.
+    """
+    index = [k for k, node in enumerate(nodes) if node.readings.up is not None]
+    measured = np.array([nodes[k].readings.up for k in index]).reshape(-1, 3) @ rig.body_from_camera[:3, :3]
+    across = np.array([pose_filter.perpendicular_axes(up) for up in measured]).reshape(-1, 2, 3)
+
+    def jacobians(poses: Array, _: Array) -> Array:
+        by_pose = np.zeros((len(poses), 2, 6))
+        by_pose[:, :, :3] = across @ np.array([geometry.skew(up) for up in poses[:, 2, :3]]).reshape(-1, 3, 3)
+        return by_pose
+
+    information = np.tile(np.eye(2) * noise.up_rad**-2 / max(len(index), 1), (len(index), 1, 1))
+    return UnaryFactors(
+        np.array(index, np.int64),
+        information,
+        lambda poses: np.einsum("nij,nj->ni", across, poses[:, 2, :3]),
+        jacobians,
+    )
 
 
 def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFactors:

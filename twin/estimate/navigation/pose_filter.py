@@ -76,12 +76,40 @@ class PoseFilter:
             if np.isfinite(expected).all():
                 self._update(np.array(sighting.pixel) - expected, jacobian, np.eye(2) * self.noise.beacon_px**2)
 
+    def fuse_vertical(self, readings: Readings) -> None:
+        """Fuses the direction of the vertical, if it was measured, as far as it is more precise than the pose.
+
+        The errors of the readings are not independent: a bias of the accelerometer is in all of them. Let S be the
+        covariance of the predicted direction and s the standard deviation of a reading. Along the axes of S, each
+        component with a variance above s^2 is fused with the noise that reduces its variance to s^2, and the others are
+        left as they are. However many readings follow, the variance does not fall below s^2.
+        """
+        if readings.up is None:
+            return
+        measured = self.rig.body_from_camera[:3, :3].T @ readings.up
+        across, predicted = perpendicular_axes(measured), self.world_from_camera[2, :3]
+        jacobian = np.hstack([across @ geometry.skew(predicted), np.zeros((2, 3))])
+        variances, axes = np.linalg.eigh(jacobian @ self.cov @ jacobian.T)
+        above = variances > self.noise.up_rad**2 * (1 + 1e-9)
+        if above.any():
+            known = axes[:, above].T
+            noise = self.noise.up_rad**2 / (1 - self.noise.up_rad**2 / variances[above])
+            self._update(-known @ across @ predicted, known @ jacobian, np.diag(noise))
+
     def reset(self, world_from_camera: Array, cov: Array) -> None:
         """Replaces pose and covariance, for example by those of a global alignment."""
         self.world_from_camera, self.cov = geometry.nearest_rigid(world_from_camera), cov
 
     def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
         self.world_from_camera, self.cov = kalman_update(self.world_from_camera, self.cov, residual, jacobian, cov)
+
+
+def perpendicular_axes(direction: Array) -> Array:
+    """Returns two unit vectors (2, 3) that are perpendicular to a unit vector (3,) and to each other."""
+    turned = geometry.skew(direction)
+    first = turned @ np.eye(3)[int(np.argmin(np.abs(direction)))]
+    first = first / np.linalg.norm(first)
+    return np.stack([first, turned @ first])
 
 
 def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
