@@ -159,6 +159,12 @@ class TerrainConfig(Section):
         "without a photo the ground sample distance of the images at plan.altitude_m, 0.0006 to 0.005; larger on a "
         "sea floor that would have more than 40 million texture pixels",
     )
+    wall_texture: Literal["triplanar", "draped"] = Field(
+        default="triplanar",
+        description="texture of slopes of more than 37 deg. triplanar: projected horizontally, with the detail of level "
+        "ground; from 37 to 53 deg blended with the texture from above, which stays wherever orthophoto_file has data; "
+        "draped: the texture from above, stretched on slopes; no effect on a mesh",
+    )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
         default="lambert",
         description="reflection of the light of lamps. lambert: ideally diffuse; oren_nayar: rough, brighter towards "
