@@ -1,46 +1,66 @@
 """Albedo of steep parts of the floor by triplanar mapping: textures projected horizontally, see `terrains.walls`.
 
-The albedo depends only on the point of the floor. Its texture is filtered over the pixel's footprint on the rendered
-facet: trilinearly between levels of resolution (Williams 1983), at several places along the major axis of the
+The albedo depends only on the point of the floor. Its texture is filtered over the footprint of the pixel on the
+rendered facet: trilinearly between levels of resolution (Williams 1983), at several places along the major axis of the
 footprint, because walls are seen obliquely (anisotropic filter, McCormack et al. 1999, Feline).
+
+The steep pixels of a row pass through short loops, most of them without branches, so that the compiler vectorizes them.
+A colour is one integer with a lane of 21 bits for each band; the weights of all samples of a pixel are integers that
+add up to WHOLE, so a weighted sum of colours takes one multiplication for each texel and never leaves its lane.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
 from terrains import Terrain
-from terrains.objects.texture_pyramid import textures_of
 from twin.core.records import Image
 from twin.imaging.row_parallel import in_row_bands
 
 Array = NDArray[np.float64]
 
-MOST_SAMPLES = 4  #: largest number of samples along the major axis of a footprint
+MOST_SAMPLES = 4.0  #: largest number of samples along the major axis of a footprint
 LEAST_COSINE = 0.05  #: smallest cosine of the angle between ray and normal; smaller ones count as this value
+LEVELS = 6  #: levels of resolution: the coarsest texels are 32 times as large as the finest
+WHOLE = 4096  #: sum of the weights of a pixel
+_GREEN, _BLUE, _LANE, _SHIFT = np.uint64(21), np.uint64(42), np.uint64(0xFF), np.uint64(12)
+_HALF = np.uint64(WHOLE // 2 * (1 | 1 << 21 | 1 << 42))
+_FAR_M = np.float32(1e6)  # depths beyond this are infinite
+_FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
+(_COL, _ROW, _RAY_X, _RAY_Y, _EAST, _NORTH, _X, _Y, _ACROSS_X, _ACROSS_Y, _ACROSS_Z, _DOWN_X, _DOWN_Y, _DOWN_Z, _BELOW,
+ _MAJOR_ALONG, _MAJOR_BELOW, _SAMPLES, _LEVEL, _N_WORK) = range(20)  # fmt: skip
 
 
 class WallSurface(NamedTuple):
-    """Steep parts of a floor for the compiled kernels.
+    """Steep parts of a floor for the compiled kernels. All coordinates are texels of the texture of the walls.
 
     Args:
-        height_m: (ny, nx) heights of the floor.
+        height: (ny, nx) float32 heights of the floor below its highest point.
         number: (ny - 1, nx - 1), weights: (n, 2, 2, 2): see `terrains.walls.Walls`.
-        texels: (n, 3), levels: (levels, 3): see `terrains.objects.texture_pyramid.Textures`.
-        frame: west and south edge of the floor and spacing of its nodes [m]; length of the texture, height of its upper
-            edge, and its rise [m].
+        texels: (n,) uint64 colours of all levels, row by row.
+        levels: (LEVELS, 3) int64: number of the first texel, rows and columns of each level, finest first. A texel of a
+            level is the mean of 2 x 2 texels of the level before.
+        spacing, length: distance between the nodes, length of the texture [texels].
+        corner_m: (2,) x and y of the south-west corner of the floor [m].
+        high_m: greatest height of the floor [m].
+        texel_m: side of a texel [m].
     """
 
-    height_m: NDArray[np.float32]
+    height: NDArray[np.float32]
     number: NDArray[np.int32]
     weights: NDArray[np.float32]
-    texels: NDArray[np.uint8]
+    texels: NDArray[np.uint64]
     levels: NDArray[np.int64]
-    frame: tuple[float, float, float, float, float, float]
+    spacing: np.float32
+    length: np.float32
+    corner_m: Array
+    high_m: float
+    texel_m: float
 
 
 def wall_surface(terrain: Terrain) -> WallSurface | None:
@@ -48,11 +68,29 @@ def wall_surface(terrain: Terrain) -> WallSurface | None:
     walls = terrain.walls
     if walls is None:
         return None
-    texels, levels = textures_of([walls.texture])
-    frame = terrain.west_m, terrain.south_m, terrain.spacing_m
-    extent = walls.length_m, walls.high_m, max(walls.high_m - walls.low_m, 1e-6)
-    heights = np.ascontiguousarray(terrain.height_m, np.float32)
-    return WallSurface(heights, walls.number, walls.weights, texels, levels[0], tuple(map(float, (*frame, *extent))))
+    texels, levels = _levels(walls.texture)
+    texel_m = walls.length_m / walls.texture.shape[1]
+    height = ((walls.high_m - terrain.height_m.astype(np.float64)) / texel_m).astype(np.float32)
+    spacing, length = np.float32(terrain.spacing_m / texel_m), np.float32(walls.texture.shape[1])
+    corner_m = np.array([terrain.west_m, terrain.south_m])
+    return WallSurface(
+        height, walls.number, walls.weights, texels, levels, spacing, length, corner_m, walls.high_m, texel_m
+    )
+
+
+def _levels(texture: Image) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+    """Returns `WallSurface.texels` and `levels` of a texture (h, w, 3), continued beyond its lower and right edge."""
+    period = 2 ** (LEVELS - 1)
+    bottom, right = (period + -n % period for n in texture.shape[:2])
+    image = cv2.copyMakeBorder(texture, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
+    table, blocks, first = np.zeros((LEVELS, 3), np.int64), [], 0
+    for k in range(LEVELS):
+        table[k] = first, *image.shape[:2]
+        red, green, blue = (image[..., band].ravel().astype(np.uint64) for band in range(3))
+        blocks.append(red | green << _GREEN | blue << _BLUE)
+        first += len(red)
+        image = cv2.resize(image, (image.shape[1] // 2, image.shape[0] // 2), interpolation=cv2.INTER_AREA)
+    return np.concatenate(blocks), table
 
 
 def paint_walls(
@@ -67,8 +105,16 @@ def paint_walls(
         world_from_camera: (4, 4) pose of the camera; x right, y down, z forward.
         focal_px: focal length; the optical axis is at the centre of the image.
     """
-    pose = np.ascontiguousarray(world_from_camera[:3], np.float64)
-    in_row_bands(lambda first, end: _paint(surface, albedo, depth, pose, focal_px, first, end), len(depth))
+    pose = np.array(world_from_camera[:3]) / surface.texel_m  # east, north and down from the highest point [texels]
+    pose[:2, 3] -= surface.corner_m / surface.texel_m
+    pose[2] = -pose[2]
+    pose[2, 3] += surface.high_m / surface.texel_m
+    origin = np.floor(pose[:2, 3] / surface.spacing)  # columns and rows relative to the camera need only float32
+    origin = np.clip(origin, 0, np.array(surface.number.shape[::-1]) - 1)
+    pose[:2, 3] -= origin * np.float64(surface.spacing)
+    view, cell = pose.astype(np.float32), origin.astype(np.int64)
+    focal = np.float32(focal_px)
+    in_row_bands(lambda first, end: _paint(surface, albedo, depth, view, cell, focal, first, end), len(depth))
 
 
 def paint_walls_from_above(surface: WallSurface, albedo: Image, x_m: Array, y_m: Array, step_m: float) -> None:
@@ -81,159 +127,237 @@ def paint_walls_from_above(surface: WallSurface, albedo: Image, x_m: Array, y_m:
         y_m: (rows,) y of the samples.
         step_m: distance between the samples.
     """
-    _paint_from_above(surface, albedo, x_m, y_m, step_m)
+    spacing_m = float(surface.spacing) * surface.texel_m
+    columns, rows = (x_m - surface.corner_m[0]) / spacing_m, (y_m - surface.corner_m[1]) / spacing_m
+    _paint_from_above(surface, albedo, columns, rows, np.float32(step_m / surface.texel_m))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _paint(surface, albedo, depth, pose, focal, first, end):
-    """Compiled kernel of `paint_walls` for the rows first to end - 1."""
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _paint(surface, albedo, depth, view, origin, focal, first, end):
+    """Compiled kernel of `paint_walls` for the rows first to end - 1.
+
+    Args:
+        view: (3, 4) map from the axes of the camera [m] to east and north of the cell `origin`, and down from the
+            highest point of the floor [texels].
+        origin: (2,) column and row of this cell.
+    """
     height, width = depth.shape
-    west, south, spacing, _, _, _ = surface.frame
-    rows, cols = surface.number.shape
-    ax, ay, az, bx, by, bz = pose[0, 0], pose[1, 0], pose[2, 0], pose[0, 1], pose[1, 1], pose[2, 1]
+    work, steep = np.empty((_N_WORK, width), np.float32), np.empty((3, width), np.int32)
+    total, used = np.empty(width, np.uint64), np.empty(width, np.int64)
     for v in range(first, end):
-        q = (v - 0.5 * (height - 1)) / focal
-        x0, y0, z0 = q * bx + pose[0, 2], q * by + pose[1, 2], q * bz + pose[2, 2]
-        for u in range(width):
-            far = np.float64(depth[v, u])
-            if not far < np.inf:
-                continue
-            p = (u - 0.5 * (width - 1)) / focal
-            dx, dy = x0 + p * ax, y0 + p * ay
-            col = (pose[0, 3] + far * dx - west) / spacing
-            row = (pose[1, 3] + far * dy - south) / spacing
-            c, r = min(max(int(col), 0), cols - 1), min(max(int(row), 0), rows - 1)
-            if surface.number[r, c] < 0:
-                continue
-            east, north = _slope(surface.height_m, r, c, col - c, row - r, spacing)
-            dz = z0 + p * az
-            along = dz - east * dx - north * dy
-            least = LEAST_COSINE * np.sqrt((1 + east * east + north * north) * (dx * dx + dy * dy + dz * dz))
-            along = min(along, -least)  # the camera sees the upper side
-            du = (az - east * ax - north * ay) / along
-            dv = (bz - east * bx - north * by) / along
-            size = far / focal
-            across = size * (ax - dx * du), size * (ay - dy * du), size * (az - dz * du)
-            down = size * (bx - dx * dv), size * (by - dy * dv), size * (bz - dz * dv)
-            _blend(surface, albedo[v, u], (r, c, col - c, row - r), pose[2, 3] + far * dz, across, down)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _paint_from_above(surface, albedo, x_m, y_m, step):
-    """Compiled kernel of `paint_walls_from_above`."""
-    west, south, spacing, _, _, _ = surface.frame
-    rows, cols = surface.number.shape
-    for i in range(y_m.size):
-        row = (y_m[i] - south) / spacing
-        r = min(max(int(row), 0), rows - 1)
-        for j in range(x_m.size):
-            col = (x_m[j] - west) / spacing
-            c = min(max(int(col), 0), cols - 1)
-            if surface.number[r, c] < 0 or row < 0 or row > rows or col < 0 or col > cols:
-                continue
-            s, t = col - c, row - r
-            east, north = _slope(surface.height_m, r, c, s, t, spacing)
-            z = surface.height_m[r, c] + spacing * (s * east + t * north)
-            _blend(surface, albedo[i, j], (r, c, s, t), z, (step, 0.0, step * east), (0.0, step, step * north))
-
-
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
-def _slope(height, r, c, s, t, spacing):
-    """Returns the slope towards east and north, rise over run, of the facet at (s, t) in cell (r, c)."""
-    south_west, north_east = np.float64(height[r, c]), np.float64(height[r + 1, c + 1])
-    if s >= t:
-        middle = height[r, c + 1]
-        return (middle - south_west) / spacing, (north_east - middle) / spacing
-    middle = height[r + 1, c]
-    return (north_east - middle) / spacing, (middle - south_west) / spacing
-
-
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
-def _blend(surface, colour, place, z, across, down):
-    """Blends the texture of the walls into the colour (3,) of one pixel, in place.
-
-    Args:
-        surface: `WallSurface`.
-        colour: albedo with the texture projected from above.
-        place: row and column of the cell, and position in it towards east and north, 0 to 1.
-        z: height of the point [m].
-        across, down: displacement (x, y, z) of the point from this pixel to the next one along each axis [m].
-    """
-    r, c, s, t = place
-    _, _, spacing, length, high, rise = surface.frame
-    corner = surface.weights[surface.number[r, c]]
-    sw, se, nw, ne = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
-    rest, red, green, blue = 1.0, 0.0, 0.0, 0.0
-    for axis in range(2):
-        weight = sw * corner[0, 0, axis] + se * corner[0, 1, axis] + nw * corner[1, 0, axis] + ne * corner[1, 1, axis]
-        if weight == 0.0:
+        y = (np.float32(v) - np.float32(0.5) * np.float32(height - 1)) / focal
+        n = _find(surface, depth[v], y, view, origin, focal, work, steep)
+        if n == 0:
             continue
-        along = (r + t) * spacing / length if axis == 0 else (c + s) * spacing / length
-        sign = 1.0
-        if weight < 0:
-            weight, along, sign = -weight, 1 - along, -1.0
-        k = 1 - axis
-        footprint = sign * across[k] / length, -across[2] / rise, sign * down[k] / length, -down[2] / rise
-        red1, green1, blue1 = _filtered(surface.texels, surface.levels, along, (high - z) / rise, footprint)
-        red, green, blue = red + weight * red1, green + weight * green1, blue + weight * blue1
-        rest -= weight
-    if rest < 1:
-        rest = max(rest, 0.0)
-        colour[0] = np.uint8(rest * colour[0] + red + 0.5)
-        colour[1] = np.uint8(rest * colour[1] + green + 0.5)
-        colour[2] = np.uint8(rest * colour[2] + blue + 0.5)
+        _place(surface, origin, work, steep, n)
+        _project(depth[v], y, view, focal, surface.spacing, work, steep, n)
+        _blend(surface, albedo[v], work, steep, n, total, used)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _filtered(texels, levels, along, below, footprint):
-    """Returns red, green and blue of a texture, filtered over the footprint of a pixel.
+@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+def _paint_from_above(surface, albedo, columns, rows, step):
+    """Compiled kernel of `paint_walls_from_above`; columns, rows and step are in cells, cells and texels."""
+    n_rows, n_cols = surface.number.shape
+    work, steep = np.empty((_N_WORK, columns.size), np.float32), np.empty((3, columns.size), np.int32)
+    total, used = np.empty(columns.size, np.uint64), np.empty(columns.size, np.int64)
+    for v in range(rows.size):
+        r, n = min(max(int(np.floor(rows[v])), 0), n_rows - 1), 0
+        if not 0 <= rows[v] <= n_rows:
+            continue
+        for u in range(columns.size):
+            c = min(max(int(np.floor(columns[u])), 0), n_cols - 1)
+            steep[0, n], steep[1, n], steep[2, n] = u, c, r
+            work[_COL, n], work[_ROW, n] = np.float32(columns[u] - c), np.float32(rows[v] - r)
+            if 0 <= columns[u] <= n_cols and surface.number[r, c] >= 0:
+                n += 1
+        _place(surface, np.zeros(2, np.int64), work, steep, n)
+        for i in range(n):
+            c, r, east, north = steep[1, i], steep[2, i], work[_EAST, i], work[_NORTH, i]
+            work[_BELOW, i] = surface.height[r, c] + surface.spacing * (work[_COL, i] * east + work[_ROW, i] * north)
+            work[_ACROSS_X, i], work[_ACROSS_Y, i], work[_ACROSS_Z, i] = step, 0.0, step * east
+            work[_DOWN_X, i], work[_DOWN_Y, i], work[_DOWN_Z, i] = 0.0, step, step * north
+        _blend(surface, albedo[v], work, steep, n, total, used)
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _find(surface, depth, y, view, origin, focal, work, steep):
+    """Finds the pixels of a row that show steep cells; returns their number.
+
+    Fills `steep` (3, W) with the column of each such pixel, and column and row of its cell, and rows _COL and _ROW of
+    `work` with its position in the cell.
+    """
+    rows, cols = surface.number.shape
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    per_cell = one / surface.spacing
+    west, south = -np.float32(origin[0]), -np.float32(origin[1])
+    east, north = west + np.float32(cols - 1), south + np.float32(rows - 1)
+    col_x, row_x, col_0, row_0 = view[0, 0] * per_cell, view[1, 0] * per_cell, view[0, 3] * per_cell, view[1, 3] * per_cell
+    col_z, row_z = (view[0, 1] * y + view[0, 2]) * per_cell, (view[1, 1] * y + view[1, 2]) * per_cell
+    centre = half * np.float32(depth.size - 1)
+    col, row, column, line, there = work[_EAST], work[_NORTH], work[_RAY_X], work[_RAY_Y], work[_BELOW]
+    for u in range(depth.size):
+        z = depth[u] if depth[u] < _FAR_M else zero
+        x = (np.float32(u) - centre) / focal
+        at, up = z * (col_x * x + col_z) + col_0, z * (row_x * x + row_z) + row_0
+        col[u], row[u] = at, up
+        column[u] = min(max(np.floor(at), west), east)
+        line[u] = min(max(np.floor(up), south), north)
+    n, first = 0, np.int64(origin[1]) * cols + origin[0]
+    flat = surface.number.reshape(-1)
+    for u in range(depth.size):
+        c, r = np.int64(column[u]), np.int64(line[u])
+        steep[0, n], steep[1, n], steep[2, n] = u, c + origin[0], r + origin[1]
+        work[_COL, n], work[_ROW, n] = col[u] - column[u], row[u] - line[u]
+        n += (flat[first + r * cols + c] >= 0) & (depth[u] < _FAR_M)
+    return n
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _place(surface, origin, work, steep, n):
+    """Fills the rows _EAST and _NORTH of `work` with the slopes of the facets, _X and _Y with the signed weights.
+
+    The slopes are the increase of the depth below the highest point, divided by the distance.
+    """
+    height, per_cell = surface.height, np.float32(1) / surface.spacing
+    one = np.float32(1)
+    for i in range(n):
+        c, r, s, t = steep[1, i], steep[2, i], work[_COL, i], work[_ROW, i]
+        south_west, south_east = height[r, c], height[r, c + 1]
+        north_west, north_east = height[r + 1, c], height[r + 1, c + 1]
+        lower = s >= t
+        work[_EAST, i] = (south_east - south_west if lower else north_east - north_west) * per_cell
+        work[_NORTH, i] = (north_east - south_east if lower else north_west - south_west) * per_cell
+        corner = surface.weights[surface.number[r, c]]
+        sw, se, nw, ne = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
+        work[_X, i] = sw * corner[0, 0, 0] + se * corner[0, 1, 0] + nw * corner[1, 0, 0] + ne * corner[1, 1, 0]
+        work[_Y, i] = sw * corner[0, 0, 1] + se * corner[0, 1, 1] + nw * corner[1, 0, 1] + ne * corner[1, 1, 1]
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _project(depth, y, view, focal, spacing, work, steep, n):
+    """Fills the rows _ACROSS_X to _BELOW of `work`: displacement on the facet to the next pixel along both axes.
+
+    The facet is the plane through the point with the normal N = (east, north, -1) in the axes east, north, down. With
+    the ray d of a pixel at the depth z, and d' its change to the next pixel, the point moves by z (d' - d N.d' / N.d).
+    """
+    ax, ay, az, bx, by, bz = view[0, 0], view[1, 0], view[2, 0], view[0, 1], view[1, 1], view[2, 1]
+    x0, y0, z0 = view[0, 1] * y + view[0, 2], view[1, 1] * y + view[1, 2], view[2, 1] * y + view[2, 2]
+    one, half, least, down_0 = np.float32(1), np.float32(0.5), np.float32(LEAST_COSINE), view[2, 3]
+    centre, per_px, far, px = half * np.float32(depth.size - 1), one / focal, work[_MAJOR_ALONG], work[_MAJOR_BELOW]
+    for i in range(n):
+        px[i], far[i] = np.float32(steep[0, i]), depth[steep[0, i]]
+    for i in range(n):
+        x = (px[i] - centre) * per_px
+        dx, dy, dz = x0 + x * ax, y0 + x * ay, z0 + x * az
+        east, north = work[_EAST, i], work[_NORTH, i]
+        smallest = least * np.sqrt((one + east * east + north * north) * (dx * dx + dy * dy + dz * dz))
+        along = one / max(dz - east * dx - north * dy, smallest)  # the camera sees the upper side
+        size = far[i] * per_px
+        du, dv = (az - east * ax - north * ay) * along, (bz - east * bx - north * by) * along
+        work[_ACROSS_X, i], work[_DOWN_X, i] = size * (ax - dx * du), size * (bx - dx * dv)
+        work[_ACROSS_Y, i], work[_DOWN_Y, i] = size * (ay - dy * du), size * (by - dy * dv)
+        work[_ACROSS_Z, i], work[_DOWN_Z, i] = size * (az - dz * du), size * (bz - dz * dv)
+        work[_BELOW, i] = down_0 + far[i] * dz
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _blend(surface, albedo, work, steep, n, total, used):
+    """Blends the texture of the walls into the n steep pixels of a row of the image `albedo` (W, 3)."""
+    for i in range(n):
+        total[i], used[i] = np.uint64(0), 0
+    for axis in range(2):  # projection along x, then along y
+        _footprints(work[_ACROSS_Y - axis], work[_DOWN_Y - axis], work, n)
+        for i in range(n):
+            weight = work[_X + axis, i]
+            if weight == 0:
+                continue
+            cell, part = steep[2 - axis, i], work[_ROW - axis, i]
+            along, turned = (np.float32(cell) + part) * surface.spacing, np.float32(1)
+            if weight < 0:
+                weight, along, turned = -weight, surface.length - along, -turned
+            total[i], used[i] = _filtered(surface, weight, along, turned, work[:, i], total[i], used[i])
+    for i in range(n):
+        if used[i] > 0:
+            colour = albedo[steep[0, i]]
+            own = np.uint64(colour[0]) | np.uint64(colour[1]) << _GREEN | np.uint64(colour[2]) << _BLUE
+            mixed = total[i] + own * np.uint64(max(WHOLE - used[i], 0)) + _HALF
+            colour[0] = mixed >> _SHIFT & _LANE
+            colour[1] = mixed >> (_GREEN + _SHIFT) & _LANE
+            colour[2] = mixed >> (_BLUE + _SHIFT) & _LANE
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _footprints(across, down, work, n):
+    """Fills the rows _MAJOR_ALONG to _LEVEL of `work`: the filter of the pixels.
+
+    With J the (2, 2) displacement in the texture to the next pixel along both axes, the footprint is an ellipse, and
+    its squared axes are the eigenvalues of J J^T. There are as many samples along the major axis as it is longer than
+    the minor axis, MOST_SAMPLES at most, and the texels of the level are as large as the distance between the samples.
 
     Args:
-        texels, levels: see `WallSurface`.
-        along, below: position in the texture, as a fraction of its columns and rows.
-        footprint: change of `along` and of `below` to the next pixel across, and to the next pixel down.
+        across, down: (W,) displacement along the columns of the texture; that along its rows is in `work`.
     """
-    _, rows, cols = levels[0]
-    a, b, c, d = footprint[0] * cols, footprint[1] * rows, footprint[2] * cols, footprint[3] * rows
-    # axes of the ellipse onto which [[a, c], [b, d]] maps the unit circle [texels]
-    aa, ab, bb = a * a + c * c, a * b + c * d, b * b + d * d
-    half = 0.5 * (aa - bb)
-    square = 0.5 * (aa + bb) + np.sqrt(half * half + ab * ab)
-    major, area = np.sqrt(square), abs(a * d - b * c)
-    n, axis_along, axis_below = 1, 0.0, 0.0
-    if major > 1:
-        n = min(max(int(major / max(area / major, 1.0) + 0.5), 1), MOST_SAMPLES)
-        axis_along, axis_below = (square - bb, ab) if half > 0 else (ab, square - aa)
-        scale = major / (n * np.sqrt(axis_along * axis_along + axis_below * axis_below))
-        axis_along, axis_below = axis_along * scale / cols, axis_below * scale / rows
-    level = min(max(np.log2(major / n), 0.0), len(levels) - 1.001)
-    fine = int(level)
-    share = level - fine
-    red, green, blue = 0.0, 0.0, 0.0
-    for k in range(n):
-        at, under = along + (k - 0.5 * (n - 1)) * axis_along, below + (k - 0.5 * (n - 1)) * axis_below
-        r, g, b = _sample(texels, levels[fine], at, under)
-        red, green, blue = red + (1 - share) * r, green + (1 - share) * g, blue + (1 - share) * b
-        if share > 0:
-            r, g, b = _sample(texels, levels[fine + 1], at, under)
-            red, green, blue = red + share * r, green + share * g, blue + share * b
-    return red / n, green / n, blue / n
+    zero, one, half, most = np.float32(0), np.float32(1), np.float32(0.5), np.float32(MOST_SAMPLES)
+    size = work[_LEVEL]
+    for i in range(n):
+        a, b, c, d = across[i], work[_ACROSS_Z, i], down[i], work[_DOWN_Z, i]
+        aa, ab, bb, area = a * a + c * c, a * b + c * d, b * b + d * d, a * d - b * c
+        difference = half * (aa - bb)
+        major = half * (aa + bb) + np.sqrt(difference * difference + ab * ab)
+        ratio = major / np.sqrt(max(area * area, max(major, np.float32(1e-12))))
+        samples = min(max(np.floor(ratio + half), one), most)
+        along, below = (major - bb, ab) if difference > zero else (ab, major - aa)
+        step = np.sqrt(major / max(along * along + below * below, np.float32(1e-20))) / samples
+        work[_MAJOR_ALONG, i], work[_MAJOR_BELOW, i], work[_SAMPLES, i] = step * along, step * below, samples
+        size[i] = max(major / (samples * samples), one)
+    bits = size.view(np.int32)
+    for i in range(n):  # log2 from exponent and mantissa, linear within an octave
+        size[i] = half * (np.float32(bits[i]) * np.float32(2**-23) - np.float32(127))
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
-def _sample(texels, level, along, below):
-    """Returns red, green and blue of a level, interpolated bilinearly; the texels of the edges continue beyond them."""
-    first, rows, cols = level
-    col, row = min(max(along * cols - 0.5, 0.0), cols - 1.0), min(max(below * rows - 0.5, 0.0), rows - 1.0)
-    c, r = int(col), int(row)
-    s, t = col - c, row - r
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _filtered(surface, weight, along, turned, of_pixel, total, used):
+    """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added.
+
+    Args:
+        weight: weight of the texture in this pixel, 0 to 1.
+        along: column in the texture [texels].
+        turned: -1 if the texture runs from right to left, else 1.
+        of_pixel: column of `work`.
+    """
+    samples, level = np.int64(of_pixel[_SAMPLES]), min(of_pixel[_LEVEL], np.float32(LEVELS - 1.001))
+    fine = np.int64(level)
+    each = np.int64(weight * np.float32(WHOLE) / of_pixel[_SAMPLES] + np.float32(0.5))
+    coarser = np.int64(np.float32(each) * (level - np.float32(fine)) + np.float32(0.5))
+    step_along, step_below = of_pixel[_MAJOR_ALONG] * turned, of_pixel[_MAJOR_BELOW]
+    start = np.float32(0.5) * (of_pixel[_SAMPLES] - np.float32(1))
+    along, below = along - start * step_along, of_pixel[_BELOW] - start * step_below
+    for _ in range(samples):
+        total += _sample(surface.texels, surface.levels, fine, along, below, each - coarser)
+        total += _sample(surface.texels, surface.levels, fine + 1, along, below, coarser)
+        along, below = along + step_along, below + step_below
+    return total, used + samples * each
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _sample(texels, levels, level, along, below, weight):
+    """Returns `weight` times the colour of a level at a point [finest texels], interpolated bilinearly.
+
+    The texels of the edges continue beyond the texture.
+    """
+    first, rows, cols = levels[level]
+    zero, half, scale = np.float32(0), np.float32(0.5), np.float32(1) / np.float32(1 << level)
+    col = min(max(along * scale - half, zero), np.float32(cols - 2))
+    row = min(max(below * scale - half, zero), np.float32(rows - 2))
+    c, r = np.int64(col), np.int64(row)
+    right, lower = col - np.float32(c), (row - np.float32(r)) * np.float32(weight)
+    south = np.int64(lower + half)
+    south_east = np.int64(lower * right + half)
+    north_east = min(np.int64((np.float32(weight) - lower) * right + half), weight - south)
     upper = first + r * cols + c
-    right = 1 if c + 1 < cols else 0
-    lower = upper + cols if r + 1 < rows else upper
-    nw, ne, sw, se = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
-    red = nw * texels[upper, 0] + ne * texels[upper + right, 0] + sw * texels[lower, 0] + se * texels[lower + right, 0]
-    green = (
-        nw * texels[upper, 1] + ne * texels[upper + right, 1] + sw * texels[lower, 1] + se * texels[lower + right, 1]
+    return (
+        texels[upper] * np.uint64(weight - south - north_east)
+        + texels[upper + 1] * np.uint64(north_east)
+        + texels[upper + cols] * np.uint64(south - south_east)
+        + texels[upper + cols + 1] * np.uint64(south_east)
     )
-    blue = nw * texels[upper, 2] + ne * texels[upper + right, 2] + sw * texels[lower, 2] + se * texels[lower + right, 2]
-    return red, green, blue
