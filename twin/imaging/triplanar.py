@@ -191,7 +191,12 @@ def _find(surface, depth, y, view, origin, focal, work, steep):
     per_cell = one / surface.spacing
     west, south = -np.float32(origin[0]), -np.float32(origin[1])
     east, north = west + np.float32(cols - 1), south + np.float32(rows - 1)
-    col_x, row_x, col_0, row_0 = view[0, 0] * per_cell, view[1, 0] * per_cell, view[0, 3] * per_cell, view[1, 3] * per_cell
+    col_x, row_x, col_0, row_0 = (
+        view[0, 0] * per_cell,
+        view[1, 0] * per_cell,
+        view[0, 3] * per_cell,
+        view[1, 3] * per_cell,
+    )
     col_z, row_z = (view[0, 1] * y + view[0, 2]) * per_cell, (view[1, 1] * y + view[1, 2]) * per_cell
     centre = half * np.float32(depth.size - 1)
     col, row, column, line, there = work[_EAST], work[_NORTH], work[_RAY_X], work[_RAY_Y], work[_BELOW]
@@ -218,7 +223,8 @@ def _place(surface, origin, work, steep, n):
 
     The slopes are the increase of the depth below the highest point, divided by the distance.
     """
-    height, per_cell = surface.height, np.float32(1) / surface.spacing
+    height, number, weights = surface.height, surface.number, surface.weights
+    per_cell = np.float32(1) / surface.spacing
     one = np.float32(1)
     for i in range(n):
         c, r, s, t = steep[1, i], steep[2, i], work[_COL, i], work[_ROW, i]
@@ -227,10 +233,14 @@ def _place(surface, origin, work, steep, n):
         lower = s >= t
         work[_EAST, i] = (south_east - south_west if lower else north_east - north_west) * per_cell
         work[_NORTH, i] = (north_east - south_east if lower else north_west - south_west) * per_cell
-        corner = surface.weights[surface.number[r, c]]
+        k = number[r, c]
         sw, se, nw, ne = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
-        work[_X, i] = sw * corner[0, 0, 0] + se * corner[0, 1, 0] + nw * corner[1, 0, 0] + ne * corner[1, 1, 0]
-        work[_Y, i] = sw * corner[0, 0, 1] + se * corner[0, 1, 1] + nw * corner[1, 0, 1] + ne * corner[1, 1, 1]
+        work[_X, i] = (
+            sw * weights[k, 0, 0, 0] + se * weights[k, 0, 1, 0] + nw * weights[k, 1, 0, 0] + ne * weights[k, 1, 1, 0]
+        )
+        work[_Y, i] = (
+            sw * weights[k, 0, 0, 1] + se * weights[k, 0, 1, 1] + nw * weights[k, 1, 0, 1] + ne * weights[k, 1, 1, 1]
+        )
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -263,6 +273,7 @@ def _project(depth, y, view, focal, spacing, work, steep, n):
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
 def _blend(surface, albedo, work, steep, n, total, used):
     """Blends the texture of the walls into the n steep pixels of a row of the image `albedo` (W, 3)."""
+    texels, levels, spacing, length = surface.texels, surface.levels, surface.spacing, surface.length
     for i in range(n):
         total[i], used[i] = np.uint64(0), 0
     for axis in range(2):  # projection along x, then along y
@@ -272,18 +283,18 @@ def _blend(surface, albedo, work, steep, n, total, used):
             if weight == 0:
                 continue
             cell, part = steep[2 - axis, i], work[_ROW - axis, i]
-            along, turned = (np.float32(cell) + part) * surface.spacing, np.float32(1)
+            along, turned = (np.float32(cell) + part) * spacing, np.float32(1)
             if weight < 0:
-                weight, along, turned = -weight, surface.length - along, -turned
-            total[i], used[i] = _filtered(surface, weight, along, turned, work[:, i], total[i], used[i])
+                weight, along, turned = -weight, length - along, -turned
+            total[i], used[i] = _filtered(texels, levels, weight, along, turned, work, i, total[i], used[i])
     for i in range(n):
         if used[i] > 0:
-            colour = albedo[steep[0, i]]
-            own = np.uint64(colour[0]) | np.uint64(colour[1]) << _GREEN | np.uint64(colour[2]) << _BLUE
+            u = steep[0, i]
+            own = np.uint64(albedo[u, 0]) | np.uint64(albedo[u, 1]) << _GREEN | np.uint64(albedo[u, 2]) << _BLUE
             mixed = total[i] + own * np.uint64(max(WHOLE - used[i], 0)) + _HALF
-            colour[0] = mixed >> _SHIFT & _LANE
-            colour[1] = mixed >> (_GREEN + _SHIFT) & _LANE
-            colour[2] = mixed >> (_BLUE + _SHIFT) & _LANE
+            albedo[u, 0] = mixed >> _SHIFT & _LANE
+            albedo[u, 1] = mixed >> (_GREEN + _SHIFT) & _LANE
+            albedo[u, 2] = mixed >> (_BLUE + _SHIFT) & _LANE
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -316,7 +327,7 @@ def _footprints(across, down, work, n):
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
-def _filtered(surface, weight, along, turned, of_pixel, total, used):
+def _filtered(texels, levels, weight, along, turned, work, i, total, used):
     """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added.
 
     Args:
@@ -325,16 +336,16 @@ def _filtered(surface, weight, along, turned, of_pixel, total, used):
         turned: -1 if the texture runs from right to left, else 1.
         of_pixel: column of `work`.
     """
-    samples, level = np.int64(of_pixel[_SAMPLES]), min(of_pixel[_LEVEL], np.float32(LEVELS - 1.001))
+    samples, level = np.int64(work[_SAMPLES, i]), min(work[_LEVEL, i], np.float32(LEVELS - 1.001))
     fine = np.int64(level)
-    each = np.int64(weight * np.float32(WHOLE) / of_pixel[_SAMPLES] + np.float32(0.5))
+    each = np.int64(weight * np.float32(WHOLE) / work[_SAMPLES, i] + np.float32(0.5))
     coarser = np.int64(np.float32(each) * (level - np.float32(fine)) + np.float32(0.5))
-    step_along, step_below = of_pixel[_MAJOR_ALONG] * turned, of_pixel[_MAJOR_BELOW]
-    start = np.float32(0.5) * (of_pixel[_SAMPLES] - np.float32(1))
-    along, below = along - start * step_along, of_pixel[_BELOW] - start * step_below
+    step_along, step_below = work[_MAJOR_ALONG, i] * turned, work[_MAJOR_BELOW, i]
+    start = np.float32(0.5) * (work[_SAMPLES, i] - np.float32(1))
+    along, below = along - start * step_along, work[_BELOW, i] - start * step_below
     for _ in range(samples):
-        total += _sample(surface.texels, surface.levels, fine, along, below, each - coarser)
-        total += _sample(surface.texels, surface.levels, fine + 1, along, below, coarser)
+        total += _sample(texels, levels, fine, along, below, each - coarser)
+        total += _sample(texels, levels, fine + 1, along, below, coarser)
         along, below = along + step_along, below + step_below
     return total, used + samples * each
 
@@ -345,7 +356,7 @@ def _sample(texels, levels, level, along, below, weight):
 
     The texels of the edges continue beyond the texture.
     """
-    first, rows, cols = levels[level]
+    first, rows, cols = levels[level, 0], levels[level, 1], levels[level, 2]
     zero, half, scale = np.float32(0), np.float32(0.5), np.float32(1) / np.float32(1 << level)
     col = min(max(along * scale - half, zero), np.float32(cols - 2))
     row = min(max(below * scale - half, zero), np.float32(rows - 2))
