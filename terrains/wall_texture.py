@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.textures import COARSEN_TEXELS, TextureSource, generate_wall_texture, texture_from_photo
+from terrains.textures import TextureSource, generate_wall_texture, texture_from_photo
 from terrains.walls import Walls, wall_weights
+
+WALL_TEXELS = 10_000_000  #: largest number of texels of the texture of walls
 
 
 def walls_of(
@@ -26,7 +28,7 @@ def walls_of(
         source: source of the texture of the floor.
         cover: a key of `ground_cover.COVERS`, for a floor without photo.
         texel_m: side of the texels of the floor; those of the walls have the same side, or a larger one if there would
-            be more than COARSEN_TEXELS.
+            be more than WALL_TEXELS.
         rng: random generator of a generated texture.
         draped: (rows, cols) texels, row 0 = north, that an orthophoto covers. It shows no walls, and the scene has its
             colours wherever it has any: there are no walls here.
@@ -36,7 +38,7 @@ def walls_of(
         return None
     length_m, low_m, high_m = (max(height_m.shape) - 1) * spacing_m, float(height_m.min()), float(height_m.max())
     rise_m = high_m - low_m
-    texel_m = max(texel_m, float(np.sqrt(length_m * rise_m / COARSEN_TEXELS)))
+    texel_m = max(texel_m, float(np.sqrt(length_m * rise_m / WALL_TEXELS)))
     shape = max(2, round(rise_m / texel_m)), max(2, round(length_m / texel_m))
     if source.photo_file is not None:
         texture = texture_from_photo(source, shape, (length_m, rise_m))

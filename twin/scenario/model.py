@@ -163,7 +163,7 @@ class TerrainConfig(Section):
         default="triplanar",
         description="texture of slopes of more than 37 deg. triplanar: projected horizontally, with the detail of level "
         "ground; from 37 to 53 deg blended with the texture from above, which stays wherever orthophoto_file has data; "
-        "draped: the texture from above, stretched on slopes; no effect on a mesh",
+        "draped: the texture from above, stretched on slopes; not with a mesh",
     )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
         default="lambert",
