@@ -23,7 +23,7 @@ FOCAL_PX = H / 2 / np.tan(np.deg2rad(VFOV) / 2)
 TEXEL_M = 0.005
 
 
-def floor(heights, size_m=(3.0, 3.0), grid_m=0.05, walls=True, cover="rubble") -> Terrain:
+def floor(heights, size_m=(3.0, 3.0), grid_m=0.05, walls=True, cover="sand") -> Terrain:
     """Returns a floor with the heights of a function of x (nx,) and y (ny, 1)."""
     return terrains.generate_from(
         lambda x, y, _: heights(x[None], y[:, None]) + 0 * x[None] * y[:, None], size_m, grid_m,
@@ -50,7 +50,8 @@ def points_of(depth: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Returns the points (H, W, 3) of the pixels in the world."""
     u, v = np.meshgrid(np.arange(W) - (W - 1) / 2, np.arange(H) - (H - 1) / 2)
     rays = np.stack([u / FOCAL_PX, v / FOCAL_PX, np.ones_like(u)], axis=2)
-    return geometry.transform(pose, (rays * depth[..., None].astype(np.float64)).reshape(-1, 3)).reshape(H, W, 3)
+    rays *= np.where(np.isfinite(depth), depth, 100.0)[..., None]  # beyond the floor where there is none
+    return geometry.transform(pose, rays.reshape(-1, 3)).reshape(H, W, 3)
 
 
 def steepness(terrain: Terrain, points: np.ndarray) -> np.ndarray:
@@ -68,8 +69,8 @@ def gradient_energy(albedo: np.ndarray) -> tuple[float, float]:
 
 
 def bumps(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Returns heights [m] with slopes in all directions, up to 70 deg."""
-    return 0.45 * np.sin(5 * x + 0.4) * np.sin(5 * y - 0.3) + 0.1 * x
+    """Returns heights [m] of rounded hills and hollows with slopes in all directions, up to 70 deg."""
+    return 0.3 * np.tanh(2.5 * np.sin(3.5 * x + 0.4) * np.sin(3.5 * y - 0.3)) + 0.1 * x
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 90.0, 200.0, 315.0])
@@ -85,6 +86,7 @@ def test_a_wall_has_the_detail_of_level_ground_and_a_draped_texture_a_fraction_o
     draped = gradient_energy(render(replace(wall, walls=None), facing)[0][0])
     # stretched by 1 / cos 70 deg = 2.9, gradients along the slope have 1 / 8.5 of the energy; an azimuth between the
     # axes compresses by sqrt(2) across and blends two textures, whose filter removes some of the gradients
+    print("gradient energy", azimuth_deg, np.divide(found, expected), np.divide(draped, expected))
     assert draped[0] < 0.3 * expected[0]
     assert 0.6 < found[0] / expected[0] < 1.7 and 0.6 < found[1] / expected[1] < 2.2
 
@@ -98,7 +100,7 @@ def test_pixels_of_moderate_slopes_keep_every_byte() -> None:
     points = points_of(depth, pose)
     col, row = (points[..., 0] - terrain.west_m) / 0.05, (points[..., 1] - terrain.south_m) / 0.05
     edge = np.abs(col - np.rint(col)).clip(max=np.abs(row - np.rint(row))) < 1e-3  # either cell
-    c, r = (np.clip(np.floor(np.nan_to_num(k, posinf=0)), 0, 59).astype(int) for k in (col, row))
+    c, r = (np.clip(np.floor(k), 0, 59).astype(int) for k in (col, row))
     level = (terrain.walls.number[r, c] < 0) & ~edge & np.isfinite(depth)
     changed = (albedo != draped).any(axis=2)
     assert level.sum() > 5000 and changed.sum() > 5000
@@ -143,6 +145,7 @@ def test_two_views_of_a_wall_show_the_same_albedo() -> None:
     steep, level = same & (slope > 52), same & (slope < 30)
     assert steep.sum() > 3000 and level.sum() > 3000
     scatter = one.mean(axis=2)[steep].std()
+    print("views", scatter, difference[level].std() / scatter, difference[steep].std() / scatter)
     assert difference[level].std() < 0.06 * scatter
     assert difference[steep].std() < 0.06 * scatter
 
@@ -164,6 +167,7 @@ def test_the_true_albedo_is_that_of_an_image_from_above() -> None:
             assert here.sum() > 3000
             blurred = cv2.GaussianBlur(albedo, (0, 0), 0.5)[here].mean(axis=1)
             correlation[name, steep] = np.corrcoef(blurred, truth[here].mean(axis=1))[0, 1]
+    print(correlation)
     assert correlation["walls", True] > 0.85 and correlation["walls", False] > 0.85
     assert correlation["draped", True] < 0.5
 
