@@ -32,8 +32,8 @@ _GREEN, _BLUE, _LANE, _SHIFT = np.uint64(21), np.uint64(42), np.uint64(0xFF), np
 _HALF = np.uint64(WHOLE // 2 * (1 | 1 << 21 | 1 << 42))
 _FAR_M = np.float32(1e6)  # depths beyond this are infinite
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
-(_COL, _ROW, _RAY_X, _RAY_Y, _EAST, _NORTH, _X, _Y, _ACROSS_X, _ACROSS_Y, _ACROSS_Z, _DOWN_X, _DOWN_Y, _DOWN_Z, _BELOW,
- _MAJOR_ALONG, _MAJOR_BELOW, _SAMPLES, _LEVEL, _N_WORK) = range(20)  # fmt: skip
+(_COL, _ROW, _EAST, _NORTH, _X, _Y, _ACROSS_X, _ACROSS_Y, _ACROSS_Z, _DOWN_X, _DOWN_Y, _DOWN_Z, _BELOW,
+ _MAJOR_ALONG, _MAJOR_BELOW, _SAMPLES, _LEVEL, _N_WORK) = range(18)  # fmt: skip
 
 
 class WallSurface(NamedTuple):
@@ -117,7 +117,9 @@ def paint_walls(
     in_row_bands(lambda first, end: _paint(surface, albedo, depth, view, cell, focal, first, end), len(depth))
 
 
-def paint_walls_from_above(surface: WallSurface, albedo: Image, x_m: Array, y_m: Array, step_m: float) -> None:
+def paint_walls_from_above(
+    surface: WallSurface, albedo: Image, x_m: NDArray[np.floating], y_m: NDArray[np.floating], step_m: float
+) -> None:
     """Blends the texture of the walls into a parallel view of the floor from above, in place.
 
     Args:
@@ -199,7 +201,7 @@ def _find(surface, depth, y, view, origin, focal, work, steep):
     )
     col_z, row_z = (view[0, 1] * y + view[0, 2]) * per_cell, (view[1, 1] * y + view[1, 2]) * per_cell
     centre = half * np.float32(depth.size - 1)
-    col, row, column, line, there = work[_EAST], work[_NORTH], work[_RAY_X], work[_RAY_Y], work[_BELOW]
+    col, row, column, line = work[_EAST], work[_NORTH], work[_X], work[_Y]  # filled anew by `_place`
     for u in range(depth.size):
         z = depth[u] if depth[u] < _FAR_M else zero
         x = (np.float32(u) - centre) / focal

@@ -161,9 +161,9 @@ class TerrainConfig(Section):
     )
     wall_texture: Literal["triplanar", "draped"] = Field(
         default="triplanar",
-        description="texture of slopes of more than 37 deg. triplanar: projected horizontally, with the detail of level "
-        "ground; from 37 to 53 deg blended with the texture from above, which stays wherever orthophoto_file has data; "
-        "draped: the texture from above, stretched on slopes; not with a mesh",
+        description="texture of slopes of more than 37 deg. triplanar: projected horizontally, with the detail of "
+        "level ground, and blended with the texture from above up to 53 deg; wherever orthophoto_file has data, its "
+        "colours stay. draped: the texture from above, stretched on slopes. Not with a mesh",
     )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
         default="lambert",

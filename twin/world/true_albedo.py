@@ -19,7 +19,8 @@ def true_albedo(terrain: terrains.Terrain, grid: MapGrid) -> NDArray[np.float32]
     """Returns the mean albedo (rows, cols, 3) of the floor in the cells of a grid, 255 = white.
 
     The mean is taken over at least one sample per texel along x and y; samples are interpolated bilinearly, as in a
-    rendered image, and walls have their own texture (`triplanar`). It is NaN in cells whose middle sample lies outside the terrain.
+    rendered image, and walls have their own texture (`imaging.triplanar`). It is NaN in cells whose middle sample lies
+    outside the terrain.
     """
     rows, cols, _ = terrain.texture.shape
     texel_m = np.array(terrain.size_m) / [cols, rows]
