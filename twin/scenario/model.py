@@ -997,10 +997,21 @@ class Scenario(Section):
     def fingerprint(self) -> str:
         """Returns a hash of all values, 16 hexadecimal digits; of files, only the paths are hashed.
 
-        `record` is left out, and `imu` if there is none: the section is younger than results that have the hash.
+        `record` is left out, and so are `imu` if there is none and `terrain.wall_texture` where it is draped or has no
+        effect: these keys are younger than results that have the hash.
         """
-        left_out = {"record"} if self.imu else {"record", "imu"}
+        left_out: dict[str, bool | set[str]] = {"record": True}
+        if not self.imu:
+            left_out["imu"] = True
+        if not self.has_walls:
+            left_out["terrain"] = {"wall_texture"}
         return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()[:16]
+
+    @property
+    def has_walls(self) -> bool:
+        """Returns whether steep parts of the floor have a texture of their own in images (`terrain.wall_texture`)."""
+        t = self.terrain
+        return t.wall_texture == "triplanar" and t.kind != "mesh" and self.imaging.fidelity == "rendered"
 
 
 def _tan_deg(angle_deg: float) -> float:
