@@ -12,6 +12,7 @@ from terrains.ground_cover import DEFAULT_COVERS
 from terrains.noise import fractal_field
 from terrains.terrain import Terrain, texture_shape
 from terrains.textures import TextureSource, generate_texture
+from terrains.wall_texture import walls_of
 from twin.errors import TwinError
 
 Heights = NDArray[np.float32]
@@ -81,7 +82,8 @@ def generate_from(
     height_m = np.asarray(heights(west_m + grid_m * columns, south_m + grid_m * rows, shape_rng), np.float32)
     texel_m = (nx - 1) * grid_m / shape[1]
     texels = generate_texture(cover, height_m, shape, texel_m, texture_rng)
-    return Terrain(height_m, grid_m, west_m, south_m, texels, texel_m)
+    walls = walls_of(height_m, grid_m, texture, cover, texel_m, texture_rng)
+    return Terrain(height_m, grid_m, west_m, south_m, texels, texel_m, walls=walls)
 
 
 def default_cover(kind: str) -> str:

@@ -15,6 +15,7 @@ from terrains.ground_cover import DEFAULT_COVERS
 from terrains.terrain import Terrain, texture_shape
 from terrains.textures import TextureSource, generate_texture, texture_from_photo
 from terrains.vertical import Direction, VerticalAxis, upward_sign
+from terrains.wall_texture import walls_of
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
 
@@ -68,20 +69,21 @@ def load(
     extent_m = ((nx - 1) * spacing_m, (ny - 1) * spacing_m)
     shape = texture_shape((ny, nx), spacing_m, texture.texel_m(extent_m) if texture.in_images else spacing_m)
     texel_m = extent_m[0] / shape[1]
+    cover, rng = texture.cover or DEFAULT_COVERS["file"], np.random.default_rng(seed)
     if texture.photo_file is not None:
         texels = texture_from_photo(texture, shape, extent_m)
     else:
-        texels = generate_texture(
-            texture.cover or DEFAULT_COVERS["file"], height_m, shape, texel_m, np.random.default_rng(seed)
-        )
-    share = None
+        texels = generate_texture(cover, height_m, shape, texel_m, rng)
+    covered = None
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
         from terrains.orthophoto import lay_orthophoto
 
-        share = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
+        covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
+    walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
+    share = None if covered is None else float(covered.mean())
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
-    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share)
+    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share, walls)
 
 
 def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightGrid:

@@ -27,7 +27,7 @@ _MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than th
 
 def lay_orthophoto(
     texture: NDArray[np.uint8], file: Path, extent_m: tuple[float, float], georeference: Georeference | None
-) -> float:
+) -> NDArray[np.bool_]:
     """Replaces the texture of a floor by an orthophoto wherever the orthophoto has valid pixels.
 
     The orthophoto is transformed to the CRS of the DEM. An orthophoto without a CRS is taken to be in that of the DEM.
@@ -39,7 +39,7 @@ def lay_orthophoto(
         extent_m: extent of the floor along x and y; its centre is the origin of the scene.
         georeference: position of the scene in the CRS of the DEM; None if the DEM has no coordinates.
     Returns:
-        Share of the texels that the orthophoto covers.
+        Whether the orthophoto covers each texel (rows, cols).
     Raises:
         TwinError: the DEM has no coordinates, or no CRS although the orthophoto has one; or the orthophoto is missing,
             invalid or too large, has no coordinates, or does not overlap the DEM.
@@ -61,7 +61,7 @@ def lay_orthophoto(
     except (RasterioError, OSError, CRSError) as error:
         raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be read: {error}", _FORMATS) from error
     texture[covered] = colour[covered]
-    return float(covered.mean())
+    return covered
 
 
 def _texel_grid(shape: tuple[int, ...], extent_m: tuple[float, float], georeference: Georeference) -> Affine:

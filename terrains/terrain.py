@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrains.walls import Walls
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
 
@@ -29,6 +30,7 @@ class Terrain:
         n_filled: number of nodes without a height in the source, filled with the nearest height.
         georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
         orthophoto_share: share of the texels that an orthophoto covers; None without an orthophoto.
+        walls: texture of the steep parts; None: the texture is projected from above everywhere.
     """
 
     height_m: NDArray[np.float32]
@@ -40,6 +42,7 @@ class Terrain:
     n_filled: int = 0
     georeference: Georeference | None = None
     orthophoto_share: float | None = None
+    walls: Walls | None = None
 
     @property
     def size_m(self) -> tuple[float, float]:

@@ -17,6 +17,7 @@ from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 from twin.errors import TwinError
 
 COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`
+_STEEP = 1.5  # slope, rise over run, above which the material no longer depends on it
 _QUILT_SEED = 1  #: a texture from a photo is the same for every seed of a survey
 
 
@@ -34,6 +35,7 @@ class TextureSource:
         coarsen: whether texels of a large floor are larger than px_m, so that there are not more than COARSEN_TEXELS.
         in_images: whether the texture is seen in images; if not, the texels of a floor from a file have the side of
             the cells of its height grid.
+        walls: whether steep parts of the floor have a texture of their own, see `walls.Walls`.
     """
 
     px_m: float
@@ -43,6 +45,7 @@ class TextureSource:
     cover: str | None = None
     coarsen: bool = False
     in_images: bool = True
+    walls: bool = False
 
     def texel_m(self, size_m: tuple[float, float]) -> float:
         """Returns the side of the texels of a floor of the given extent along x and y [m]."""
@@ -71,10 +74,36 @@ def generate_texture(
     """
     if cover not in COVERS:
         raise TwinError("terrain.cover", f"unknown cover {cover!r}", ", ".join(COVERS))
-    octaves = int(np.clip(np.log2(max(shape)), 3, 11))
-    tone = pink_noise(shape, octaves, 20.0, rng)
+    tone = _tone(shape, rng)
     material = _material_level(height_m, shape, texel_m, rng)
     return paint(material, tone, texel_m, cover, rng)
+
+
+def generate_wall_texture(
+    cover: str, shape: tuple[int, int], extent_m: tuple[float, float], spacing_m: float, rng: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Generates the texture of the steep parts of a floor, with the materials that `generate_texture` gives them.
+
+    Args:
+        cover: a key of `ground_cover.COVERS`.
+        shape: (rows, cols) of the texture; rows run down from the highest to the lowest point of the floor.
+        extent_m: extent along columns and rows.
+        spacing_m: distance between the nodes of the height grid of the floor.
+        rng: random generator.
+    Returns:
+        (rows, cols, 3) uint8 RGB.
+    """
+    tone = _tone(shape, rng)
+    cols, rows = (max(2, round(extent / spacing_m) + 1) for extent in extent_m)
+    patches = fractal_field((rows, cols), 1.0 / spacing_m, 0.6, rng)
+    height = np.linspace(1.0, 0.0, rows, dtype=np.float32)[:, None]
+    material = _resized_level(_level(height, np.float32(_STEEP), patches), shape)
+    return paint(material, tone, extent_m[0] / shape[1], cover, rng)
+
+
+def _tone(shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Returns the pink noise (rows, cols) of a generated texture, mean 128."""
+    return pink_noise(shape, int(np.clip(np.log2(max(shape)), 3, 11)), 20.0, rng)
 
 
 def _material_level(
@@ -91,7 +120,24 @@ def _material_level(
     patch_px = 1.0 / (spacing_px * texel_m)  # patches of 1 m and smaller
     patches = fractal_field(height_m.shape, patch_px, 0.6, rng)
     height = (north_up - north_up.min()) / relief_m
-    level = 40 + 110 * height + 60 * np.clip(np.hypot(down, right), 0, 1.5) + 26 * patches
+    return _resized_level(_level(height, np.hypot(down, right), patches), shape)
+
+
+def _level(
+    height: NDArray[np.float32], slope: NDArray[np.float32] | np.float32, patches: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Returns the level of the material at nodes, not limited to 0 to 255.
+
+    Args:
+        height: height above the lowest point of the floor, as a fraction of the relief.
+        slope: rise over run.
+        patches: random field with unit standard deviation.
+    """
+    return 40 + 110 * height + 60 * np.clip(slope, 0, _STEEP) + 26 * patches
+
+
+def _resized_level(level: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Returns a level at nodes (ny, nx) as the level 0 to 255 of the texels (rows, cols)."""
     small = np.clip(cv2.GaussianBlur(level, (0, 0), 1.0), 0, 255).astype(np.uint8)
     return np.asarray(cv2.resize(small, shape[::-1], interpolation=cv2.INTER_LINEAR), np.uint8)
 

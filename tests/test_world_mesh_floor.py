@@ -318,6 +318,7 @@ def bad_meshes(folder: Path) -> None:
         ("small.ply", [], "plan.area_m: 1 x 0.5 m is larger than the terrain"),
         ("small.ply", ["terrain.mesh_scale=0.001"], "terrain.mesh_file: 'small.ply' covers 0.0004 m x 0.0004 m"),
         ("small.ply", ["terrain.cover=sand"], "terrain.cover: has no effect on a mesh"),
+        ("small.ply", ["terrain.wall_texture=draped"], "terrain.wall_texture: has no effect on a mesh"),
         ("small.ply", ["terrain.kind=reef"], "terrain.mesh_file: has no effect on terrain.kind = 'reef'"),
     ],
 )

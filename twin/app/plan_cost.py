@@ -61,6 +61,7 @@ _IMAGES_MB_PER_MPX = 300.0
 _SURROGATE_MB = 380.0
 #: Memory of the floor [MB] of a rendered survey, per node of the height grid and per texel (see `terrains.terrain`).
 _NODE_MB, _TEXEL_MB = 400e-6, 9e-6
+_WALL_CELL_MB, _WALL_TEXEL_MB = 36e-6, 14e-6  #: memory of walls [MB], per steep cell and per texel of their texture
 _FACE_MB, _MESH_TEXEL_MB = 80e-6, 4e-6  #: memory of a mesh floor [MB], per triangle and per texel of its textures
 
 
@@ -80,12 +81,18 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
         )  # fmt: skip
     window = n_keyframes * min(1.0, (mission.scenario.estimate.window_tracks + 1) / len(mission.tracks))
     texels = mission.terrain.texture.size / 3
-    floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels + _mesh_mb(mission)
+    floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels + _mesh_mb(mission) + _walls_mb(mission)
     return ComputingCost(
         _RENDERED_S.total(n_frames, n_keyframes, megapixels),
         _RENDERED_MB.total(n_frames, round(window), megapixels) + _IMAGES_MB_PER_MPX * megapixels + floor_mb,
         _RENDERED_DISK_MB.total(n_frames, n_keyframes, megapixels),
     )
+
+
+def _walls_mb(mission: Mission) -> float:
+    """Returns the memory of the texture of the walls of the floor and of its weights [MB]."""
+    walls = mission.terrain.walls
+    return 0.0 if walls is None else _WALL_CELL_MB * len(walls.weights) + _WALL_TEXEL_MB * walls.texture.size / 3
 
 
 def _mesh_mb(mission: Mission) -> float:

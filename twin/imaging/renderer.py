@@ -1,4 +1,7 @@
-"""Rendering of the floor with MuJoCo: albedo and depth in one pass, without the effects of water and lamps."""
+"""Rendering of the floor with MuJoCo: albedo and depth in one pass, without the effects of water and lamps.
+
+The texture of steep parts of the floor is sampled after the rendering, at the points that the depth gives.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from scenes.floor import FLOOR_GROUP
 from scenes.gl import MjModel, MjvScene, mujoco, offscreen_context
 from twin.errors import TwinError
 from twin.imaging.mesh_raster import NEAR_M
+from twin.imaging.triplanar import paint_walls, wall_surface
 
 Array = NDArray[np.float64]
 
@@ -43,6 +47,7 @@ class Renderer:
         self._near, self._far = np.float32(znear_m), np.float32(zfar_m)
         self._rect = mujoco.MjrRect(0, 0, width_px, height_px)
         self._tan = np.tan(np.deg2rad(vfov_deg) / 2) * np.array([width_px / height_px, 1.0])
+        self._focal_px, self._walls = height_px / 2 / self._tan[1], wall_surface(scene.terrain)
         self._rgb = np.empty((height_px, width_px, 3), np.uint8)
         self._z = np.empty((height_px, width_px), np.float32)
         self._gl: Any
@@ -67,7 +72,10 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._z, self._rect, self._context)
-        return self._rgb[::-1].copy(), linear_depth(self._z[::-1], self._near, self._far)  # OpenGL's rows run upwards
+        albedo, depth = self._rgb[::-1].copy(), linear_depth(self._z[::-1], self._near, self._far)  # rows run upwards
+        if self._walls is not None:
+            paint_walls(self._walls, albedo, depth, world_from_camera, self._focal_px)
+        return albedo, depth
 
     def close(self) -> None:
         """Releases the OpenGL context; closing twice has no effect."""

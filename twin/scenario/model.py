@@ -162,6 +162,12 @@ class TerrainConfig(Section):
         "without a photo the ground sample distance of the images at plan.altitude_m, 0.0006 to 0.005; larger on a "
         "sea floor that would have more than 40 million texture pixels",
     )
+    wall_texture: Literal["triplanar", "draped"] = Field(
+        default="triplanar",
+        description="texture of slopes of more than 37 deg. triplanar: projected horizontally, with the detail of "
+        "level ground, and blended with the texture from above up to 53 deg; wherever orthophoto_file has data, its "
+        "colours stay. draped: the texture from above, stretched on slopes. Not with a mesh",
+    )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
         default="lambert",
         description="reflection of the light of lamps. lambert: ideally diffuse; oren_nayar: rough, brighter towards "
@@ -1004,11 +1010,21 @@ class Scenario(Section):
     def fingerprint(self) -> str:
         """Returns a hash of all values, 16 hexadecimal digits; of files, only the paths are hashed.
 
-        `record` is left out, and `imu` if there is none, so that results from before that section was introduced keep
-        their hash.
+        `record` is left out, and so are `imu` if there is none and `terrain.wall_texture` where it is draped or has no
+        effect, so that results from before these keys were introduced keep their hash.
         """
-        left_out = {"record"} if self.imu else {"record", "imu"}
+        left_out: dict[str, bool | set[str]] = {"record": True}
+        if not self.imu:
+            left_out["imu"] = True
+        if not self.has_walls:
+            left_out["terrain"] = {"wall_texture"}
         return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()[:16]
+
+    @property
+    def has_walls(self) -> bool:
+        """Returns whether steep parts of the floor have a texture of their own in images (`terrain.wall_texture`)."""
+        t = self.terrain
+        return t.wall_texture == "triplanar" and t.kind != "mesh" and self.imaging.fidelity == "rendered"
 
 
 def _tan_deg(angle_deg: float) -> float:

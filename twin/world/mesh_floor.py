@@ -130,8 +130,8 @@ def _mesh_file(t: TerrainConfig) -> Path:
     """Returns the file of the mesh; raises TwinError if it is not given, or keys without effect on a mesh are set."""
     if t.mesh_file is None:
         raise TwinError(FIELD, "missing", 'a mesh, as terrain.kind is "mesh"')
-    for key in ("height_file", "texture_file", "orthophoto_file", "z", "cover", "plugin"):
-        if getattr(t, key) is not None:
+    for key in ("height_file", "texture_file", "orthophoto_file", "z", "cover", "plugin", "wall_texture"):
+        if getattr(t, key) != TerrainConfig.model_fields[key].default:
             raise TwinError(f"terrain.{key}", 'has no effect on a mesh (terrain.kind = "mesh")', "without it")
     return Path(t.mesh_file)
 

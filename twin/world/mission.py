@@ -280,7 +280,9 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
                 'terrain.kind = "file"',
             )
         texel_m = scenario.texel_m if scenario.imaging.fidelity == "rendered" else t.grid_m  # unused without images
-        texture = terrains.TextureSource(texel_m, cover=t.cover, coarsen=t.texture_px_m is None)
+        texture = terrains.TextureSource(
+            texel_m, cover=t.cover, coarsen=t.texture_px_m is None, walls=scenario.has_walls
+        )
         if (plugin := t.plugin) is not None:
             return terrains.generate_from(
                 lambda x_m, y_m, _: terrain_heights(plugin, x_m, y_m, scenario.seed),
@@ -295,7 +297,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
     photographed = t.texture_file is not None or t.orthophoto_file is not None
     texture = terrains.TextureSource(
         scenario.texel_m, t.texture_file, tiling, t.orthophoto_file, t.cover, coarsen=t.texture_px_m is None,
-        in_images=photographed or scenario.imaging.fidelity == "rendered",
+        in_images=photographed or scenario.imaging.fidelity == "rendered", walls=scenario.has_walls,
     )  # fmt: skip
     return terrains.load(t.height_file, texture, t.height_spacing_m, t.height_range_m, scenario.seed, t.z)
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 import terrains
 from twin.core.records import Image, MapGrid
+from twin.imaging.triplanar import paint_walls_from_above, wall_surface
 
 Layer = NDArray[np.float32]
 
@@ -18,7 +19,8 @@ def true_albedo(terrain: terrains.Terrain, grid: MapGrid) -> NDArray[np.float32]
     """Returns the mean albedo (rows, cols, 3) of the floor in the cells of a grid, 255 = white.
 
     The mean is taken over at least one sample per texel along x and y; samples are interpolated bilinearly, as in a
-    rendered image. It is NaN in cells whose middle sample lies outside the terrain.
+    rendered image, and walls have their own texture (`imaging.triplanar`). It is NaN in cells whose middle sample lies
+    outside the terrain.
     """
     rows, cols, _ = terrain.texture.shape
     texel_m = np.array(terrain.size_m) / [cols, rows]
@@ -29,29 +31,25 @@ def true_albedo(terrain: terrains.Terrain, grid: MapGrid) -> NDArray[np.float32]
     col = ((x - terrain.west_m) / texel_m[0] - 0.5).astype(np.float32)
     row = ((terrain.north_m - y) / texel_m[1] - 0.5).astype(np.float32)
     out = np.empty((grid.rows, grid.cols, 3), np.float32)
-    side = max(1, _BLOCK // n)
+    side, walls = max(1, _BLOCK // n), wall_surface(terrain)
     for top in range(0, grid.rows, side):
         for left in range(0, grid.cols, side):
             part = out[top : top + side, left : left + side]
-            across, down = np.meshgrid(col[left * n : (left + side) * n], row[top * n : (top + side) * n])
-            part[:] = _mean_of_samples(terrain.texture, across, down, n)
+            of_cols, of_rows = slice(left * n, (left + side) * n), slice(top * n, (top + side) * n)
+            fine = _samples(terrain.texture, *np.meshgrid(col[of_cols], row[of_rows]))
+            if walls is not None:
+                paint_walls_from_above(walls, fine, x[of_cols], y[of_rows], step_m)
+            part[:] = fine.reshape(len(part), n, -1, n, 3).mean(axis=(1, 3), dtype=np.float32)
     inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
     inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)
     out[~(inside_y[:, None] & inside_x)] = np.nan
     return out
 
 
-def _mean_of_samples(texture: Image, across: Layer, down: Layer, n: int) -> Layer:
-    """Returns the means (rows, cols, 3) of n x n samples each of a texture, interpolated bilinearly.
-
-    Args:
-        texture: (h, w, 3) albedo.
-        across, down: (rows n, cols n) columns and rows of the samples in the texture.
-        n: samples along the side of a cell.
-    """
-    fine = cv2.remap(*_cropped(texture, across, down), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    rows, cols = across.shape[0] // n, across.shape[1] // n
-    return fine.reshape(rows, n, cols, n, 3).mean(axis=(1, 3), dtype=np.float32)
+def _samples(texture: Image, across: Layer, down: Layer) -> Image:
+    """Returns the samples (rows, cols, 3) of a texture (h, w, 3) at columns and rows (rows, cols), bilinearly."""
+    resampled = cv2.remap(*_cropped(texture, across, down), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(resampled, np.uint8)
 
 
 def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | None, map_grid: MapGrid) -> Layer:
