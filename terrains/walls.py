@@ -2,9 +2,9 @@
 
 The texture of the floor is projected from above, which stretches it on a slope of angle a by 1 / cos a. On steep parts
 it is therefore blended with textures projected horizontally: along x onto the coordinates (y, z), along y onto (x, z).
-With the unit normal n, the weight of each projection is proportional to max(|n_i| - TOLERANCE, 0)^SHARPNESS (Geiss
-2007, GPU Gems 3, sec. 1.5). Only the floor's texture is used up to a slope of 37 deg, half of it at 45 deg, and nearly
-nothing from 53 deg on.
+The share of these two together increases smoothly from 0 at a slope of 50 deg, where the texture is stretched by 1.56,
+to 1 at 65 deg. With the unit normal n, it is divided between them in proportion to |n_x|^SHARPNESS and
+|n_y|^SHARPNESS (after Geiss 2007, GPU Gems 3, sec. 1.5).
 """
 
 from __future__ import annotations
@@ -15,10 +15,9 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-TOLERANCE = 0.5  #: component of a normal below which a projection is not used
-SHARPNESS = 4  #: exponent of the weights
-LEAST_WEIGHT = 1 / 64  #: weights of the horizontal projections below this value become 0
-LEVEL_COSINE = 0.82  #: cosine of a slope at which all weights of horizontal projections are 0
+SHARPNESS = 4  #: exponent of the weights of the two horizontal projections
+#: Cosines of the slope from which on walls have a texture of their own (50 deg), and no other (65 deg).
+STEEP_COSINE, WALL_COSINE = 0.643, 0.423
 CREASE_COSINE = 0.7  #: cosine of the largest angle between the normals of adjacent cells of one smooth surface
 
 
@@ -72,7 +71,7 @@ def wall_weights(
     if draped is not None:
         allowed = ~_cells_with(draped, allowed.shape)
     normals = _cell_normals(height_m, spacing_m)
-    if normals[..., 2].min() > LEVEL_COSINE:
+    if normals[..., 2].min() > STEEP_COSINE:
         return None
     number, weights = _weights(normals, allowed)
     return WallWeights(number, weights) if len(weights) else None
@@ -150,12 +149,10 @@ def _corner_weights(
             if own[0] * other[0] + own[1] * other[1] + own[2] * other[2] >= CREASE_COSINE:
                 x, y, z = x + other[0], y + other[1], z + other[2]
     length = np.sqrt(x * x + y * y + z * z)
-    a = max(abs(x) / length - TOLERANCE, 0.0) ** SHARPNESS
-    b = max(abs(y) / length - TOLERANCE, 0.0) ** SHARPNESS
-    total = a + b + max(z / length - TOLERANCE, 0.0) ** SHARPNESS
-    share = (a + b) / total
-    if share <= LEAST_WEIGHT:
+    t = min(max((STEEP_COSINE - z / length) / (STEEP_COSINE - WALL_COSINE), 0.0), 1.0)
+    share = t * t * (3.0 - 2.0 * t)
+    if share == 0.0:
         weight[0], weight[1] = 0.0, 0.0
         return
-    rest = (share - LEAST_WEIGHT) / (1.0 - LEAST_WEIGHT) / (a + b)
-    weight[0], weight[1] = np.copysign(a * rest, x), np.copysign(b * rest, y)
+    a, b = abs(x) ** SHARPNESS, abs(y) ** SHARPNESS
+    weight[0], weight[1] = np.copysign(share * a / (a + b), x), np.copysign(share * b / (a + b), y)

@@ -164,8 +164,8 @@ class TerrainConfig(Section):
     )
     wall_texture: Literal["triplanar", "draped"] = Field(
         default="triplanar",
-        description="texture of slopes of more than 37 deg. triplanar: projected horizontally, with the detail of "
-        "level ground, and blended with the texture from above up to 53 deg; wherever orthophoto_file has data, its "
+        description="texture of slopes of more than 50 deg. triplanar: projected horizontally, with the detail of "
+        "level ground, and blended with the texture from above up to 65 deg; wherever orthophoto_file has data, its "
         "colours stay. draped: the texture from above, stretched on slopes. Not with a mesh",
     )
     material: Literal["lambert", "oren_nayar", "hapke"] = Field(
