@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.core.records import SurveyResult, Trajectory
+from twin.core.records import StereoRig, SurveyResult, Trajectory
 from twin.reproduce import tank_survey
 from twin.reproduce.tank import TABLES, TITLES, flagged_share, sizes_table
+from twin.reproduce.tank_hidden import hidden_cells
 from twin.reproduce.tank_path import N_LOOP, STEP_M, lawnmower_path, two_loops_path
 from twin.reproduce.tank_scene import OBJECTS, tank_floor
 from twin.reproduce.tank_sizes import measure, true_size
@@ -47,6 +48,54 @@ def test_holes_are_passed_over_and_an_object_without_heights_has_no_size():
     strip = np.where(np.abs(np.abs(X - item.centre_m[0]) - 0.075) < 0.003, np.nan, height)  # no heights at two sides
     assert abs(measure(item, strip, GRID).errors_m.x_m) < 0.003
     assert np.isnan(measure(item, np.full_like(height, np.nan), GRID).measured).all()
+
+
+def test_mismatches_on_top_of_an_object_do_not_change_its_extents():
+    pipe = next(item for item in OBJECTS if item.shape == "pipe")
+    height = pipe.height_at(X, Y)
+    top = (height > 0.9 * pipe.size_m[2]) & (np.abs(X - pipe.centre_m[0]) < 0.2)
+    true, wrong = measure(pipe, height, GRID).measured, measure(pipe, np.where(top, -0.36, height), GRID).measured
+    np.testing.assert_allclose(wrong[:2], true[:2], atol=1e-3)
+
+
+def test_a_pipe_without_heights_on_its_crest_has_extents_but_no_height():
+    pipe = next(item for item in OBJECTS if item.shape == "pipe")
+    crest = np.abs(Y - pipe.centre_m[1]) < 0.01
+    row = measure(pipe, np.where(crest, np.nan, pipe.height_at(X, Y)), GRID)
+    assert np.isnan(row.measured.height_m) and np.abs(row.errors_m[:2]).max() < 0.003
+
+
+def box_map(side_m, hidden_m):
+    """Returns heights of a box at the origin with a strip of unknown floor beyond its side towards +x."""
+    beyond = X - side_m / 2
+    height = np.where(np.maximum(np.abs(X), np.abs(Y)) < side_m / 2, 0.09, 0.0)
+    return np.where((beyond > 0) & (beyond < hidden_m) & (np.abs(Y) < side_m / 2), np.nan, height)
+
+
+def one_view(x_m):
+    """Returns the pose (1, 4, 4) of a camera 1.5 m above the floor that looks down."""
+    return geometry.pose(geometry.rotations_of_down_camera(np.zeros(1))[0], np.array([x_m, 0.0, 1.5]))[None]
+
+
+def test_floor_behind_a_box_is_hidden_as_far_as_similar_triangles_say():
+    """Cameras at x = -0.4 m, 1.5 m above the floor, see it from 0.0894 m on beyond an edge at 0.06 m, 0.09 m high."""
+    rig = StereoRig(640, 480, 686.0, 0.3)
+    edge = 0.06 + 0.09 * (0.06 + 0.4) / (1.5 - 0.09)
+    hidden = hidden_cells(box_map(0.12, 0.1), GRID, one_view(-0.4), rig)
+    here = (np.abs(Y) < 0.03) & (X < 0.15)
+    found = X[here & hidden].max()
+    assert abs(found - edge) < GRID.cell_m and not hidden[X < 0.06].any()
+    np.testing.assert_array_equal(hidden[here], (np.isnan(box_map(0.12, 0.1)) & (X <= found + 1e-9))[here])
+    seen = np.concatenate([one_view(-0.4), one_view(0.4)])
+    assert not hidden_cells(box_map(0.12, 0.1), GRID, seen, rig).any()
+
+
+def test_an_object_beside_hidden_floor_ends_at_its_last_cell_and_not_in_the_middle_of_the_gap():
+    box = OBJECTS[0]._replace(centre_m=(0.0, 0.0), size_m=(0.12, 0.12, 0.09))
+    height = box_map(0.12, 0.033)
+    assert measure(box, height, GRID).errors_m.x_m > 0.012
+    hidden = np.isnan(height)
+    np.testing.assert_allclose(measure(box, height, GRID, hidden).errors_m, 0, atol=0.0031)
 
 
 def test_a_dome_is_narrower_at_half_of_its_height():

@@ -13,6 +13,7 @@ from twin.judge.map_error import height_error
 from twin.judge.trajectory import path_errors
 from twin.reproduce import tank_sheet
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
+from twin.reproduce.tank_hidden import hidden_cells
 from twin.reproduce.tank_scene import OBJECTS
 from twin.reproduce.tank_sizes import SizeRow, measure
 from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, height_errors, survey_tank
@@ -36,7 +37,9 @@ def run(name: str, folder: Path, quick: bool = False) -> Exhibit:
     """
     with tempfile.TemporaryDirectory(prefix="twin-") as images:
         survey = survey_tank(name, Path(images), QUICK if quick else ())
-    sizes = [measure(item, survey.elevation.height_m, survey.mission.grid) for item in OBJECTS]
+    grid, height_m, final = survey.mission.grid, survey.elevation.height_m, survey.result.final.world_from_camera
+    hidden = hidden_cells(height_m, grid, final[survey.result.keyframe_rows], survey.mission.rig)
+    sizes = [measure(item, height_m, grid, hidden) for item in OBJECTS]
     tables = {
         "rows": _paper_table(survey),
         "closure": _closure_table(survey),
@@ -68,7 +71,8 @@ def _text(survey: TankSurvey) -> str:
         f"{survey.mission.scenario.estimate.max_links} earlier ones with an overlap of 70 %, and all pairs are aligned "
         "together. The estimators start at the planned pose of the first pair; paths and heights are compared after "
         "the motion that maps the first estimated pose to the first true one. The light is uneven: the white PVC pipe "
-        "is saturated, a third of the floor lies in the shade."
+        "is saturated, a third of the floor lies in the shade. Cells that an object hides in every pair count as "
+        "floor; the height of the pipe is not measured where its crest is saturated."
         f"{ended}"
     )
 

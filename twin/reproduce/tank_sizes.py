@@ -17,6 +17,7 @@ MARGIN_M = 0.04  # margin of the window around an object; the outer half of the 
 PLATEAU = 0.75  # cells above this fraction of the 90th percentile of height belong to the top of a box or a disc
 CENTRAL = 0.5  # extents are medians over lines through the central part of a box or a pipe, a fraction of its size
 CENTRAL_ROUND = 0.15  # the same for a disc or a dome
+CREST = 0.3  # the crest of a pipe is this fraction of its width; it lies 1.4 mm below the highest line at most
 
 
 class Size(NamedTuple):
@@ -53,9 +54,16 @@ class Window(NamedTuple):
     height_m: Array
 
 
-def measure(item: TankObject, height_m: Array, grid: MapGrid) -> SizeRow:
-    """Returns the size of an object measured in a map of heights (rows, cols) [m], and its true size."""
-    window = window_around(item, height_m, grid)
+def measure(item: TankObject, height_m: Array, grid: MapGrid, hidden: NDArray[np.bool_] | None = None) -> SizeRow:
+    """Returns the size of an object measured in a map of heights (rows, cols) [m], and its true size.
+
+    Args:
+        item: the object.
+        height_m: heights of the map [m]; NaN where unknown.
+        grid: grid of the map.
+        hidden: mask (rows, cols) of the cells that the objects hide (`hidden_cells`), which count as floor; None: none.
+    """
+    window = window_around(item, height_m, grid, hidden)
     top = _TOPS[item.shape](window)
     share = CENTRAL_ROUND if item.shape in ("disc", "dome") else CENTRAL
     across = np.abs(window.y_m) <= share * item.size_m[1] / 2, np.abs(window.x_m) <= share * item.size_m[0] / 2
@@ -63,7 +71,7 @@ def measure(item: TankObject, height_m: Array, grid: MapGrid) -> SizeRow:
     x_m, y_m = (
         _median(_extent(at, line, top / 2) for line in rows) for at, rows in zip(window[:2], lines, strict=True)
     )
-    return SizeRow(item.name, Size(x_m, y_m, top), true_size(item))
+    return SizeRow(item.name, Size(x_m, y_m, top if _shows_crest(item, window) else np.nan), true_size(item))
 
 
 def true_size(item: TankObject) -> Size:
@@ -72,15 +80,34 @@ def true_size(item: TankObject) -> Size:
     return Size(share * item.size_m[0], share * item.size_m[1], item.size_m[2])
 
 
-def window_around(item: TankObject, height_m: Array, grid: MapGrid) -> Window:
-    """Returns the part of a map around an object; heights are above their median in the outer half of the margin."""
+def _shows_crest(item: TankObject, window: Window) -> bool:
+    """Returns whether the map has heights at the crest of an object, without which its height cannot be measured.
+
+    This is the case if most of the lines across the central part of a pipe have a height near its axis. Objects with
+    another shape have a top that is large enough to be measured beside a hole.
+    """
+    if item.shape != "pipe":
+        return True
+    along, crest = (
+        np.abs(axis) <= share * side / 2
+        for axis, share, side in zip(window[:2], (CENTRAL, CREST), item.size_m, strict=False)
+    )
+    return bool(np.isfinite(window.height_m[np.ix_(crest, along)]).any(axis=0).mean() > 0.5)
+
+
+def window_around(item: TankObject, height_m: Array, grid: MapGrid, hidden: NDArray[np.bool_] | None = None) -> Window:
+    """Returns the part of a map around an object; heights are above their median in the outer half of the margin.
+
+    Arguments as for `measure`.
+    """
     x, y = (axis - c for axis, c in zip(grid.centres(), item.centre_m, strict=True))
     inside = [np.abs(axis) <= side / 2 + MARGIN_M for axis, side in zip((x, y), item.size_m, strict=False)]
     part = height_m[np.ix_(inside[1], inside[0])].astype(np.float64)
     x, y = x[inside[0]], y[inside[1]]
     beside = (np.abs(x) > item.size_m[0] / 2 + MARGIN_M / 2) | (np.abs(y) > item.size_m[1] / 2 + MARGIN_M / 2)[:, None]
     floor = part[beside & np.isfinite(part)]
-    return Window(x, y, part - (np.median(floor) if floor.size else np.nan))
+    above = part - (np.median(floor) if floor.size else np.nan)
+    return Window(x, y, above if hidden is None else np.where(hidden[np.ix_(inside[1], inside[0])], 0.0, above))
 
 
 def _plateau(window: Window) -> float:
@@ -118,10 +145,11 @@ _TOPS: dict[str, Callable[[Window], float]] = {"box": _plateau, "disc": _plateau
 
 
 def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
-    """Returns the length of the part of a profile around the place 0 that lies above a level [m].
+    """Returns the distance between the outermost places on both sides of 0 where a profile rises to a level [m].
 
-    The ends are interpolated linearly between the last point above the level and the first one at or below it. NaN if
-    the profile is not above the level near 0, or does not fall to it on both sides.
+    The places are interpolated linearly between the last point at or below the level and the first one above it, from
+    outside to inside, so that holes and mismatches on top of an object do not count. NaN if the profile does not rise
+    above the level on both sides, or is above it at an end.
 
     Args:
         at_m: (n,) places along the profile, relative to the centre of the object [m].
@@ -129,29 +157,28 @@ def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
         level_m: the level [m].
     """
     known = np.isfinite(height_m)
-    order = np.argsort(at_m[known])
-    at, above = at_m[known][order], (height_m[known] - level_m)[order]
-    if not np.isfinite(level_m) or not len(at) or above[np.argmin(np.abs(at))] <= 0:
+    if not np.isfinite(level_m) or not known.any():
         return np.nan
-    ends = [_crossing(at[side], above[side]) for side in (at >= 0, at <= 0)]
+    at, above = at_m[known], height_m[known] - level_m
+    ends = [_rise(at[side], above[side]) for side in (at >= 0, at <= 0)]
     return ends[0] - ends[1]
 
 
-def _crossing(at: Array, above: Array) -> float:
-    """Returns the place nearest to 0 at which a profile falls to the level [m]; NaN if it does not.
+def _rise(at: Array, above: Array) -> float:
+    """Returns the place farthest from 0 at which a profile rises above the level, towards 0 [m]; NaN if it does not.
 
     Args:
         at: (n,) places along the profile on one side of 0 [m].
         above: (n,) height above the level at these places [m].
     """
-    order = np.argsort(np.abs(at))
+    order = np.argsort(-np.abs(at))
     at, above = at[order], above[order]
-    below = np.flatnonzero(above <= 0)
-    if not len(below) or below[0] == 0:
+    higher = np.flatnonzero(above > 0)
+    if not len(higher) or higher[0] == 0:
         return np.nan
-    k = int(below[0])
-    share = above[k - 1] / (above[k - 1] - above[k])
-    return float(at[k - 1] + share * (at[k] - at[k - 1]))
+    k = int(higher[0])
+    share = above[k] / (above[k] - above[k - 1])
+    return float(at[k] + share * (at[k - 1] - at[k]))
 
 
 def _median(values: Iterable[float]) -> float:

@@ -29,7 +29,7 @@ from twin.world.rendered_world import RenderedWorld
 Array = NDArray[np.float64]
 
 AREA_M = (2.0, 1.5)  # mapped area around the centre of the tank
-QUICK = ("rig.image_width_px=320", "rig.image_height_px=240", "estimate.patch_px=15")
+QUICK = ("rig.image_width_px=320", "rig.image_height_px=240", "estimate.patch_px=15", "map.cell_m=0.003")
 N_PAIRS = 130
 SEED = 1
 
