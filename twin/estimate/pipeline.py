@@ -336,6 +336,7 @@ class Navigator:
             links_failed=int(failed.sum()),
             link_residual=None if failed.all() else float(np.median(residuals[~failed])),
             link_chi2=history.alignments[-1].link_chi2 if history.alignments else None,
+            alignment_converged=history.alignments[-1].converged if history.alignments else True,
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
             disparity_offset=disparity_offset.combine(
