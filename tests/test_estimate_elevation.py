@@ -139,6 +139,16 @@ def test_the_lower_of_two_heights_is_chosen_unless_the_higher_is_much_more_certa
     assert np.all(sigma < 0.12)
 
 
+@pytest.mark.parametrize(("rows", "cols"), [(1, 80), (80, 2), (2, 40), (1, 1)])
+def test_a_grid_of_one_or_two_rows_or_columns_is_mapped(rows, cols):
+    grid = MapGrid(-0.01 * cols, 0.01 * rows, 0.02, rows, cols)
+    mapper = elevation.ElevationMapper(grid)
+    mapper.fuse(surface.rasterise(depth_map(np.full((120, 160), 1.7)), down_camera(0, 0, 2.0), EXACT, RIG, grid))
+    height = mapper.result().height_m
+    assert np.isfinite(height).sum() >= elevation.MIN_CELLS or rows * cols < elevation.MIN_CELLS
+    np.testing.assert_allclose(height[np.isfinite(height)], 0.3, atol=1e-6)
+
+
 def test_two_heights_that_agree_form_one_hypothesis():
     _, sigma = fused_heights((0.0, 1e-4), (0.001, 1e-4))
     np.testing.assert_allclose(sigma, 0.01 / np.sqrt(2), rtol=1e-3)
