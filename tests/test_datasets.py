@@ -4,6 +4,7 @@ import os
 import shutil
 import struct
 import zlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +17,8 @@ from recorded_datasets import RIG
 
 from twin.app.outputs import new_folder, writing
 from twin.core import geometry
-from twin.core.records import Frame
-from twin.datasets import image_files
+from twin.core.records import Frame, Trajectory
+from twin.datasets import image_files, replay
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
@@ -607,6 +608,15 @@ def test_a_folder_that_may_not_be_listed_or_entered_is_one_line_with_its_name(me
     monkeypatch.setattr(Path, method, refused)
     with pytest.raises(TwinError, match="set.*: cannot be read: Permission denied"):
         open_dataset(folder, ReplayOptions(truth=Path("/truth")))
+
+
+def test_a_truth_without_poses_is_one_line(euroc, monkeypatch):
+    """Readers of other packages may return one; those of this package refuse such files."""
+    dataset, name = read_dataset(euroc)
+    empty = replace(dataset, truth=Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
+    monkeypatch.setattr(replay, "read_dataset", lambda *_: (empty, name))
+    with pytest.raises(TwinError, match="set: the truth has no poses"):
+        open_dataset(euroc, ReplayOptions())
 
 
 def test_an_error_of_another_file_does_not_blame_the_output(tmp_path):
