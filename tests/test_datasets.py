@@ -610,6 +610,11 @@ def test_a_folder_that_may_not_be_listed_or_entered_is_one_line_with_its_name(me
         open_dataset(folder, ReplayOptions(truth=Path("/truth")))
 
 
+def test_a_bayer_pattern_for_images_with_colours_is_refused(euroc):
+    with pytest.raises(TwinError, match=r"--bayer: .*\.png has colours already"):
+        open_dataset(euroc, ReplayOptions(bayer="RGGB"))
+
+
 def test_a_truth_without_poses_is_one_line(euroc, monkeypatch):
     """Readers of other packages may return one; those of this package refuse such files."""
     dataset, name = read_dataset(euroc)
