@@ -70,7 +70,7 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
     """Returns +1 if the values increase upwards, -1 if they are depths, which increase downwards.
 
     Args:
-        values: (rows, cols) values of the file, NaN in holes, but not everywhere.
+        values: (rows, cols) values of the file, NaN or infinite in holes, but not everywhere.
         axis: vertical axis as the file describes it.
         asked: `terrain.z` of the scenario, which takes precedence; None: determined from the file.
         file: the file, for the error message.
@@ -79,7 +79,8 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
     """
     if asked is not None:
         return 1.0 if asked == "up" else -1.0
-    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    heights = values[np.isfinite(values)]
+    low, high = float(heights.min()), float(heights.max())
     shown = f"{file.name!r} with values from {low:g} to {high:g}"
     if axis.direction == "down" and high <= 0:
         raise _ambiguous(f"{shown} states that they increase downwards, but none is positive")

@@ -4,6 +4,7 @@ import os
 import shutil
 import struct
 import zlib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +17,8 @@ from recorded_datasets import RIG
 
 from twin.app.outputs import new_folder, writing
 from twin.core import geometry
-from twin.core.records import Frame
-from twin.datasets import image_files
+from twin.core.records import Frame, Trajectory
+from twin.datasets import image_files, replay
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
@@ -25,6 +26,7 @@ from twin.datasets.frames import RecordedFrames, increasing
 from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.readers import read_dataset
 from twin.datasets.rectification import rectification
+from twin.datasets.replay import ReplayOptions, open_dataset
 from twin.datasets.truth_files import read_truth
 from twin.errors import TwinError
 from twin.exchange.euroc import EurocWriter
@@ -566,6 +568,11 @@ def test_a_path_that_is_too_long_is_one_line():
         read_dataset(Path("x" * 5000))
 
 
+def test_a_path_that_is_too_long_is_one_line_also_with_a_topic_of_true_poses():
+    with pytest.raises(TwinError, match="File name too long"):
+        open_dataset(Path("x" * 5000), ReplayOptions(truth=Path("/truth")))
+
+
 def test_a_path_that_is_not_utf8_is_refused_before_opencv_crashes_on_it(tmp_path):
     folder = os.fsencode(tmp_path) + b"/\xff\xfe"
     os.mkdir(folder)
@@ -585,6 +592,36 @@ def test_an_unreadable_folder_is_one_line_with_its_name(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "iterdir", lambda path: refused(path) if path.name == "left" else iter([path]))
     with pytest.raises(TwinError, match="set/left: cannot be read: Permission denied"):
         read_dataset(folder)
+
+
+@pytest.mark.parametrize("method", ["iterdir", "is_dir"])
+def test_a_folder_that_may_not_be_listed_or_entered_is_one_line_with_its_name(method, tmp_path, monkeypatch):
+    """A folder without permission r fails when it is listed, one without permission x when a file in it is tested."""
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(recorded.poses(1)))
+    original = getattr(Path, method)
+
+    def refused(path):
+        if path == folder and method == "iterdir" or path.parent == folder:
+            raise PermissionError(13, "Permission denied", str(path))
+        return original(path)
+
+    monkeypatch.setattr(Path, method, refused)
+    with pytest.raises(TwinError, match="set.*: cannot be read: Permission denied"):
+        open_dataset(folder, ReplayOptions(truth=Path("/truth")))
+
+
+def test_a_bayer_pattern_for_images_with_colours_is_refused(euroc):
+    with pytest.raises(TwinError, match=r"--bayer: .*\.png has colours already"):
+        open_dataset(euroc, ReplayOptions(bayer="RGGB"))
+
+
+def test_a_truth_without_poses_is_one_line(euroc, monkeypatch):
+    """Readers of other packages may return one; those of this package refuse such files."""
+    dataset, name = read_dataset(euroc)
+    empty = replace(dataset, truth=Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
+    monkeypatch.setattr(replay, "read_dataset", lambda *_: (empty, name))
+    with pytest.raises(TwinError, match="set: the truth has no poses"):
+        open_dataset(euroc, ReplayOptions())
 
 
 def test_an_error_of_another_file_does_not_blame_the_output(tmp_path):

@@ -352,9 +352,11 @@ def frame_of(image):
     return recorded.Frame(0, 0.0, image, image)
 
 
-def test_the_preview_is_one_sheet(euroc, tmp_path):
+@pytest.mark.parametrize("name", ["sheet.png", "sheet"])
+def test_the_preview_is_one_sheet_with_the_given_name(name, euroc, tmp_path):
     opened = open_dataset(euroc, ReplayOptions())
-    file = preview.draw(opened, tmp_path / "sheet.png")
+    file = preview.draw(opened, tmp_path / name)
+    assert list(tmp_path.iterdir()) == [file]
     assert cv2.imread(str(file)).shape[1] > 1000
     table = {row[0]: row[1:] for row in preview.rows(opened)}
     assert int(table["matched points"][0]) > 100 and table["reader"][0] == "euroc"

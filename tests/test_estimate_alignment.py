@@ -8,6 +8,7 @@ import pytest
 from twin.core import geometry
 from twin.core.links import Link
 from twin.core.records import Readings, SensorNoise, StereoRig
+from twin.estimate import alignment
 from twin.estimate.alignment import align
 from twin.estimate.vision.keyframes import Keyframe
 
@@ -98,6 +99,15 @@ def test_exact_links_give_the_true_poses():
     aligned = align(keyframes(start), links, ANCHOR, RIG, NOISE)
     np.testing.assert_allclose(aligned.poses, poses, atol=1e-6)
     assert not aligned.dropped
+
+
+def test_an_alignment_that_ends_before_it_converges_says_so(monkeypatch):
+    poses, links = small_network(np.random.default_rng(1))
+    start = [poses[0]] + [p @ geometry.exp(np.full(6, 0.5)) for p in poses[1:]]
+    assert align(keyframes(start), links, ANCHOR, RIG, NOISE).converged is True
+    for name, limit in {"_ROUND_ITERATIONS": 1, "_MAX_ITERATIONS": 1, "_MAX_ROUNDS": 0}.items():
+        monkeypatch.setattr(alignment, name, limit)
+    assert align(keyframes(start), links, ANCHOR, RIG, NOISE).converged is False
 
 
 def test_an_outlier_link_is_removed_and_reported():

@@ -10,6 +10,7 @@ from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, MeanIllumination, build_map
 from twin.estimate.mapping.surface import HeightPatch
+from twin.estimate.vision import disparity
 
 RIG = small_rig(160, 120)
 GRID = MapGrid(-2.0, 1.6, 0.02, 160, 200)
@@ -139,6 +140,16 @@ def test_the_lower_of_two_heights_is_chosen_unless_the_higher_is_much_more_certa
     assert np.all(sigma < 0.12)
 
 
+@pytest.mark.parametrize(("rows", "cols"), [(1, 80), (80, 2), (2, 40), (1, 1)])
+def test_a_grid_of_one_or_two_rows_or_columns_is_mapped(rows, cols):
+    grid = MapGrid(-0.01 * cols, 0.01 * rows, 0.02, rows, cols)
+    mapper = elevation.ElevationMapper(grid)
+    mapper.fuse(surface.rasterise(depth_map(np.full((120, 160), 1.7)), down_camera(0, 0, 2.0), EXACT, RIG, grid))
+    height = mapper.result().height_m
+    assert np.isfinite(height).sum() >= elevation.MIN_CELLS or rows * cols < elevation.MIN_CELLS
+    np.testing.assert_allclose(height[np.isfinite(height)], 0.3, atol=1e-6)
+
+
 def test_two_heights_that_agree_form_one_hypothesis():
     _, sigma = fused_heights((0.0, 1e-4), (0.001, 1e-4))
     np.testing.assert_allclose(sigma, 0.01 / np.sqrt(2), rtol=1e-3)
@@ -243,6 +254,20 @@ def test_a_pair_without_texture_is_skipped(bumpy):
     blank = KeyframeImages(*(np.full((120, 160, 3), 90, np.uint8),) * 2)
     elevation_map = build_map([pairs[0], blank, pairs[2]], KeyframePath(poses[:3], np.zeros((3, 6, 6))), RIG, GRID)
     assert np.isfinite(elevation_map.height_m).sum() > 2000
+
+
+@pytest.mark.parametrize(("sigma_px", "known"), [(0.31, True), (0.33, False)])
+def test_a_depth_with_a_relative_sigma_above_20_percent_does_not_enter_the_map(sigma_px, known, monkeypatch):
+    """Around the image centre, a disparity of 1.6 px (13 m) over a floor at 2 m; 20 % of it is 0.32 px."""
+    px = np.full((120, 160), RIG.focal_px * RIG.baseline_m / 2.0, np.float32)
+    sigma = np.full_like(px, 0.1)
+    px[45:75, 65:95], sigma[45:75, 65:95] = 1.6, sigma_px
+    monkeypatch.setattr(disparity, "dense_disparity", lambda *_: disparity.Disparity(px, sigma))
+    blank = KeyframeImages(*(np.full((120, 160, 3), 90, np.uint8),) * 2)
+    path = KeyframePath(down_camera(0, 0, 2.0)[None], np.zeros((1, 6, 6)))
+    elevation_map = build_map([blank], path, RIG, GRID)
+    assert bool((elevation_map.height_m < -10).any()) == known
+    assert (np.abs(elevation_map.height_m) < 0.01).sum() > 2000
 
 
 def test_without_keyframes_the_map_is_empty():

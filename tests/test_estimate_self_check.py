@@ -136,6 +136,7 @@ def quality(**changes):
         ({"nodes_bridged": 1}, {}, "nodes_bridged"),
         ({"links_failed": 30}, {}, "links_failed"),
         ({"link_chi2": 5.0}, {}, "link_chi2"),
+        ({"alignment_converged": False}, {}, "alignment"),
         ({"link_residual": 3.0}, {}, "link_residual"),
         ({"frame_sigma_m": 0.05}, {}, "frame_sigma"),
         ({}, {"n_points": 20}, "points"),

@@ -85,6 +85,17 @@ def test_transformed_covariances_are_exactly_symmetric():
     np.testing.assert_array_equal(product, product.T)
 
 
+@given(poses(), motions())
+def test_the_covariance_of_a_transported_pose_is_that_of_its_error(a_from_b, error):
+    """An error e of the pose of a is the error f of that of b with exp(e) a_from_b = a_from_b exp(f)."""
+    moved = g.inverse(a_from_b) @ g.exp(1e-4 * error) @ a_from_b
+    transported = g.log(moved) / 1e-4
+    expected = np.outer(transported, transported)
+    found = g.transport_covariance(np.outer(error, error), a_from_b)
+    # log and exp of an error of 1e-4 rad are exact to 1e-4 of it squared
+    np.testing.assert_allclose(found, expected, atol=1e-6 * max(1.0, np.abs(expected).max()))
+
+
 def test_log_is_defined_at_an_angle_of_pi():
     half = g.pose(np.diag([1.0, -1.0, -1.0]), np.array([1.0, 2.0, 3.0]))
     assert np.linalg.norm(g.log(half)[:3]) == np.pi

@@ -75,14 +75,14 @@ def test_an_episode_that_follows_the_plan_covers_the_area_and_ends_with_the_plan
 def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
     env = make(action="thrust", reward="track")
     _, info = env.reset(seed=3)
-    assert info["truth"]["cross_track_m"] == pytest.approx(0, abs=1e-9)
+    assert info["truth"]["distance_to_plan_m"] == pytest.approx(0, abs=1e-9)
     down = nominal_controller(1.2, 10).state.allocation.commands(np.array([0, 0, 0, 0, 0, -100.0]))[0]
     terminated = truncated = False
     while not (terminated or truncated):
         _, reward, terminated, truncated, info = env.step(down.astype(np.float32))
-        assert reward == pytest.approx(-info["truth"]["cross_track_m"])
+        assert reward == pytest.approx(-info["truth"]["distance_to_plan_m"])
     assert terminated and info["ended"] == "the camera touched the floor"
-    assert info["truth"]["world_from_camera"][2, 3] < 0.1 < info["truth"]["cross_track_m"]
+    assert info["truth"]["world_from_camera"][2, 3] < 0.1 < info["truth"]["distance_to_plan_m"]
     env.close()
 
 

@@ -81,6 +81,12 @@ def test_a_truth_of_another_clock_unit_or_body_is_named(pair):
     assert "turned by 180 degrees" in found[0] and "another body" in found[0]
 
 
+def test_a_truth_without_poses_is_a_warning(pair):
+    estimate, truth = pair
+    empty = Trajectory(truth.times_s[:0], truth.world_from_camera[:0])
+    assert truth_warnings(estimate, empty) == ["The truth has no poses."]
+
+
 def test_too_few_true_poses_give_no_error(pair):
     estimate, truth = pair
     few = Trajectory(truth.times_s[:2], truth.world_from_camera[:2])

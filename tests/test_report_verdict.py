@@ -159,6 +159,12 @@ def test_metrics_of_older_runs_keep_their_warning():
     assert wording.headline(older, {}) and wording.key_figures(older)
 
 
+def test_the_sentence_on_the_observed_floor_names_the_map_where_no_area_was_asked_for():
+    asked, observed = good(), changed(map={"completeness_area": None})
+    assert " of the asked area; " in wording.headline(asked, {}) and " It covers " in wording.headline(asked, {})
+    assert " The map covers " in wording.headline(observed, {}) and " It covers " not in wording.headline(observed, {})
+
+
 def test_a_replay_lists_only_figures_that_it_has():
     metrics = changed(map=dict.fromkeys(good()["map"])) | {"replay": {"dataset": "euroc"}}
     labels = [figure.label for figure in wording.key_figures(metrics)]

@@ -58,6 +58,26 @@ def test_failed_surveys_are_not_counted(tmp_path):
     assert failed in wording.headline(study, half)
 
 
+def test_a_single_failed_survey_is_singular(tmp_path):
+    study = study_of(tmp_path)
+    rest = analyse(study, tmp_path, lambda survey: fail(survey) if survey.sample == 3 else fly(survey))
+    headline = wording.headline(study, rest)
+    assert " 1 more survey failed because of the computer or the program and is not counted; if it had not " in headline
+    assert headline.endswith("Use --resume to fly it again.")
+
+
+def test_warnings_of_repeated_surveys_count_once(tmp_path):
+    """Eight of the twelve surveys are in water that is listed twice, so four repeat others."""
+    grid = (
+        ("{ log_uniform = [1.0, 40.0] }", "{ grid = [2.0, 2.0, 3.0] }"),
+        ('method = "lhs"\nsamples = 12', 'method = "grid"\nseeds = 1'),
+    )
+    study = study_of(tmp_path, STUDY, *grid, ("{ uniform = [1.6, 2.4] }", "{ grid = [1.8, 2.2] }"))
+    warned = analyse(study, tmp_path, lambda survey: fly(survey) | {"warning": "too turbid"})
+    assert (len(warned.rows), warned.duplicate.sum(), warned.warning_counts) == (12, 4, {"too turbid": 8})
+    assert wording.headline(study, warned).endswith("Warning in 8 of 8 surveys: too turbid.")
+
+
 def test_warnings_are_counted_and_the_first_one_is_shown(tmp_path):
     study = study_of(tmp_path)
     warned = analyse(study, tmp_path, lambda s: fly(s) | {"warning": "surrogate: too turbid" if s.sample < 3 else ""})

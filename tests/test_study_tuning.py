@@ -6,7 +6,7 @@ import study_surveys
 from study_surveys import SerialEngine, study_of
 
 from twin.errors import ScenarioError, TwinError
-from twin.scenario.file import load_scenario
+from twin.scenario.file import find_scene, load_scenario
 from twin.study import tuning_report
 from twin.study.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
 from twin.study.flight import row_of
@@ -206,6 +206,17 @@ def test_a_folder_of_another_search_is_rejected(searched, tmp_path):
     other = study_of(tmp_path, TUNING, ("[1.5, 3.0]", "[1.5, 2.5]"))
     with pytest.raises(TwinError, match="--resume: .* contains another search"):
         search(other, folder, resume=True)
+
+
+def test_a_search_is_not_continued_with_an_edited_scenario_file(tmp_path):
+    file = tmp_path / "scene.toml"
+    file.write_text(f'extends = "{find_scene("reef")}"\n')
+    study = study_of(tmp_path, TUNING, ('"reef"', '"scene.toml"'))
+    stopped = search(study, tmp_path / "out", SerialEngine(stop_before=15))
+    assert stopped.interrupted
+    file.write_text(f'extends = "{find_scene("reef")}"\n[control]\nhold_s = 0.37\n')
+    with pytest.raises(TwinError, match=r"--resume: .* another scenario: .*scene\.toml was changed"):
+        search(study, tmp_path / "out", resume=True)
 
 
 @pytest.mark.parametrize(

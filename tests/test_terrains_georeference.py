@@ -117,6 +117,15 @@ def test_negative_values_are_elevations(tmp_path, written):
     assert load(write(tmp_path / "depth.tif", HEIGHTS, **written)).height_at(0.5, 0.5) == 0.0
 
 
+@pytest.mark.parametrize(("sign", "hole"), [(-1, -np.inf), (1, np.inf), (-1, np.nan)])
+def test_a_hole_does_not_determine_the_direction_of_the_values(tmp_path, sign, hole):
+    """Positive values of a band "depth" increase downwards, negative ones upwards, whatever value a hole has."""
+    values = sign * HEIGHTS
+    values[2, 2] = hole
+    terrain = load(write(tmp_path / "dem.tif", values, description="depth"))
+    assert terrain.n_filled == 1 and terrain.height_at(0.5, 0.5) == 0.0
+
+
 @pytest.mark.parametrize(
     ("written", "metre"),
     [

@@ -13,6 +13,9 @@ import trimesh
 import terrains
 from terrains.ground_cover import COVERS
 from terrains.objects import mesh_file, placement
+from terrains.objects.detail import levels_of
+from terrains.objects.floor_mesh import tiles_of
+from terrains.objects.mesh import Mesh
 from terrains.objects.mesh_header import face_count
 from terrains.objects.model import model_of
 from terrains.objects.shapes import SHAPES, build_shape
@@ -287,3 +290,24 @@ def test_a_grey_texture_of_16_bits_keeps_its_brightness(tmp_path):
     )
     assert (mesh_file.read_textured_mesh(tmp_path / "square.obj", FIELD).images[0] == 117).all()
     assert (read(tmp_path / "square.obj").colours == 117).all()
+
+
+@pytest.mark.parametrize("near_m", [0.0, 1e-30])
+def test_degenerate_triangles_do_not_change_the_levels_of_detail(near_m):
+    """1005 triangles with an edge length of 0 or almost 0 beside two with edges of 2 cm and 2.8 cm."""
+    corners = np.array([[0, 0, 0], [0.02, 0, 0], [0.02, 0.02, 0], [0, 0.02, 0], [0, 0, near_m]], np.float32)
+    real = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    colours = np.arange(15, dtype=np.uint8).reshape(5, 3)
+    mesh = Mesh(corners, np.concatenate([real, np.tile(np.int32([0, 0, 4]), (1005, 1))]), colours)
+    sides_m = [
+        [level.cell_m for level in tiles_of(untextured(one)).tiles[0].placed.model.levels]
+        for one in (mesh, mesh._replace(faces=real))
+    ]
+    assert sides_m[0] == sides_m[1] and sides_m[0][:2] == pytest.approx([0, 0.02])
+    assert [(level.cell_m, len(level.mesh.faces)) for level in levels_of(mesh)] == [(0, 1007), (pytest.approx(0.02), 2)]
+
+
+def untextured(mesh: Mesh) -> mesh_file.TexturedMesh:
+    """Returns a mesh whose triangles have no texture."""
+    uv, texture = np.zeros((len(mesh.vertices_m), 2), np.float32), np.full(len(mesh.faces), -1, np.int32)
+    return mesh_file.TexturedMesh(mesh, uv, texture, ())

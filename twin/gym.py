@@ -60,7 +60,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         "coverage": part of the asked area that both cameras saw for the first time, in a keyframe [m2].
         "track": minus the distance of the true left camera from its planned position at the end of the step [m].
 
-    Info: `time_s`; `truth`, with `world_from_camera` (4, 4), `cross_track_m` (distance from the planned position) and
+    Info: `time_s`; `truth`, with `world_from_camera` (4, 4), `distance_to_plan_m` (from the planned position) and
     `covered` (fraction of the asked area seen so far); `ended`, the reason for the termination, or "".
 
     Args:
@@ -158,7 +158,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._ended = self._ended or self._collision()
         seen_m2 = self._seen_m2()
         gained_m2, self._covered_m2 = seen_m2 - self._covered_m2, seen_m2
-        reward = gained_m2 if self._reward == "coverage" else -self._cross_track_m()
+        reward = gained_m2 if self._reward == "coverage" else -self._distance_to_plan_m()
         return self._observation(), reward, bool(self._ended), truncated, self._info()
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -209,12 +209,12 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         asked_m2 = float(self._asked.sum()) * self._world.mission.grid.cell_m**2
         truth = {
             "world_from_camera": self._world.true_pose,
-            "cross_track_m": self._cross_track_m(),
+            "distance_to_plan_m": self._distance_to_plan_m(),
             "covered": self._covered_m2 / asked_m2,
         }
         return {"time_s": self._frame.time_s, "truth": truth, "ended": self._ended}
 
-    def _cross_track_m(self) -> float:
+    def _distance_to_plan_m(self) -> float:
         """Returns the distance of the true left camera from its planned position [m]."""
         return float(np.linalg.norm(self._world.true_pose[:3, 3] - self._world.reference.position))
 

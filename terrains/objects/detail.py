@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.mesh import Mesh
+from terrains.objects.mesh import Mesh, median_edge_m
 from terrains.objects.parts import Parts, parts_of
 
 FEWEST_FACES = 64  #: a level with at most this many triangles is the last one
@@ -44,8 +44,7 @@ def levels_of(mesh: Mesh) -> tuple[Level, ...]:
     mesh and grows by a factor of sqrt(2) in each step; a step that removes no triangles makes no level. The last level
     has at most FEWEST_FACES triangles, or the next step would leave none.
     """
-    corners = mesh.vertices_m[mesh.faces]
-    cell_m = float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
+    cell_m = median_edge_m(mesh)
     levels = [level_of(mesh, 0.0)]
     while len(levels[-1].mesh.faces) > FEWEST_FACES:
         coarser = clustered(mesh, cell_m)

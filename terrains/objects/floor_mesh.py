@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrains.objects.detail import cell_colours, level_of
-from terrains.objects.mesh import Mesh, extent
+from terrains.objects.mesh import Mesh, extent, median_edge_m
 from terrains.objects.mesh_file import MAX_FACES, TexturedMesh
 from terrains.objects.model import ObjectModel, PlacedObject
 from terrains.objects.texture_pyramid import Textures, textures_of
@@ -224,12 +224,6 @@ def _colour_levels(whole: TexturedMesh) -> list[tuple[NDArray[np.uint8], float]]
         levels.append((cell_colours(mesh, cell_m), cell_m))
         cell_m *= np.sqrt(2)
     return levels
-
-
-def median_edge_m(mesh: Mesh) -> float:
-    """Returns the median length of the edges of the triangles [m]."""
-    corners = mesh.vertices_m[mesh.faces]
-    return float(np.median(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)))
 
 
 def _upward_m2(vertices: Array, faces: NDArray[np.int32]) -> Array:

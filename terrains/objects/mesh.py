@@ -80,3 +80,16 @@ def is_closed(mesh: Mesh) -> bool:
 def extent(mesh: Mesh) -> tuple[Array, Array]:
     """Returns the minimum and maximum corner (3,) of the bounding box [m]."""
     return mesh.vertices_m.min(axis=0).astype(np.float64), mesh.vertices_m.max(axis=0).astype(np.float64)
+
+
+def median_edge_m(mesh: Mesh) -> float:
+    """Returns the median length of the edges of the triangles [m].
+
+    Edges shorter than a millionth of the largest extent, as degenerate triangles have, do not count; if all edges are
+    shorter, the result is that millionth.
+    """
+    corners = mesh.vertices_m[mesh.faces]
+    lengths_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
+    shortest_m = 1e-6 * float(np.ptp(mesh.vertices_m, axis=0).max())
+    counted_m = lengths_m[lengths_m > shortest_m]
+    return float(np.median(counted_m)) if len(counted_m) else shortest_m

@@ -183,7 +183,7 @@ def _print_result(study: Study, result: StudyResult) -> None:
         samples = wording.sample_count(len(analysis.refused_samples))
         console.print_table(f"{samples} cannot be flown: surveys, reason", reasons)
     for warning, count in analysis.warning_counts.items():
-        print(f"Warning in {count} of {analysis.rows.num_rows} surveys: {warning}")
+        print(f"Warning in {count} of {int((~analysis.duplicate).sum())} surveys: {warning}")
     if result.throughput.surveys:
         print(wording.throughput(*result.throughput))
     if result.page.is_file():

@@ -284,6 +284,17 @@ def transform(a_from_b: Array, points_b: Array) -> Array:
 
 
 @njit(cache=True, nogil=True)
+def transport_covariance(cov: Array, a_from_b: Array) -> Array:
+    """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
+
+    Args:
+        cov: (6, 6) covariance of the pose of a, in the axes of a; the result is in the axes of b.
+        a_from_b: (4, 4) pose of b in a.
+    """
+    return transform_covariance(adjoint(inverse(a_from_b)), cov)
+
+
+@njit(cache=True, nogil=True)
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Returns the rotation world_from_body (3, 3) of angles [rad]: yaw about z, pitch about y', roll about x''."""
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)

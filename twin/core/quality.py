@@ -51,6 +51,7 @@ class EstimationQuality(NamedTuple):
             divided by its expected value; None without a measured link.
         link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected;
             None without an alignment.
+        alignment_converged: whether the last global alignment converged; True without an alignment.
         epipolar: estimated errors of the rectification; None without images, unless a surrogate models them.
         frame_sigma_m: standard deviation (3-D) of the position of a keyframe relative to the previous keyframe, by
             frame-to-frame motion alone; 90th percentile over the keyframes [m]; None if it is not known at any
@@ -65,6 +66,7 @@ class EstimationQuality(NamedTuple):
     links_failed: int = 0
     link_residual: float | None = None
     link_chi2: float | None = None
+    alignment_converged: bool = True
     epipolar: EpipolarError | None = None
     frame_sigma_m: float | None = None
     disparity_offset: DisparityOffset | None = None

@@ -305,6 +305,7 @@ class Alignment(NamedTuple):
         nodes, edges: number of nodes (including fixed ones) and of links (including rejected ones).
         dropped: number of links rejected as outliers.
         link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected; 0 without links.
+        converged: false if the iterations ended before the minimum was reached.
     """
 
     track: int
@@ -313,6 +314,7 @@ class Alignment(NamedTuple):
     edges: int
     dropped: int
     link_chi2: float = 1.0
+    converged: bool = True
 
 
 class StereoObservation(NamedTuple):

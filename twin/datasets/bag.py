@@ -42,8 +42,11 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Returns whether a path is a file with the suffix .mcap or .db3 (SQLite), or a folder with metadata.yaml."""
-    return (path.is_file() and path.suffix in _SUFFIXES) or (path.is_dir() and (path / "metadata.yaml").is_file())
+    """Returns whether a path is a file with the suffix .mcap or .db3 (SQLite), or a folder with metadata.yaml.
+
+    False for an invalid path.
+    """
+    return (path.suffix in _SUFFIXES and is_file(path)) or is_file(path / "metadata.yaml")
 
 
 class Bag:

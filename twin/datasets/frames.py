@@ -37,7 +37,8 @@ class RecordedFrames:
         skipped: number of frames or right images that could not be used, by reason, counted while the frames are read.
 
     Raises:
-        TwinError: no left image can be read, or the calibration does not fit the images or cannot be rectified.
+        TwinError: no left image can be read, the calibration does not fit the images or cannot be rectified, or a Bayer
+            pattern is given for images that have colours.
     """
 
     def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
 from twin.core.records import Image
+from twin.errors import TwinError
 
 Bayer = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
 BAYER: tuple[Bayer, ...] = ("RGGB", "GRBG", "GBRG", "BGGR")
@@ -128,6 +129,9 @@ def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer:
         images: all images of the data set.
         size_px: (width, height) of the images; images of another size are left out.
         bayer: pattern of raw images, which is copied to the result.
+
+    Raises:
+        TwinError: a Bayer pattern is given, but an image of the sample has colours already.
     """
     largest = 0
     for k in np.unique(np.linspace(0, len(images) - 1, _N_SAMPLES).astype(int)):
@@ -135,6 +139,8 @@ def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer:
             pixels = _pixels(images[k], size_px)
         except UnreadableImage:
             continue
+        if bayer is not None and pixels.ndim == 3:
+            raise TwinError("--bayer", f"{images[k].name} has colours already", "raw images of one band")
         if pixels.dtype == np.uint16:
             largest = max(largest, int(pixels.max()))
     return ImageFormat(max(8, largest.bit_length()), bayer)

@@ -23,7 +23,7 @@ def draw(opened: OpenedDataset, file: Path) -> Path:
 
     Args:
         opened: the data set.
-        file: file to write, with the suffix .png.
+        file: file to write; its name is not changed.
 
     Raises:
         OSError: the file cannot be written.
@@ -48,7 +48,7 @@ def draw(opened: OpenedDataset, file: Path) -> Path:
     rows_axes.axvline(0, color="k", linewidth=0.8)
     rows_axes.set(xlabel="row of the right point minus row of the left point [px]", ylabel="matched points")
     rows_axes.set_title("row differences: centred at 0 if the calibration fits")
-    figure.savefig(file, dpi=110)
+    figure.savefig(file, dpi=110, format="png")
     return file
 
 

@@ -94,19 +94,19 @@ def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset
         raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder or the bag of a data set")
     if not folder.exists():
         raise TwinError(str(folder), "does not exist", "the folder or the bag of a data set")
-    if folder.is_dir() and not any(folder.iterdir()):
-        raise TwinError(str(folder), "is empty", "the folder of a data set")
     readers = all_readers(topics)
-    for reader in readers:
-        if reader.recognises(folder):
-            try:
-                dataset = reader.read(folder)
-            except OSError as error:
-                problem = f"cannot be read: {error.strerror or error}"
-                raise TwinError(str(error.filename or folder), problem, "readable files and folders") from None
-            if not dataset.images:
-                raise TwinError(str(folder), "has no images of the left camera", reader.layout)
-            check_times(dataset)
-            return dataset, reader.name
-    layouts = "; ".join(f"{reader.name}: {reader.layout}" for reader in readers)
-    raise TwinError(str(folder), "has no layout that a reader knows", layouts)
+    try:
+        if folder.is_dir() and not any(folder.iterdir()):
+            raise TwinError(str(folder), "is empty", "the folder of a data set")
+        reader = next((reader for reader in readers if reader.recognises(folder)), None)
+        dataset = None if reader is None else reader.read(folder)
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror or error}"
+        raise TwinError(str(error.filename or folder), problem, "readable files and folders") from None
+    if reader is None or dataset is None:
+        layouts = "; ".join(f"{reader.name}: {reader.layout}" for reader in readers)
+        raise TwinError(str(folder), "has no layout that a reader knows", layouts)
+    if not dataset.images:
+        raise TwinError(str(folder), "has no images of the left camera", reader.layout)
+    check_times(dataset)
+    return dataset, reader.name

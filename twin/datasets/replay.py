@@ -358,8 +358,8 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
     """Returns the true poses of the rectified left camera, at times relative to the first frame; None without a truth.
 
     Raises:
-        TwinError: the truth is damaged, a true position is impossible, or there are several frames and none of them has
-            a true pose at its time (`associate`).
+        TwinError: the truth is damaged or has no poses, a true position is impossible, or there are several frames and
+            none of them has a true pose at its time (`associate`).
     """
     truth = dataset.truth if file is None else read_truth(file, dataset)
     if isinstance(truth, TwinError):
@@ -387,8 +387,10 @@ def _ordered(truth: Trajectory, source: str) -> Trajectory:
         source: file or folder of the truth, for the message.
 
     Raises:
-        TwinError: a coordinate of a position is larger than 1e8 m or not a number.
+        TwinError: there are no poses, or a coordinate of a position is larger than 1e8 m or not a number.
     """
+    if not len(truth):
+        raise TwinError(source, "the truth has no poses", "true poses at the times of the frames")
     largest_m = float(np.abs(truth.positions).max(initial=0.0))
     if not largest_m <= _FARTHEST_M:
         raise TwinError(source, f"a coordinate of a true position is {largest_m:g} m", f"up to {_FARTHEST_M:g} m")

@@ -40,12 +40,14 @@ class AlignmentResult(NamedTuple):
             nodes whose covariance was not requested.
         dropped: links that were removed as outliers.
         link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links.
+        converged: false if the iterations ended before the minimum was reached.
     """
 
     poses: Array
     covs: Array
     dropped: list[Link]
     link_chi2: float
+    converged: bool
 
 
 def align(
@@ -88,7 +90,8 @@ def align(
         del solution
         solution = window.optimise(state, _MAX_ITERATIONS)
     link_chi2 = _mean_chi2(window.links, solution.chi2[0])
-    return AlignmentResult(solution.state.poses, _marginals(solution, marginals_of, index_of), dropped, link_chi2)
+    covs = _marginals(solution, marginals_of, index_of)
+    return AlignmentResult(solution.state.poses, covs, dropped, link_chi2, solution.converged)
 
 
 def _mean_chi2(links: Links, chi2: Array) -> float:

@@ -344,7 +344,9 @@ class KeyframeNetwork:
             raise SurveyAborted(f"global alignment failed: {error}") from None
         ms = (time.perf_counter() - start_s) * 1e3
         n_nodes, n_dropped = len(everyone), len(aligned.dropped)
-        self.history.alignments.append(Alignment(track, ms, n_nodes, len(links), n_dropped, aligned.link_chi2))
+        self.history.alignments.append(
+            Alignment(track, ms, n_nodes, len(links), n_dropped, aligned.link_chi2, aligned.converged)
+        )
         self.history.dropped += aligned.dropped
         if aligned.dropped:
             dropped = {link[:2] for link in aligned.dropped}

@@ -40,7 +40,7 @@ from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_t
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator
-from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance, transport_covariance
+from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance
 from twin.estimate.network import KeyframeNetwork
 from twin.estimate.pose_log import PoseLog
 from twin.estimate.stereo_vision import StereoVision
@@ -336,6 +336,7 @@ class Navigator:
             links_failed=int(failed.sum()),
             link_residual=None if failed.all() else float(np.median(residuals[~failed])),
             link_chi2=history.alignments[-1].link_chi2 if history.alignments else None,
+            alignment_converged=history.alignments[-1].converged if history.alignments else True,
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
             disparity_offset=disparity_offset.combine(
@@ -455,7 +456,7 @@ class Navigator:
             return None
         last = self.network.nodes[-1]
         correction = geometry.inverse(last.world_from_camera @ self.since_node.motion) @ self.filter.world_from_camera
-        cov = transport_covariance(self.since_node.cov_at_node, link.i_from_j) + link.cov
+        cov = geometry.transport_covariance(self.since_node.cov_at_node, link.i_from_j) + link.cov
         self.filter.reset(last.world_from_camera @ link.i_from_j @ correction, cov)
         node.world_from_camera = self.filter.world_from_camera
         return link
@@ -503,7 +504,9 @@ class Navigator:
         """
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(before) @ self.filter.world_from_camera
-        self.filter.reset(last.world_from_camera @ last_from_now, transport_covariance(node_cov, last_from_now))
+        self.filter.reset(
+            last.world_from_camera @ last_from_now, geometry.transport_covariance(node_cov, last_from_now)
+        )
         self.since_node = self.since_node._replace(cov_at_node=node_cov)
 
 

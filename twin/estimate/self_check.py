@@ -106,8 +106,9 @@ def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
 def _consistency(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
     """Yields a finding for each quantity that shows inconsistent links or a large uncertainty.
 
-    These are the residuals of the matched points, the offset of all disparities, the chi-square of the links, and the
-    standard deviations of keyframe positions, both relative to the previous keyframe and in the world.
+    These are the residuals of the matched points, the offset of all disparities, the chi-square of the links, an
+    alignment that did not converge, and the standard deviations of keyframe positions, both relative to the previous
+    keyframe and in the world.
     """
     quality = result.quality
     if quality.link_residual is not None and quality.link_residual > MAX_LINK_RESIDUAL:
@@ -125,6 +126,9 @@ def _consistency(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
     if quality.link_chi2 is not None and quality.link_chi2 > MAX_LINK_CHI2:
         text = f"the motions between keyframes contradict each other (chi-square {quality.link_chi2:.1f}, 1 expected)"
         yield Finding("link_chi2", quality.link_chi2, MAX_LINK_CHI2, text)
+    if not quality.alignment_converged:
+        text = "the last global alignment ended before it converged, so its poses do not fit the motions best"
+        yield Finding("alignment", 1, 0, text)
     if quality.frame_sigma_m is not None and len(result.keyframe_depth_m):
         share = quality.frame_sigma_m / float(np.median(result.keyframe_depth_m))
         if share > MAX_SIGMA_DEPTHS:

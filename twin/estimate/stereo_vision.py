@@ -149,7 +149,7 @@ class StereoVision:
         self._image = matching.normalise(self._gray)
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        _check_size(frame, self._size_px)
+        check_image_sizes(frame, self._size_px)
         with self.stopwatch("f2f"):
             self._set_image(self._square(frame.left))
             return self.f2f.step(self._image, self._interval_s(frame.time_s))
@@ -316,7 +316,7 @@ def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.floa
     return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)
 
 
-def _check_size(frame: Frame, size_px: tuple[int, int]) -> None:
+def check_image_sizes(frame: Frame, size_px: tuple[int, int]) -> None:
     """Checks the sizes of the images of a frame.
 
     Args:

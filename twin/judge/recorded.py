@@ -212,6 +212,8 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
     """
     if len(estimate) < _MIN_ASSOCIATED:
         return []
+    if not len(truth):
+        return ["The truth has no poses."]
     a, b = _associated_poses(estimate, truth)
     if len(a) < _MIN_ASSOCIATED:
         return [

@@ -12,7 +12,7 @@ from twin.core.records import Estimate, Frame, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
-from twin.estimate.stereo_vision import StereoVision
+from twin.estimate.stereo_vision import StereoVision, check_image_sizes
 from twin.estimate.vision.keyframes import Keyframe
 from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import ESTIMATORS
@@ -68,11 +68,12 @@ class PluginNavigator(Navigator):
 
         Raises:
             PluginFailed: the plug-in raised an exception or returned an unusable value.
-            ValueError: the frame is not later than the last one, or an image of a keyframe is not of the size that the
-                calibration states.
+            ValueError: the frame is not later than the last one, or an image is not of the size that the calibration
+                states; the plug-in does not get the frame.
             OSError: images could not be written.
         """
         interval_s = self._interval_s(frame.time_s)
+        check_image_sizes(frame, (self.rig.width_px, self.rig.height_px))
         with self.stopwatch("f2f"):
             found = self._plugin.call("update", frame)
             cov = self._plugin.call("covariance")

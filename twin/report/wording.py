@@ -211,7 +211,8 @@ def _results(metrics: Mapping[str, Any]) -> str:
         sentences.append(f"The map covers {share} of the asked area; LE90 of its heights over this area is {error}.")
     if elevation["le90_m"] is not None:
         share, error = percent(elevation["completeness"]), length(elevation["le90_m"])
-        sentences.append(f"It covers {share} of the observed floor, with an LE90 of {error} over these cells.")
+        subject = "It" if elevation.get("completeness_area") is not None else "The map"
+        sentences.append(f"{subject} covers {share} of the observed floor, with an LE90 of {error} over these cells.")
     return " ".join(sentences) or "There is no trajectory and no map to evaluate."
 
 

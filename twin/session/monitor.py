@@ -40,14 +40,15 @@ class SurveyProgress(NamedTuple):
 
 
 class SurveyMonitor:
-    """Reports the progress of a survey at every frame; aborts a survey that cannot continue.
+    """Reports the progress of a survey at the frames that it is given; aborts a survey that cannot continue.
 
     It cannot continue if vision is lost, the vehicle has been stopped for too long, or the position is too uncertain.
 
     Args:
         mission: the survey as planned.
         folder: run folder, for the log.
-        progress: function called with the progress after every frame and during the later stages.
+        progress: function called with the progress at each of these frames and during the later stages. Frames between
+            keyframes that the compiled loop of a surrogate survey simulates are not among them.
         live: whether to show the survey in Rerun while it runs.
     """
 

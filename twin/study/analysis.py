@@ -84,7 +84,7 @@ class StudyAnalysis:
     """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
 
     Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Surveys
-    of the same scenario with the same seed are identical and count once, except in `warning_counts` and `sobol`.
+    of the same scenario with the same seed are identical and count once, except in `sobol`.
 
     Args:
         rows: results table.
@@ -107,7 +107,8 @@ class StudyAnalysis:
         self.passed = self._passed()
 
     def _texts(self, name: str) -> NDArray:
-        column = self.rows[name].to_pylist() if name in self.rows.column_names else []
+        """Returns a column of the table as texts (n,), "" where a survey has no value or if there is no column."""
+        column = self.rows[name].to_pylist() if name in self.rows.column_names else [None] * self.rows.num_rows
         return np.array(["" if value is None else str(value) for value in column], dtype=object)
 
     def _duplicates(self) -> NDArray[np.bool_]:
@@ -115,7 +116,7 @@ class StudyAnalysis:
         hashes, seeds = self._texts("scenario_hash"), self.numbers("seed")
         seen: set[tuple[str, float]] = set()
         duplicate = np.zeros(self.rows.num_rows, np.bool_)
-        for k in np.flatnonzero(~(self.refused | self.failed)) if len(hashes) else ():
+        for k in np.flatnonzero(~(self.refused | self.failed)):
             identity = hashes[k], float(seeds[k])
             duplicate[k] = bool(hashes[k]) and identity in seen
             seen.add(identity)
@@ -337,7 +338,7 @@ class StudyAnalysis:
     @cached_property
     def warning_counts(self) -> dict[str, int]:
         """Returns the number of surveys with each warning, the most frequent first; see `count_similar`."""
-        return count_similar(self.warning[self.warning != ""])
+        return count_similar(self.warning[(self.warning != "") & ~self.duplicate])
 
     def _missed_limits(self, row: int) -> list[str]:
         return [name for name in self.limits if self.numbers(f"require.{name}.passed")[row] != 1]

@@ -160,7 +160,17 @@ class CandidateSurveys:
     @property
     def uses_surrogate(self) -> bool:
         """Returns whether the surveys are flown by the surrogate, judged by the first valid sample."""
-        return scenario_of_sample(self.study, self.base, self.conditions[0]).imaging.fidelity == "surrogate"
+        return self._original.imaging.fidelity == "surrogate"
+
+    @property
+    def fingerprint(self) -> str:
+        """Returns the hash of the scenario of the first valid sample with the original plan."""
+        return self._original.fingerprint()
+
+    @property
+    def _original(self) -> Scenario:
+        """Returns the scenario of the first valid sample with the original plan."""
+        return scenario_of_sample(self.study, self.base, self.conditions[0])
 
     def add(self, row: Row) -> None:
         """Adds the result of a survey, which replaces an earlier result with the same sample and seed."""

@@ -35,18 +35,19 @@ class Proposal(NamedTuple):
 class Search:
     """Search for the best plans; stores its trials in `optuna.journal`, which other programs can read while it runs."""
 
-    def __init__(self, study: Study, config: TuningConfig, folder: Path, search_round: int = 0):
+    def __init__(self, study: Study, config: TuningConfig, folder: Path, fingerprint: str, search_round: int = 0):
         """Starts a search, or continues the search stored in the folder.
 
         Args:
             study: the study.
             config: section [tune] of the study.
             folder: results folder.
+            fingerprint: hash of the scenario (`CandidateSurveys.fingerprint`).
             search_round: round of the search, from 0; a further round begins with the candidates given to
                 `add_earlier_candidates`.
 
         Raises:
-            TwinError: the journal in the folder belongs to another search.
+            TwinError: the journal in the folder belongs to another search, or the scenario file was changed.
         """
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self.config, self.seed, self.first_number = config, study.sampling.seed, search_round * ROUND_NUMBERS
@@ -62,7 +63,11 @@ class Search:
         identity = study.model_dump_json(exclude=extendable | {"timeout_s": True, "retries": True})  # pyright: ignore
         if self.optuna_study.user_attrs.get("identity", identity) != identity:
             raise TwinError("--resume", f"{folder} contains another search", "the folder of this search")
+        if self.optuna_study.user_attrs.get("scenario", fingerprint) != fingerprint:
+            problem = f"{folder} contains a search with another scenario: {study.scenario_file} was changed"
+            raise TwinError("--resume", problem, "the scenario of this search, or a new folder")
         self.optuna_study.set_user_attr("identity", identity)
+        self.optuna_study.set_user_attr("scenario", fingerprint)
 
     def add_earlier_candidates(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
         """Adds the candidates of earlier rounds, whose results the sampler uses from the first batch of this round.

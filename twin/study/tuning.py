@@ -121,7 +121,7 @@ def tune(
 
     Raises:
         TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, cannot be written,
-            or belongs to another search; or the engine lost its connection.
+            or belongs to another search or scenario; or the engine lost its connection.
         ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
         OSError: the results cannot be written.
     """
@@ -162,7 +162,7 @@ class Tuning:
 
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed.
-            TwinError: the engine lost its connection, or the folder contains another search.
+            TwinError: the engine lost its connection, or the folder contains another search or another scenario.
         """
         search_round = 0
         for search_round in range(1 + self.config.rounds):
@@ -205,7 +205,7 @@ class Tuning:
 
     def _search(self, search_round: int) -> None:
         """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
-        search = Search(self.study, self.config, self.folder, search_round)
+        search = Search(self.study, self.config, self.folder, self.trials.fingerprint, search_round)
         if search_round:
             search.add_earlier_candidates((c.values, c.objectives, c.shortfall) for c in self._candidates())
         while batch := search.next_batch():

@@ -178,8 +178,9 @@ def _labelled(low: str, high: str) -> str:
 
 def _warnings(analysis: StudyAnalysis) -> str:
     """Returns a sentence with the number of surveys with a warning and the most frequent one; "" without warnings."""
-    warned, texts = int((analysis.warning != "").sum()), list(analysis.warning_counts)
-    return f" Warning in {warned} of {len(analysis.warning)} surveys: {texts[0].rstrip('.')}." if texts else ""
+    different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)
+    warned = int((different != "").sum())
+    return f" Warning in {warned} of {len(different)} surveys: {texts[0].rstrip('.')}." if texts else ""
 
 
 def _main_reason(analysis: StudyAnalysis) -> str:
@@ -247,9 +248,12 @@ def _failed(analysis: StudyAnalysis) -> str:
     if not n:
         return ""
     lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.evaluated.sum())))
+    subject, none, again = (
+        ("1 more survey", "it had not", "it") if n == 1 else (f"{n} more surveys", "none of them had", "them")
+    )
     return (
-        f" {n} more surveys failed because of the computer or the program and are not counted; if none of them had "
-        f"passed, the pass probability would be {lowest}. Use --resume to fly them again."
+        f" {subject} failed because of the computer or the program and {'is' if n == 1 else 'are'} not counted; if "
+        f"{none} passed, the pass probability would be {lowest}. Use --resume to fly {again} again."
     )
 
 

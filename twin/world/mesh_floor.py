@@ -18,17 +18,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, minimum_filter
 
 import terrains
-from terrains.objects.floor_mesh import (
-    FloorTiles,
-    divided,
-    downward_part,
-    levelled,
-    median_edge_m,
-    raised,
-    tiles_of,
-    upward_part,
-)
-from terrains.objects.mesh import Mesh, extent
+from terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
+from terrains.objects.mesh import Mesh, extent, median_edge_m
 from terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
 from terrains.terrain import texture_shape
 from twin.core.records import Array, Image, MapGrid

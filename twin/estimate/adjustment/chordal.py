@@ -32,10 +32,14 @@ _ANCHOR_SIGMA = 1e-6  # prior standard deviation of the first pose [rad, m]
 
 
 class PoseGraphSolution(NamedTuple):
-    """Poses (4, 4) by node number at a local minimum of the cost F (see `pose_graph`), and the value of F there."""
+    """Poses (4, 4) by node number at a local minimum of the cost F (see `pose_graph`), and the value of F there.
+
+    `converged` is false if the iterations ended before the minimum was reached.
+    """
 
     poses: dict[int, Array]
     cost: float
+    converged: bool
 
 
 def solve_pose_graph(
@@ -62,7 +66,8 @@ def solve_pose_graph(
     index_of = {number: k for k, number in enumerate(numbers)}
     graph = FactorGraph(len(poses), [anchor], [motion_factors(links, index_of, huber)])
     solution = optimise(graph, GraphState(poses))
-    return PoseGraphSolution(dict(zip(numbers, solution.state.poses, strict=True)), solution.cost)
+    poses = dict(zip(numbers, solution.state.poses, strict=True))
+    return PoseGraphSolution(poses, solution.cost, solution.converged)
 
 
 def chordal_start(links: Sequence[Link]) -> dict[int, Array]:

@@ -195,7 +195,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
         expected = -0.5 * (np.sum(equations.gradient * step.poses) + equations.shared_gradient * step.shared)
         after, max_iterations = _evaluate(graph, trial), max_iterations - 1
         if after.cost <= current.cost + _COST_TOLERANCE:
-            converged = damping == 0 and abs(current.cost - after.cost - expected) < _COST_TOLERANCE
+            converged = bool(damping == 0 and abs(current.cost - after.cost - expected) < _COST_TOLERANCE)
             current, damping = after, damping / 10 if damping > _MIN_DAMPING else 0.0
         else:
             damping = max(10 * damping, _INITIAL_DAMPING)

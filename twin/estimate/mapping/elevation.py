@@ -162,9 +162,12 @@ def _relief(height: Map) -> Map:
 def _step(height: Map) -> Map:
     """Returns the largest absolute second difference (rows, cols) of height across each cell, over four directions [m].
 
-    Directions in which a height is unknown are left out; the result is 0 if all are, and at the edge of the grid.
+    Directions in which a height is unknown are left out; the result is 0 if all are, and at the edge of the grid. All
+    cells of a grid with fewer than three rows or columns are at its edge.
     """
     step = np.zeros_like(height)
+    if min(height.shape) < 3:
+        return step
     inner, around = height[1:-1, 1:-1], np.lib.stride_tricks.sliding_window_view(height, (3, 3))
     for i, j in ((0, 1), (1, 0), (0, 0), (0, 2)):
         second_difference = np.abs(around[..., i, j] + around[..., 2 - i, 2 - j] - 2 * inner)

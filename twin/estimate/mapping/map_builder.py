@@ -25,6 +25,9 @@ Map = NDArray[np.float32]
 #: noise, and half of the pixels are mismatches. A limit of 1 px doubles the number of cells with errors above 0.1 m; a
 #: limit of 0.35 px reduces it to a third.
 MAX_STEREO_SIGMA_PX = 0.5
+#: Largest relative standard deviation of a stereo depth that enters the map; that of its disparity is the same. At 20 %
+#: the interval of five standard deviations reaches to infinite depth.
+MAX_RELATIVE_SIGMA = 0.2
 
 
 class KeyframeImages(NamedTuple):
@@ -149,7 +152,7 @@ def _measure_depth(
     if pattern is not None:
         left, right = left - pattern.left, right - pattern.right
     stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
-    stereo = stereo.with_sigma_below(MAX_STEREO_SIGMA_PX)
+    stereo = stereo.with_sigma_below(np.minimum(MAX_STEREO_SIGMA_PX, MAX_RELATIVE_SIGMA * stereo.disparity_px))
     search_range.update(stereo.disparity_px)
     return _StereoDepth(pair, left, depth_filter.stereo_depth(stereo, rig))
 

@@ -171,7 +171,7 @@ def predict(world_from_camera, cov, a_from_b, motion_cov):
 
     These are equations (3) to (5) of Negahdaripour & Madjidi (2003).
     """
-    return geometry.compose(world_from_camera, a_from_b), transport_covariance(cov, a_from_b) + motion_cov
+    return geometry.compose(world_from_camera, a_from_b), geometry.transport_covariance(cov, a_from_b) + motion_cov
 
 
 @njit(cache=True, nogil=True)
@@ -188,17 +188,6 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
     values, axes = np.linalg.eigh(inverse_root @ cov @ inverse_root.T)
     axes = root @ axes
     return axes * np.minimum(np.maximum(values, lower), upper) @ axes.T
-
-
-@njit(cache=True, nogil=True)
-def transport_covariance(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
-
-    Args:
-        cov: (6, 6) covariance of the pose of a, in the axes of a; the result is in the axes of b.
-        a_from_b: (4, 4) pose of b in a.
-    """
-    return geometry.transform_covariance(geometry.adjoint(geometry.inverse(a_from_b)), cov)
 
 
 @njit(cache=True, nogil=True)

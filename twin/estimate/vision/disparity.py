@@ -47,8 +47,12 @@ class Disparity(NamedTuple):
     disparity_px: Map
     sigma_px: Map
 
-    def with_sigma_below(self, sigma_px: float) -> Disparity:
-        """Returns the disparity with the pixels whose standard deviation is not below `sigma_px` set to NaN."""
+    def with_sigma_below(self, sigma_px: float | Map) -> Disparity:
+        """Returns the disparity with the pixels whose standard deviation is not below `sigma_px` set to NaN.
+
+        Args:
+            sigma_px: limit of all pixels, or (H, W) limit of each pixel [px].
+        """
         accepted = self.sigma_px < sigma_px
         unknown = np.float32(np.nan)
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))

@@ -131,7 +131,7 @@ class FrameToFrame:
         status = self._fuse(located)
         motion = last_from_reference @ self.filter.pose
         if status != "ok":
-            self._common_cov = _transported(self._common_cov, motion)
+            self._common_cov = geometry.transport_covariance(self._common_cov, motion)
         if located is None or status != "ok":
             return constant_velocity_motion(motion, status)
         cov = self.filter.cov.copy()
@@ -160,7 +160,7 @@ class FrameToFrame:
         small. It is replaced by the covariance of the last measured pose, plus the growth of the filter's covariance
         since that measurement, plus the covariance of the pose of the reference image.
         """
-        return _transported(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
+        return geometry.transport_covariance(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
 
     def _set_reference(self, reference: _Reference) -> None:
         """Makes the current frame, with these points, the reference."""
@@ -238,17 +238,6 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
     cov[:, 1, 0] *= 2
     cov[:, 1, 1] *= 2
     return measured, cov
-
-
-def _transported(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
-
-    Args:
-        cov: (6, 6) covariance of the pose of a, in the axes of a; the result is in the axes of b.
-        a_from_b: (4, 4) pose of b in a.
-    """
-    adjoint = geometry.adjoint(geometry.inverse(a_from_b))
-    return adjoint @ cov @ adjoint.T
 
 
 def constant_velocity_motion(
