@@ -80,10 +80,10 @@ def slopes_over_uneven_floor(seed):
 
 
 def test_slopes_of_patches_are_not_those_of_semi_global_matching():
-    """Unrefined disparities give slopes that are 6 % too small, with an error of 0.0126 px/px; refined: 0 %, 0.0064.
+    """Unrefined disparities give slopes that are 4.2 % too small, with an RMS error of 0.0121 px/px.
 
-    The tolerances lie halfway between the two.
+    Refined ones give 0.4 % and 0.0066 px/px; the tolerances lie about halfway.
     """
     estimated, true = map(np.concatenate, zip(*(slopes_over_uneven_floor(seed) for seed in range(6)), strict=True))
-    assert np.sqrt(np.mean((estimated - true) ** 2)) < 0.0095
-    assert np.isclose(np.sum(estimated * true) / np.sum(true**2), 1.0, atol=0.03)
+    assert np.sqrt(np.mean((estimated - true) ** 2)) < 0.009
+    assert np.isclose(np.sum(estimated * true) / np.sum(true**2), 1.0, atol=0.02)

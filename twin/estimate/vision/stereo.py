@@ -196,11 +196,11 @@ def match_stereo_points(
 
 
 def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching.Gray) -> NDArray[np.float32]:
-    """Returns disparities (H, W) [px] that are accurate enough for the slopes of patches; the initial ones if that fails.
+    """Returns disparities (H, W) [px] for the slopes of patches: refined ones, or the initial ones where that fails.
 
-    Semi-global matching prefers constant disparities: over coarse texture, its slopes were 8 to 12 % too small. Patches
-    that are warped by too small slopes cover other parts of the floor in the other images, so their matches are shifted,
-    in stereo pairs by another amount than between keyframes. This biased the rotation of links by 0.16 mrad per metre.
+    Slopes from semi-global matching are 8 to 12 % too small over coarse texture, because it prefers constant
+    disparities. A patch that is warped by a wrong slope covers another part of the floor in the other images, which
+    biased the rotation of links by 0.17 mrad per metre of displacement.
     """
     refined = epipolar.refine(left, right, dense_px, epipolar.STEREO).disparity_px
     return np.where(np.isfinite(refined), refined, dense_px)
