@@ -1,8 +1,10 @@
 """Relief within a patch: shift of its least-squares match."""
 
+import cv2
 import numpy as np
+import seafloor_scene
 
-from twin.estimate.vision import patches
+from twin.estimate.vision import disparity, matching, patches, stereo
 
 PATCH_PX, HALF = 11, 5
 COLUMNS, ROWS = np.meshgrid(np.arange(48.0), np.arange(48.0))
@@ -61,3 +63,27 @@ def test_the_shift_by_relief_reverses_with_the_translation():
     forward, back = (matched_shift(image, level(COLUMNS - parallax * t, ROWS))[0] for t in (0.1, -0.1))
     assert np.linalg.norm(forward) > 0.01
     assert np.linalg.norm(forward + back) < 0.15 * np.linalg.norm(forward)
+
+
+def slopes_over_uneven_floor(seed):
+    """Returns the estimated and the true disparity slopes (n, 2) of patches of 0.3 m over relief of 0.2 m (1 sigma)."""
+    rng, rig = np.random.default_rng(seed), seafloor_scene.small_rig(160, 120, 50.0, 0.3048)
+    height = cv2.GaussianBlur(rng.normal(size=(161, 161)), (0, 0), 5)
+    texels = seafloor_scene.smooth_texture(seed, 256, 0.6)
+    floor = seafloor_scene.Seafloor(0.2 * height / height.std(), 0.1, -8.0, -8.0, texels, texture_px_m=0.076)
+    *pair, depth = seafloor_scene.stereo_pair(floor, rig, seafloor_scene.down_camera(0, 0, 3.35), rng)
+    left, right = (cv2.GaussianBlur(image.astype(np.float32), (3, 3), 0.5) for image in pair)
+    dense = disparity.search(matching.normalise(left), matching.normalise(right), 48)
+    points = stereo.match_stereo_points(left, right, dense, rig, 1000, 15)
+    true_px = (rig.focal_px * rig.baseline_m / depth).astype(np.float32)
+    return points.disparity_slope, patches.disparity_slope(true_px, points.pixels, 15)
+
+
+def test_slopes_of_patches_are_not_those_of_semi_global_matching():
+    """Unrefined disparities give slopes that are 4.2 % too small, with an RMS error of 0.0121 px/px.
+
+    Refined ones give 0.4 % and 0.0066 px/px; the tolerances lie about halfway.
+    """
+    estimated, true = map(np.concatenate, zip(*(slopes_over_uneven_floor(seed) for seed in range(6)), strict=True))
+    assert np.sqrt(np.mean((estimated - true) ** 2)) < 0.009
+    assert np.isclose(np.sum(estimated * true) / np.sum(true**2), 1.0, atol=0.02)

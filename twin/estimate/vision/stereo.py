@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
-from twin.estimate.vision import matching, patches
+from twin.estimate.vision import epipolar, matching, patches
 
 _EPIPOLAR_PX = 1.0
 _BORDER_PX = 4  # margin: two pixels for interpolation, two for matching errors, which are smaller than that
@@ -178,7 +178,7 @@ def match_stereo_points(
         patch_px: side of the matched patches (odd).
     """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
-    slope = patches.disparity_slope(dense_px, pixels, patch_px)
+    slope = patches.disparity_slope(_refined(dense_px, left, right), pixels, patch_px)
     warp = np.tile(np.eye(2), (len(pixels), 1, 1))
     warp[:, 0] -= slope
     guess = pixels - np.column_stack([disparity_px, np.zeros(len(pixels))])
@@ -193,6 +193,17 @@ def match_stereo_points(
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
     rows = match.points[ok, 1] - pixels[ok, 1]
     return StereoPoints(pixels[ok], slope[ok], mean_px[ok].astype(np.float64), measured, cov, xyz, rows, noise_ratio)
+
+
+def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching.Gray) -> NDArray[np.float32]:
+    """Returns disparities (H, W) [px] for the slopes of patches: refined ones, or the initial ones where that fails.
+
+    Slopes from semi-global matching are 8 to 12 % too small over coarse texture, because it prefers constant
+    disparities. A patch that is warped by a wrong slope covers another part of the floor in the other images, which
+    biased the rotation of links by 0.17 mrad per metre of displacement.
+    """
+    refined = epipolar.refine(left, right, dense_px, epipolar.STEREO).disparity_px
+    return np.where(np.isfinite(refined), refined, dense_px)
 
 
 def _local_mean(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
