@@ -38,7 +38,7 @@ def generate(
         relief_m: difference between the greatest and the least height.
         base_m: least height.
         grid_m: distance between grid nodes.
-        texture: side of a texel and cover of the floor; its files are not used.
+        texture: side of a texel, cover and texture of walls of the floor; its files are not used.
         seed: seed of the heights and the texture.
     Raises:
         TwinError: the kind or the cover is unknown, or the terrain is too large for memory.

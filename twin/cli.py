@@ -1,9 +1,10 @@
 """Command line `twin`: parses arguments and calls the function that implements the command.
 
-Exit status: 0 success; 1 a survey is not complete, a requirement is missed (`twin plan --strict`: expected to be), no
-plan is recommended, or a study has no result, cannot be written or finds that surrogate and rendered surveys disagree;
-2 invalid input, a study of which every survey is refused, missing system library or failed check of the machine; 130
-interrupted by Ctrl-C; 143 terminated by SIGTERM. `twin view` returns the status of the viewer.
+Exit status: 0 success; 1 a survey is not complete, a requirement is missed (with `twin plan --strict`: the plan is
+expected to miss one), no plan is recommended, or a study has no result, cannot be written or finds that surrogate and
+rendered surveys disagree; 2 invalid input, a file that cannot be read or written, a study of which every survey is
+refused, missing system library or failed check of the machine; 130 interrupted by Ctrl-C; 143 terminated by SIGTERM.
+`twin view` returns the status of the viewer.
 """
 
 from __future__ import annotations

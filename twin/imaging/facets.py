@@ -90,7 +90,9 @@ def _stored_normals(height, spacing):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _store(rise_east, rise_north, spacing):
-    """Returns the stored normal of a triangle: the component towards east in the upper 16 bits, north in the lower.
+    """Returns the stored normal (x, y, z) of a triangle, with x east and y north.
+
+    Its upper 16 bits are `UNIT` x / (1 + z), its lower 16 bits `UNIT` y / (1 + z).
 
     Args:
         rise_east, rise_north: change of height over one cell towards east and north [m].

@@ -67,8 +67,9 @@ def overlap_metrics(
         truth: true and reference poses, and the true floor.
         rig: calibration of the cameras.
         grid: cells of `truth.height_m`; None: the floor is taken to be level, at the mean height.
-        planned: pattern of the plan; overlap_along and overlap_across, the requested values; along_median and
-            across_median, the medians forecast from the planned poses over the floor.
+        planned: by key, `pattern`: the pattern of the plan; `overlap_along` and `overlap_across`: the requested
+            overlaps, 0 to 1; `along_median` and `across_median`: the medians forecast from the planned poses over the
+            floor, 0 to 1.
     """
     poses = keyframe_poses(truth.trajectory.world_from_camera, truth, result.keyframe_rows, planned)
     field = _true_floor(truth, grid)

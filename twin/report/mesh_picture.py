@@ -35,7 +35,9 @@ WHITE = (1.0, 1.0, 1.0, 0.0)
 
 
 def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Image | None:
-    """Returns an oblique view of the mesh from the south, (h, w, 3) RGB; None without a mesh or if rendering fails.
+    """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB; None if there is none.
+
+    There is none without a mesh, or if rendering fails.
 
     Args:
         mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).

@@ -127,7 +127,10 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each with the part known at that time."""
+    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time the part up to then.
+
+    Nodes have their final positions at all times.
+    """
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
         for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):

@@ -106,7 +106,7 @@ def angle(value_deg: float | None) -> str:
 
 
 def milliradians(value_deg: float | None) -> str:
-    """Returns an angle [deg] as text in milliradians; a dash for None. 1 mrad subtends 1 mm at a distance of 1 m."""
+    """Returns an angle [deg] as text in milliradians; a dash for None. 1 mm at a distance of 1 m subtends 1 mrad."""
     return DASH if value_deg is None else f"{1e3 * math.radians(value_deg):.2g} mrad"
 
 

@@ -29,7 +29,7 @@ def inertial_quantities(rotation: Array, rate_radps: Array, acceleration_mps2: A
 
 
 def imu_rate_hz(settings: ImuConfig, motion_rate_hz: float) -> float:
-    """Returns the rate of the readings [Hz].
+    """Returns the rate of the readings [Hz]: that of the scenario, or `motion_rate_hz` if the scenario gives none.
 
     Args:
         settings: section [imu] of the scenario.

@@ -177,7 +177,10 @@ def _labelled(low: str, high: str) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the number of surveys with a warning and the most frequent one; "" without warnings."""
+    """Returns a sentence, after a space, on the surveys that have a warning; "" if none has.
+
+    It has their number, without surveys that repeat others, and the text of the most frequent warning.
+    """
     different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)
     warned = int((different != "").sum())
     return f" Warning in {warned} of {len(different)} surveys: {texts[0].rstrip('.')}." if texts else ""

@@ -19,7 +19,7 @@ _MARGIN = 0.25  # fraction of its size by which an image on the floor may be lar
 
 
 class MapTile(NamedTuple):
-    """Square part of a map.
+    """Part of a map: a square of cells, cut off at the east and south edges of the map.
 
     Args:
         row, col: number of the tile from the north and from the west, from 0.

@@ -148,9 +148,10 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
-    """Writes to `nearest` (H, W), for each pixel of an image, the smallest depth of orthomosaic pixels imaged there.
+    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each pixel of an image shows.
 
-    It remains infinite where none is imaged. The other arguments are those of `_blend`.
+    An orthomosaic pixel is shown by the 2 x 2 image pixels around its projection. `nearest` remains infinite where no
+    orthomosaic pixel is shown. The other arguments are those of `_blend`.
     """
     focal, cx, cy = camera
     for i in range(first, end):
