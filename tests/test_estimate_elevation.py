@@ -186,6 +186,30 @@ def test_the_lower_height_is_chosen_at_the_corners_and_sides_of_a_pit(rows, cols
     np.testing.assert_allclose(found[~area & np.isfinite(found)], 0.0, atol=1e-6)
 
 
+def map_with(height):
+    """Returns the heights of a map of one patch with these heights [m], known to 1 cm."""
+    mapper = elevation.ElevationMapper(GRID)
+    variance_m2, systematic_m2 = (np.full(X.shape, variance, np.float32) for variance in (1e-4, 1e-6))
+    pixel = np.zeros((*X.shape, 2), np.float32)
+    mapper.fuse(HeightPatch(0, 0, height.astype(np.float32), variance_m2, systematic_m2, pixel, 0.002))
+    return mapper.result().height_m
+
+
+@pytest.mark.parametrize(("height_m", "kept"), [(-1.7, False), (1.7, False), (0.03, True)])
+def test_a_cell_at_the_border_of_the_map_that_contradicts_all_its_neighbours_is_removed(height_m, kept):
+    floor = np.where(X < 0, 0.0, np.nan)
+    row, col = 80, int(np.argmax(X[0] >= 0))
+    floor[row, col] = height_m
+    found = map_with(floor)
+    assert np.isfinite(found[row, col]) == kept
+    np.testing.assert_array_equal(np.isfinite(np.delete(found[row], col)), X[0, np.arange(X.shape[1]) != col] < 0)
+
+
+def test_cells_on_both_sides_of_a_step_of_the_floor_are_kept():
+    steps = np.where(X < 0, 0.0, 1.0) + np.where(Y < 0, 0.0, 0.5)
+    np.testing.assert_allclose(map_with(steps), steps, atol=1e-6)
+
+
 def test_sigma_of_cells_next_to_a_step_includes_the_height_of_the_other_side():
     mapper, step_m = elevation.ElevationMapper(GRID), 0.4
     patches = []

@@ -22,6 +22,8 @@ _WRONG_CHOICE = 0.16
 _NEIGHBOURS_AT_CORNER = 3
 #: Connected groups of known cells with fewer cells than this are removed.
 MIN_CELLS = 12
+#: Row and column of the eight neighbours of a cell in a window of 3 x 3 cells.
+_NEIGHBOURS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2))
 
 
 class ElevationMapper:
@@ -48,6 +50,8 @@ class ElevationMapper:
     variance due to the choice between two hypotheses. Without the term for steps, the standard deviation was 1.9 times
     too small over the whole map of a reef, because 1 % of the cells, all at edges, had the height of the wrong side of
     the edge.
+
+    A cell whose height contradicts those of all its neighbours has no result (`_contradicted`).
 
     Args:
         grid: grid of the map.
@@ -116,6 +120,7 @@ class ElevationMapper:
         edge_m2 = (fraction * _relief(height)) ** 2 + fraction * np.where(step > self.grid.cell_m, step, 0) ** 2
         choice_m2 = _WRONG_CHOICE * (1 - _WRONG_CHOICE) * np.nan_to_num(gap) ** 2
         sigma = np.sqrt(variance + systematic + edge_m2 + choice_m2)
+        height[_contradicted(height, sigma.astype(np.float32))] = np.nan
         sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
@@ -134,7 +139,7 @@ def _isolated(height: Map, other: Map) -> Mask:
     """
     around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
     known, agreeing = np.zeros(height.shape, np.int8), np.zeros(height.shape, np.int8)
-    for i, j in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
+    for i, j in _NEIGHBOURS:
         neighbour = around[..., i, j]
         known += np.isfinite(neighbour)
         agreeing += np.abs(neighbour - height) <= np.abs(neighbour - other)
@@ -149,6 +154,26 @@ def _small_groups(known: Mask) -> Mask:
     _, label, stats, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8), connectivity=8)
     small = np.asarray(stats)[:, cv2.CC_STAT_AREA] < MIN_CELLS
     return known & small[np.asarray(label, np.int64)]
+
+
+def _contradicted(height: Map, sigma: Map) -> Mask:
+    """Returns a mask (rows, cols) of the known cells whose height h contradicts those of all known neighbours.
+
+    Heights h and k with the standard deviations s and t contradict each other if (h - k)^2 >= GATE (s^2 + t^2). Such a
+    cell is a mismatch, usually at the border of the map: beside a real step, a cell has neighbours on its own side, and
+    sigma includes the height of the step. A cell without neighbours is not in the mask.
+
+    Args:
+        height, sigma: (rows, cols) height and its standard deviation [m]; heights are NaN where unknown.
+    """
+    rows, cols = height.shape
+    near, near_sigma = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, sigma))
+    alone, compared = np.ones(height.shape, np.bool_), np.zeros(height.shape, np.bool_)
+    for i, j in _NEIGHBOURS:
+        other, other_sigma = (layer[i : i + rows, j : j + cols] for layer in (near, near_sigma))
+        alone &= ~((height - other) ** 2 < GATE * (sigma**2 + other_sigma**2))
+        compared |= np.isfinite(other)
+    return np.isfinite(height) & compared & alone
 
 
 def _relief(height: Map) -> Map:
