@@ -120,7 +120,7 @@ class ElevationMapper:
         edge_m2 = (fraction * _relief(height)) ** 2 + fraction * np.where(step > self.grid.cell_m, step, 0) ** 2
         choice_m2 = _WRONG_CHOICE * (1 - _WRONG_CHOICE) * np.nan_to_num(gap) ** 2
         sigma = np.sqrt(variance + systematic + edge_m2 + choice_m2)
-        height[_contradicted(height, sigma.astype(np.float32))] = np.nan
+        height[_contradicted(height, np.hypot(sigma, self.grid.cell_m))] = np.nan
         sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
@@ -156,22 +156,24 @@ def _small_groups(known: Mask) -> Mask:
     return known & small[np.asarray(label, np.int64)]
 
 
-def _contradicted(height: Map, sigma: Map) -> Mask:
+def _contradicted(height: Map, spread: Map) -> Mask:
     """Returns a mask (rows, cols) of the known cells whose height h contradicts those of all known neighbours.
 
-    Heights h and k with the standard deviations s and t contradict each other if (h - k)^2 >= GATE (s^2 + t^2). Such a
-    cell is a mismatch, usually at the border of the map: beside a real step, a cell has neighbours on its own side, and
-    sigma includes the height of the step. A cell without neighbours is not in the mask.
+    Heights h and k contradict each other if (h - k)^2 >= GATE (s^2 + t^2), with s and t the `spread` of the two cells.
+    Such a cell is a mismatch, usually at the border of the map: beside a real step, a cell has neighbours on its own
+    side, and its sigma includes the height of the step. A cell without known neighbours is not in the mask.
 
     Args:
-        height, sigma: (rows, cols) height and its standard deviation [m]; heights are NaN where unknown.
+        height: (rows, cols) heights [m]; NaN where unknown.
+        spread: (rows, cols) standard deviation of the difference from a level floor [m]: that of the height, and one
+            cell side for relief between neighbouring cells.
     """
     rows, cols = height.shape
-    near, near_sigma = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, sigma))
+    near, near_spread = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, spread))
     alone, compared = np.ones(height.shape, np.bool_), np.zeros(height.shape, np.bool_)
     for i, j in _NEIGHBOURS:
-        other, other_sigma = (layer[i : i + rows, j : j + cols] for layer in (near, near_sigma))
-        alone &= ~((height - other) ** 2 < GATE * (sigma**2 + other_sigma**2))
+        other, other_spread = (layer[i : i + rows, j : j + cols] for layer in (near, near_spread))
+        alone &= ~((height - other) ** 2 < GATE * (spread**2 + other_spread**2))
         compared |= np.isfinite(other)
     return np.isfinite(height) & compared & alone
 
