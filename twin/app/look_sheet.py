@@ -30,7 +30,7 @@ class Panel(NamedTuple):
     Args:
         title: name of the displayed quantity.
         unit: unit of the values.
-        values: values whose minimum, median and maximum are printed; NaN is ignored.
+        values: values whose minimum, median and maximum are printed; those that are not finite are ignored.
         picture: (H, W, 3) colours from 0 to 1, or (H, W) values for the colour map.
         note: text in the corner of the picture.
         colours: name of the colour map, and the values at its lower and upper end.

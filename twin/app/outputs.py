@@ -85,9 +85,9 @@ def _check_path(path: Path, option: str, allowed: str) -> None:
 
 
 def _check_writable(path: Path, option: str) -> None:
-    """Raises TwinError unless a file can be created in `path`, if it is an existing folder, or else in its folder.
+    """Raises TwinError if no file can be created in the folder `path` or, if it is no existing folder, in its parent.
 
-    If that folder does not exist, its closest existing parent is tested.
+    If the parent does not exist either, the closest existing folder above it is tested.
     """
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest

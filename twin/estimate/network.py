@@ -252,7 +252,7 @@ class KeyframeNetwork:
         return aligned.covs[np.searchsorted([n.number for n in self.nodes], numbers, side="right") - 1]
 
     def abandon_alignment(self) -> None:
-        """Drops the links that are still being measured and disables `align_all`, as the network is incomplete."""
+        """Drops the pending link measurements and disables `align_all`, because the network is then incomplete."""
         self._queue.drop()
         self._alignable = False
 

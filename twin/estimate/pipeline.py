@@ -214,7 +214,7 @@ class Navigator:
         )
 
     def abandon_alignment(self) -> None:
-        """Drops the links that are still being measured and disables the final alignment, so that `finish` is quick."""
+        """Drops the pending link measurements and disables the final alignment, so that `finish` is quick."""
         self.network.abandon_alignment()
 
     def build_map(

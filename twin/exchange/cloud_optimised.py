@@ -29,7 +29,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     Raises:
         OSError: the folder cannot be written.
-        ValueError: a georeference is given, and the orthomosaic is rotated or its pixels are not square.
+        ValueError: a georeference is given, and the orthomosaic is rotated, its pixels are not square, or its tags are
+            damaged.
     """
     elevation, origin = contents.elevation, contents.georeference
     assert elevation is not None  # by `ExportFormat.needs`
@@ -77,7 +78,8 @@ def write_orthomosaic(path: Path, source: Path, georeference: Georeference | Non
         georeference: position of the scene in the CRS; None: the coordinates are those of `source`.
 
     Raises:
-        ValueError: a georeference is given, and the orthomosaic is rotated or its pixels are not square.
+        ValueError: a georeference is given, and the orthomosaic is rotated, its pixels are not square, or its tags are
+            damaged.
     """
     if georeference is None:
         return _optimise(source, path)

@@ -55,9 +55,9 @@ def export_laz(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def point_cloud(elevation: ElevationMap, georeference: Georeference | None = None) -> PointCloud:
-    """Returns the centres of the mapped cells, row by row from the north-west.
+    """Returns the centres of the mapped cells, row by row from the north-west, with colours and standard deviations.
 
-    They are in the CRS of `georeference` or, without one, in scene coordinates [m].
+    The centres are in the CRS of `georeference` or, without one, in scene coordinates [m].
     """
     known = np.isfinite(elevation.height_m)
     x, y = np.meshgrid(*elevation.grid.centres())

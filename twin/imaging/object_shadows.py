@@ -259,7 +259,9 @@ def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
 
 @njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
 def _cosine(depth, x, y, normal, matrix, perspective):
-    """Returns the cosine of the angle between a normal (3,) and the direction from its point to the light.
+    """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light.
+
+    The normal has the axes of the camera.
 
     The tangents `x`, `y` and the depth [m] of the point are those in the camera; see `_find_cells`.
     """

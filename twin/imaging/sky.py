@@ -65,7 +65,9 @@ def world_axes(from_camera):
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _turn(axes, to_sun, rest_lx, sun, form):
-    """Fills `sun` (3,) and `form` (3, 10), the direction to the sun and the quadratic form of `shading.shade`.
+    """Fills `sun` (3,) with the direction to the sun, `form` (3, 10) with the quadratic form of `rest_lx`.
+
+    Both are in the axes of the camera, as in the argument `sky` of `shading.shade`.
 
     Args:
         axes: (3, 3) unit vectors east, north and up in the axes of the camera, as columns.

@@ -27,7 +27,10 @@ def mean(values: ArrayLike) -> float | None:
 
 
 def percentile(values: ArrayLike, percent: float) -> float | None:
-    """Returns a percentile (0 to 100) of all values, linearly interpolated; None without values or if not finite."""
+    """Returns the percentile `percent` (0 to 100) of all values, linearly interpolated.
+
+    None if there are no values or the percentile is not finite.
+    """
     array = np.asarray(values, dtype=float)
     return finite_float(np.percentile(array, percent)) if array.size else None
 

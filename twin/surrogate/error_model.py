@@ -129,9 +129,10 @@ class ScatterLaw(NamedTuple):
 
 
 class BinnedDepthLaw(NamedTuple):
-    """Change of a `DepthLaw` for binned images, in their pixels.
+    """Parameters of a `DepthLaw` that change if images are binned; its pixels are then the binned ones.
 
-    In murky water, weak textures cause errors that further keyframes reduce less than they reduce noise.
+    `common`, `gain` and `noise_gain` change because weak textures, in murky water, cause errors that further keyframes
+    reduce less than they reduce noise.
 
     Args:
         by_2, by_4: factor on the standard deviation from one keyframe for images that are binned by 2 and by 4.

@@ -146,8 +146,8 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     Args:
         world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
         model: `PressureAhrsModel`.
-        height_m, rpy_rad: readings of the height [m], and of roll, pitch and yaw (3,) [rad]; NaN where there is no
-            reading.
+        height_m, rpy_rad: readings of the height of the left camera in the world [m], and of roll, pitch and yaw (3,)
+            of the body in the world [rad]; NaN where there is no reading.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
