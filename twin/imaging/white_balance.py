@@ -3,9 +3,10 @@
 The factors of a preset are inversely proportional to the electrons that a white surface yields in the expected light:
 white light, a black body of a colour temperature, or white light after the path from the planned altitude to the floor
 and back, exp(-2 Kd altitude), with Kd the diffuse attenuation of the water. With "gains", the scenario gives the
-factors. Grey world makes the means of the three bands equal (Buchsbaum 1980, A spatial processor model for object colour perception); the
-factors of a frame are computed from the previous frames with the lag of the auto-exposure. Factors are at least 1, so
-that a saturated pixel is white, and at most `MOST` except those for white light, as amplified bands are noisy.
+factors. Grey world makes the means of the three bands equal (Buchsbaum 1980, A spatial processor model for object
+colour perception); the factors of a frame are computed from the previous frames with the lag of the auto-exposure.
+Factors are at least 1, so that a saturated pixel is white, and at most `MOST` except those for white light, as
+amplified bands are noisy.
 """
 
 from __future__ import annotations
