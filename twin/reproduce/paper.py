@@ -18,7 +18,7 @@ from twin.judge.map_error import height_error
 from twin.judge.trajectory import PathErrors, path_errors
 from twin.reproduce import paper_sheet
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
-from twin.reproduce.paper_flight import Flown, fly_aligned, fly_without_alignment
+from twin.reproduce.paper_flight import Flown, fly_aligned, fly_in_parallel, fly_without_alignment
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 
@@ -73,11 +73,29 @@ def run(folder: Path, quick: bool = False, settings: tuple[str, ...] = ()) -> Ex
         settings: further overrides of the scenarios, each "key=value".
     """
     coarse, fine = scenarios(quick, settings)
-    flights = Flights(fly_aligned(coarse), fly_without_alignment(coarse), fly_aligned(fine))
+    flights = fly(coarse, fine)
     folder.mkdir(parents=True, exist_ok=True)
     exhibit = exhibit_of_flights(flights, quick, figures=draw_figures(flights, folder))
     write_exhibit(exhibit, folder)
     return exhibit
+
+
+def fly(coarse: Scenario, fine: Scenario) -> Flights:
+    """Flies the mission three times, in parallel on the available cores.
+
+    Args:
+        coarse: scenario of the flights over the coarse texture.
+        fine: scenario of the flight at full resolution.
+
+    Raises:
+        TwinError: a mission cannot be prepared, or no stereo pair became a keyframe.
+    """
+    flown = fly_in_parallel({
+        "full resolution": (fly_aligned, fine),
+        "coarse texture": (fly_aligned, coarse),
+        "coarse texture without alignment": (fly_without_alignment, coarse),
+    })  # fmt: skip
+    return Flights(flown["coarse texture"], flown["coarse texture without alignment"], flown["full resolution"])
 
 
 def scenarios(quick: bool, settings: tuple[str, ...] = ()) -> tuple[Scenario, Scenario]:
