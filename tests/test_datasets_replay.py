@@ -3,6 +3,7 @@
 import re
 import runpy
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -355,12 +356,33 @@ def frame_of(image):
 @pytest.mark.parametrize("name", ["sheet.png", "sheet"])
 def test_the_preview_is_one_sheet_with_the_given_name(name, euroc, tmp_path):
     opened = open_dataset(euroc, ReplayOptions())
-    file = preview.draw(opened, tmp_path / name)
+    light = preview.light_of(opened)
+    file = preview.draw(opened, light, tmp_path / name)
     assert list(tmp_path.iterdir()) == [file]
     assert cv2.imread(str(file)).shape[1] > 1000
-    table = {row[0]: row[1:] for row in preview.rows(opened)}
+    table = {row[0]: row[1:] for row in preview.rows(opened, light)}
     assert int(table["matched points"][0]) > 100 and table["reader"][0] == "euroc"
     assert abs(float(table["row difference"][0].split()[0])) < 0.1
+
+
+def test_the_preview_makes_the_light_of_the_cameras_even(frames, tmp_path):
+    """Images with a bright middle, and a right camera that is half as bright, beside the same images in even light."""
+    y, x = (np.linspace(-1, 1, n) for n in (RIG.height_px, RIG.width_px))
+    fall_off = (1 - 0.35 * (x[None] ** 2 + y[:, None] ** 2))[..., None]
+
+    def lit(image, factor):
+        return np.asarray(np.round(image * (factor * fall_off)), np.uint8)
+
+    pairs = [replace(f, left=lit(f.left, 1.0), right=None if f.right is None else lit(f.right, 0.5)) for f in frames]
+    found = {
+        name: preview.light_of(open_dataset(recorded.write_folder(tmp_path / name, images), ReplayOptions()))
+        for name, images in (("even", frames), ("lit", pairs))
+    }
+    corners = {name: preview._corner_light(light.mean_left) for name, light in found.items()}
+    assert corners["lit"] < 0.5 < 0.8 < corners["even"]
+    assert found["lit"].mean_right.mean() == pytest.approx(found["lit"].mean_left.mean() / 2, rel=0.02)
+    after = preview._corner_light(found["lit"].even_left.mean(axis=2))
+    assert after == pytest.approx(preview._corner_light(found["even"].even_left.mean(axis=2)), abs=0.15)
 
 
 @pytest.mark.parametrize("tilt_rad", [0.0, 0.35, 0.6])

@@ -8,7 +8,8 @@ from twin.core import geometry
 from twin.core.records import MapGrid
 from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap
-from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, MeanIllumination, build_map
+from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
+from twin.estimate.mapping.mean_illumination import MeanIllumination
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.vision import disparity
 

@@ -184,7 +184,7 @@ BayerOption = Annotated[
     str | None, typer.Option("--bayer", metavar="PATTERN", help="Raw images: RGGB, GRBG, GBRG or BGGR.")
 ]
 PreviewOption = Annotated[
-    bool, typer.Option("--preview", help="Only draw the first stereo pair with its matches and its disparity.")
+    bool, typer.Option("--preview", help="Only draw the first stereo pair: matches, disparity, light before and after.")
 ]
 ReplayOutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")
@@ -521,9 +521,10 @@ def replay(
         if file.suffix.lower() not in (".png", ""):
             raise TwinError("--out", f"{file.suffix[:20]!r} is not the suffix of a sheet", ".png")
         opened = recorded.open_dataset(dataset, options)
+        light = previewing.light_of(opened)
         with outputs.writing(file):
-            previewing.draw(opened, file)
-        console.print_table(f"First pair of {opened.name}", previewing.rows(opened))
+            previewing.draw(opened, light, file)
+        console.print_table(f"First pair of {opened.name}", previewing.rows(opened, light))
         print(f"Sheet: {file}")
         return
     folder = outputs.new_folder(out) if out is not None else outputs.unused_folder(Path("runs") / f"{name}-replay")

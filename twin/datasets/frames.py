@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.records import Frame, Image
 from twin.datasets.calibration import StereoCalibration
-from twin.datasets.dataset import Dataset
+from twin.datasets.dataset import Dataset, StereoImages
 from twin.datasets.image_files import Bayer, ImageSource, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.rectification import Rectification, rectification
 from twin.errors import TwinError
@@ -67,17 +67,35 @@ class RecordedFrames:
             if not in_order:
                 self.skipped[_OUT_OF_ORDER] += 1
                 continue
-            left = self._read(images.left, "left")
-            if left is None:
-                continue
-            right = self._read(images.right, "right")
-            yield Frame(
-                index,
-                images.time_s - self.start_s,
-                self.rectification.left(left),
-                None if right is None else self.rectification.right(right),
-            )
-            index += 1
+            frame = self._frame(images, index)
+            if frame is not None:
+                yield frame
+                index += 1
+
+    def _frame(self, images: StereoImages, index: int) -> Frame | None:
+        """Returns the rectified frame of recorded images with an index; None if its left image cannot be used."""
+        left = self._read(images.left, "left")
+        if left is None:
+            return None
+        right = self._read(images.right, "right")
+        return Frame(
+            index,
+            images.time_s - self.start_s,
+            self.rectification.left(left),
+            None if right is None else self.rectification.right(right),
+        )
+
+    def spread(self, n: int) -> Iterator[Frame]:
+        """Yields at most n frames with both images, in the order of time and spread evenly over the data set.
+
+        Images that cannot be used are left out, and counted in `skipped`. The index is the row in the data set.
+        """
+        both = np.array([images.right is not None for images in self.dataset.images])
+        rows = np.flatnonzero(both & self._in_order)
+        for row in rows[:: -(-len(rows) // n)]:
+            frame = self._frame(self.dataset.images[row], int(row))
+            if frame is not None and frame.right is not None:
+                yield frame
 
     @property
     def unused(self) -> int:

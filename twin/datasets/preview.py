@@ -1,4 +1,4 @@
-"""Preview of a data set: one figure of its first stereo pair with epipolar lines, matched points and disparity."""
+"""Preview of a data set: one sheet of its first stereo pair: matches, disparity, light before and after."""
 
 from __future__ import annotations
 
@@ -7,78 +7,121 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from twin.datasets.replay import OpenedDataset
+from twin.estimate.light_inspection import LightInspection, inspect_light
 from twin.report.wording import length, percent, plain
 
 _N_LINES = 9  # number of epipolar lines
+_N_PAIRS = 24  # largest number of pairs from which the light of the cameras is estimated
 _WIDTH_IN = 12.0
 
 
-def draw(opened: OpenedDataset, file: Path) -> Path:
+def light_of(opened: OpenedDataset) -> LightInspection:
+    """Returns the light of the cameras, from pairs spread over the data set, and the first pair without it."""
+    return inspect_light(opened.pair, opened.frames.spread(_N_PAIRS), opened.frames.rectification.rig)
+
+
+def draw(opened: OpenedDataset, light: LightInspection, file: Path) -> Path:
     """Writes the figure as PNG and returns `file`.
 
-    Upper row: the rectified pair with some epipolar lines, which are image rows, and the matched points, coloured by
-    disparity. Lower row: dense disparity, and a histogram of the row differences of the matched points.
+    First row: the rectified pair with some epipolar lines, which are image rows, and the matched points, coloured by
+    disparity. Second row: before and after the light of the cameras was made uniform in the left image. Third row:
+    dense disparity of the images as recorded, and as the map uses it. Fourth row: a histogram of the row differences of
+    the matched points, and the mean grey levels of both cameras along the rows of the images.
 
     Args:
         opened: the data set.
+        light: light of its cameras (`light_of`).
         file: file to write; its name is not changed.
 
     Raises:
         OSError: the file cannot be written.
     """
     pair = opened.pair
-    height_in = _WIDTH_IN * pair.rig.height_px / pair.rig.width_px + 0.8
+    height_in = 1.6 * _WIDTH_IN * pair.rig.height_px / pair.rig.width_px + 1.6
     figure = Figure(figsize=(_WIDTH_IN, height_in), layout="constrained")
-    left, right, dense, rows_axes = figure.subplots(2, 2, squeeze=False).ravel()
+    left, right, before, after, dense, mapped, rows_axes, light_axes = figure.subplots(
+        4, 2, height_ratios=(1, 1, 1, 0.7)
+    ).ravel()
     disparity_px = pair.points.measured[:, 2] * pair.rig.focal_px
-    _draw_image(left, pair.left, f"{opened.name}: left image, {len(disparity_px)} matched points")
-    _draw_image(right, pair.right, f"right image, baseline {length(pair.rig.baseline_m)}")
+    _draw_image(left, pair.left, f"{opened.name}: left image, {len(disparity_px)} matched points", _N_LINES)
+    _draw_image(right, pair.right, f"right image, baseline {length(pair.rig.baseline_m)}", _N_LINES)
     pixels = pair.points.pixels
     for axes, x, y in (
         (left, pixels[:, 0], pixels[:, 1]),
         (right, pixels[:, 0] - disparity_px, pixels[:, 1] + pair.points.row_difference_px),
     ):
         axes.scatter(x, y, s=6, c=disparity_px, cmap="turbo", linewidths=0)
-    shown = dense.imshow(pair.disparity.disparity_px, cmap="turbo")
-    dense.set_title(f"disparity, {percent(_known_share(opened))} of the pixels")
-    figure.colorbar(shown, ax=dense, label="[px]", shrink=0.8)
+    _draw_image(before, pair.left, "before: left image as recorded")
+    _draw_image(after, light.even_left, f"after: even light, by the mean of {light.n_pairs} pairs (colours of the map)")
+    subtracted = "without the light" if light.subtracted else "the same: texture dominates"
+    _draw_disparity(dense, pair.disparity.disparity_px, "disparity before")
+    _draw_disparity(mapped, light.disparity.disparity_px, f"disparity of the map, {subtracted}")
     rows_axes.hist(pair.points.row_difference_px, bins=50, range=(-1, 1), color="#4477aa")
     rows_axes.axvline(0, color="k", linewidth=0.8)
     rows_axes.set(xlabel="row of the right point minus row of the left point [px]", ylabel="matched points")
     rows_axes.set_title("row differences: centred at 0 if the calibration fits")
+    for mean, name, colour in ((light.mean_left, "left", "#4477aa"), (light.mean_right, "right", "#ee6677")):
+        light_axes.plot(mean.mean(axis=0), color=colour, label=name)
+    light_axes.set(xlabel="column [px]", ylabel="grey level")
+    light_axes.set_ylim(bottom=0)
+    light_axes.set_title(f"light of the cameras: mean of the columns of {light.n_pairs} pairs")
+    light_axes.legend()
     figure.savefig(file, dpi=110, format="png")
     return file
 
 
-def rows(opened: OpenedDataset) -> list[tuple[str, ...]]:
+def rows(opened: OpenedDataset, light: LightInspection) -> list[tuple[str, ...]]:
     """Returns the rows of a table of the properties of a data set and its first pair: name, value, remark."""
     pair, rig = opened.pair, opened.pair.rig
     found = opened.frames
     depth_m = pair.points.xyz[:, 2]
+    subtracted = "subtracted before dense matching" if light.subtracted else "not subtracted: the texture dominates"
     return [
         ("reader", opened.reader, opened.plane_text),
         ("frames", str(len(found)), f"{plain(rig.frame_rate_hz)} Hz"),
         ("images", f"{rig.width_px} x {rig.height_px} px", found.rectification.sentence),
         ("focal length, baseline", f"{plain(rig.focal_px)} px", length(rig.baseline_m)),
-        ("matched points", str(len(depth_m)), f"disparity at {percent(_known_share(opened))} of the pixels"),
+        ("matched points", str(len(depth_m)),
+         f"disparity at {percent(_known_share(pair.disparity.disparity_px))} of the pixels"),
         ("row difference", f"{np.median(pair.points.row_difference_px):+.2f} px", "median, right minus left"),
         ("depth", length(float(np.median(depth_m))), "median; 5th and 95th percentile "
          + " and ".join(length(float(value)) for value in np.percentile(depth_m, [5, 95]))),
+        ("light at the corners", f"{100 * _corner_light(light.mean_left):.0f} %",
+         f"of the centre, left camera; {subtracted}"),
+        ("right camera", f"{100 * light.mean_right.mean() / max(light.mean_left.mean(), 1e-6):.0f} %",
+         f"of the grey level of the left one, mean of {light.n_pairs} pairs"),
         ("truth", "none" if opened.truth is None else f"{len(opened.truth)} poses", "only for the comparison"),
     ]  # fmt: skip
 
 
-def _known_share(opened: OpenedDataset) -> float:
-    """Returns the fraction of the pixels of the left image of the first pair that have a disparity."""
-    return float(np.isfinite(opened.pair.disparity.disparity_px).mean())
+def _corner_light(mean: NDArray[np.float32]) -> float:
+    """Returns the mean of an image (H, W) in its corners, each a tenth of it wide and high, over that in its middle."""
+    height, width = mean.shape
+    down, across = -(-height // 10), -(-width // 10)
+    corners = [part for rows in (mean[:down], mean[-down:]) for part in (rows[:, :across], rows[:, -across:])]
+    middle = mean[(height - down) // 2 : (height + down) // 2, (width - across) // 2 : (width + across) // 2]
+    return float(np.mean(corners) / max(float(middle.mean()), 1e-6))
 
 
-def _draw_image(axes: Axes, image: np.ndarray, title: str) -> None:
-    """Draws an image with `_N_LINES` epipolar lines and a title, without axes."""
+def _known_share(disparity_px: NDArray[np.float32]) -> float:
+    """Returns the fraction of the pixels that have a disparity, that is, are not NaN."""
+    return float(np.isfinite(disparity_px).mean())
+
+
+def _draw_disparity(axes: Axes, disparity_px: NDArray[np.float32], title: str) -> None:
+    """Draws a dense disparity with its colour bar and a title that states the fraction of the pixels that have one."""
+    shown = axes.imshow(disparity_px, cmap="turbo")
+    axes.set_title(f"{title}, {percent(_known_share(disparity_px))} of the pixels")
+    axes.figure.colorbar(shown, ax=axes, label="[px]", shrink=0.8)
+
+
+def _draw_image(axes: Axes, image: np.ndarray, title: str, n_lines: int = 0) -> None:
+    """Draws an image with a number of epipolar lines and a title, without axes."""
     axes.imshow(image)
-    for row in np.linspace(0, image.shape[0], _N_LINES + 2)[1:-1]:
+    for row in np.linspace(0, image.shape[0], n_lines + 2)[1:-1]:
         axes.axhline(row, color="w", linewidth=0.5, alpha=0.6)
     axes.set_title(title)
     axes.set_axis_off()

@@ -82,13 +82,25 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
         rig: believed calibration.
         settings: settings of the estimators, for the number of points and the patch size; None: the defaults.
     """
-    assert frame.right is not None
-    chosen, square, scale = settings or EstimatorSettings(), rig.with_square_pixels(), rig.fx_px / rig.fy_px
-    left, right = (one if scale == 1 else matching.scaled_rows(one, scale) for one in (frame.left, frame.right))
+    chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
+    left, right = square_images(frame, rig)
     dense, points = _matched(left, right, square, chosen)
     exchanged = _matched(right, left, square, chosen)[1]
     swapped = len(exchanged.xyz) >= max(_MIN_POINTS, _SWAPPED_SHARE * len(points.xyz))
     return PairInspection(left, right, square, dense, points, swapped)
+
+
+def square_images(frame: Frame, rig: StereoRig) -> tuple[Image, Image]:
+    """Returns the left and the right image of a frame with both images, resampled to square pixels.
+
+    Args:
+        frame: frame with both images.
+        rig: believed calibration; that of the returned images is `rig.with_square_pixels()`.
+    """
+    assert frame.right is not None
+    scale = rig.fx_px / rig.fy_px
+    left, right = (one if scale == 1 else matching.scaled_rows(one, scale) for one in (frame.left, frame.right))
+    return left, right
 
 
 def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> tuple[Disparity, StereoPoints]:
