@@ -87,7 +87,7 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
         TwinError: a setting is invalid, or no stereo pair became a keyframe, so that there is no map.
     """
     path = two_loops_path(SEED) if name == "tank2" else lawnmower_path(n_pairs, SEED)
-    mission = _mission(settings)
+    mission = tank_mission(settings)
     stopwatch, guard = Stopwatch(), StageGuard()
     rig, estimator = mission.rig, mission.scenario.estimator_settings()
     vision = image_vision(mission, folder, stopwatch)
@@ -124,7 +124,7 @@ def height_errors(survey: TankSurvey) -> Array:
     return np.where(survey.truth.seen, error_m, np.nan)
 
 
-def _mission(settings: Sequence[str]) -> Mission:
+def tank_mission(settings: Sequence[str]) -> Mission:
     """Returns the mission of the scenario `tank`, over the floor with objects, with the map grid of `AREA_M`."""
     mission = prepare(load_scenario("tank", settings))
     cell_m = mission.scenario.map.cell_m
