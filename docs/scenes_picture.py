@@ -40,15 +40,7 @@ def missions() -> dict[str, tuple[Mission, Position | None]]:
         **{f"terrain.cover = {name}": (scene("reef", *settings), None) for name, settings in floors.items()},
         "quickstart": (scene("quickstart"), (0.3, 0.1, 2.2)),
         "reef in daylight, 6 m deep, Jerlov II": (
-            scene(
-                "reef",
-                "lamps=[]",
-                "water.jerlov=II",
-                "sun.illuminance_lx=40000",
-                "sun.depth_m=6",
-                "sun.elevation_deg=50",
-                "terrain.cover=coral",
-            ),
+            scene("reef", *DAYLIGHT, "terrain.cover=coral"),
             None,
         ),
         "coral_garden": (scene("coral_garden"), None),
