@@ -206,6 +206,21 @@ def test_a_cell_at_the_border_of_the_map_that_contradicts_all_its_neighbours_is_
     np.testing.assert_array_equal(np.isfinite(np.delete(found[row], col)), X[0, np.arange(X.shape[1]) != col] < 0)
 
 
+@pytest.mark.parametrize("n_cells", [1, 2, 3])
+def test_mismatches_in_the_middle_of_the_map_do_not_excuse_themselves(n_cells):
+    """The range of heights around a mismatch of 40 m would be part of its own sigma and of that of its neighbours."""
+    floor = np.zeros(X.shape)
+    floor[80, 80 : 80 + n_cells] = -40.0
+    mapper = elevation.ElevationMapper(GRID)
+    pixel = np.zeros((*X.shape, 2), np.float32)
+    variance_m2, systematic_m2 = np.full(X.shape, 4.0, np.float32), np.zeros(X.shape, np.float32)
+    variance_m2[floor == 0] = 1e-6
+    mapper.fuse(HeightPatch(0, 0, floor.astype(np.float32), variance_m2, systematic_m2, pixel, GRID.cell_m))
+    found = mapper.result()
+    np.testing.assert_array_equal(np.isnan(found.height_m), floor < 0)
+    assert np.nanmax(found.sigma_m) < 0.01
+
+
 def test_a_rough_floor_with_slopes_of_45_degrees_has_no_holes():
     rough = np.random.default_rng(1).uniform(0, GRID.cell_m, X.shape)  # many times the reported errors
     assert np.isfinite(map_with(rough)).all()

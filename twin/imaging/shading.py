@@ -17,6 +17,9 @@ from twin.imaging.powers import LOG2_E, two_to
 
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
 RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
+#: Columns and rows, relative to the centre of a pixel, at which it samples the facets of the floor [px]: a rotated
+#: grid, whose samples have different columns and different rows.
+SAMPLES = np.array([(-1, -3), (3, -1), (1, 3), (-3, 1)], np.float32) / 8
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
@@ -71,6 +74,7 @@ def shade(
     backscatter, reflected = np.zeros((3, width), np.float32), np.zeros((3, width), np.float32)
     arriving = np.empty((3, width), np.float32)
     cells, parts = np.empty((2, width), np.int32), np.empty((2, width), np.float32)
+    samples = np.empty((SAMPLES.shape[0] + 1, width), np.int32)
     lookup = cells[0], cells[1], parts[0], parts[1]
     row_table, shown = np.empty((cols, ranges, 4), np.float32), np.ones(width, np.uint8)
     sunny = beam[:, 0].max() > 0 or diffuse.max() > 0
@@ -80,7 +84,7 @@ def shade(
         if facets.normals.shape[0] == 0:
             _range_and_normal(depth, v, y, focal, range_m, normal)
         else:
-            _range_and_facet_normal(facets, depth[v], y, focal, cells, range_m, normal)
+            _range_and_facet_normal(facets, depth[v], y, focal, samples, cells[0], cells[1], lamp, range_m, normal)
         if objects.label.shape[0] > 0:
             _take_normals(objects, v, normal)
         light[:] = np.float32(0.0)
@@ -122,47 +126,114 @@ def shade(
 
 
 @njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
-def _range_and_facet_normal(facets, here, y, focal, cells, range_m, normal):
-    """Computes range (W,) and unit normals (3, W) of the facets in a row of pixels.
+def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, range_m, normal):
+    """Computes range (W,) and normals (3, W) of the facets in a row of pixels.
 
-    The normals are in the axes of the camera and point up in the world.
+    The normals are in the axes of the camera and point up in the world. A pixel that shows several facets gets the mean
+    of their unit normals at `SAMPLES`: the light of a matt facet is proportional to a component of its normal, so this
+    is the light of the whole area of the pixel. The points of the floor at the samples are those of the plane of the
+    facet at the centre of the pixel.
 
     Args:
         facets: `facets.FacetView`; its docstring defines the stored normals that are unpacked here.
-        cells: (2, W) int32 working memory.
+        cells: (n + 1, W) int32 working memory for the facet at each of the n `SAMPLES` and at the centre.
+        stored, mixed: (W,) int32 working memory.
+        work: (3, W) float32 working memory.
     """
     normals, origin, grid, turn = facets
+    zero, one, half, far = np.float32(0), np.float32(1), np.float32(0.5), np.float32(FAR_M)
+    centre, flat, n_samples = half * np.float32(here.size - 1), normals.reshape(-1), SAMPLES.shape[0]
+    z, along, down = work[0], work[1], work[2]  # depth, its relative decrease per pixel along the row and down
+    for u in range(here.size):
+        x = (np.float32(u) - centre) / focal
+        range_m[u] = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else far
+        z[u] = here[u] if here[u] < far else zero
+        along[u], down[u] = zero, zero
+    _cells_of_points(facets, (z, along, down), y, focal, (zero, zero), cells[n_samples])
+    for u in range(here.size):
+        stored[u] = flat[np.uint32(cells[n_samples, u])]
+    for u in range(here.size):
+        nx, ny, nz = _turned(turn, _unpacked(stored[u]))
+        normal[0, u], normal[1, u], normal[2, u] = nx, ny, nz
+        x = (np.float32(u) - centre) / focal
+        per_px = one / (focal * min(x * nx + y * ny + nz, np.float32(-0.05)))
+        along[u], down[u] = nx * per_px, ny * per_px
+        mixed[u] = 0
+    for k in range(n_samples):
+        _cells_of_points(facets, (z, along, down), y, focal, (SAMPLES[k, 0], SAMPLES[k, 1]), cells[k])
+        for u in range(here.size):
+            mixed[u] |= cells[0, u] ^ cells[k, u]
+    n = 0
+    for u in range(here.size):
+        several, mixed[n] = mixed[u] != 0, u
+        n += several
+    total, share = work, one / np.float32(n_samples)
+    for i in range(n):
+        total[0, i], total[1, i], total[2, i] = zero, zero, zero
+    for k in range(n_samples):
+        for i in range(n):
+            stored[i] = flat[np.uint32(cells[k, mixed[i]])]
+        for i in range(n):
+            nx, ny, nz = _unpacked(stored[i])
+            total[0, i] += nx * share
+            total[1, i] += ny * share
+            total[2, i] += nz * share
+    for i in range(n):
+        u = mixed[i]
+        normal[0, u], normal[1, u], normal[2, u] = _turned(turn, (total[0, i], total[1, i], total[2, i]))
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _cells_of_points(facets, floor, y, focal, shift, cells):
+    """Fills `cells` (W,) with the number of the facet that each pixel of a row shows at a point within the pixel.
+
+    Args:
+        facets: `facets.FacetView`.
+        floor: (W,) depth of the floor, and its relative decrease per pixel along the row and down.
+        y: ratio of y and depth at the centres of the pixels.
+        focal: focal length [px].
+        shift: column and row of the point, relative to the centre of the pixel [px].
+        cells: result; the first facet of cell (row, col) has the number 2 (row cols + col).
+    """
+    normals, origin, grid, _ = facets
+    z, along, down = floor
     rows, cols, _ = normals.shape
-    zero, one, two, half, far = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5), np.float32(FAR_M)
+    zero, one, two, half = np.float32(0), np.float32(1), np.float32(2), np.float32(0.5)
     west, south = -np.float32(origin[0]), -np.float32(origin[1])
     east, north = west + np.float32(cols - 1), south + np.float32(rows - 1)
-    per_x, per_z, shift = grid[:, 0].copy(), grid[:, 1] * y + grid[:, 2], grid[:, 3].copy()
-    col_x, row_x, col_z, row_z, col_0, row_0 = per_x[0], per_x[1], per_z[0], per_z[1], shift[0], shift[1]
+    left, below = half * np.float32(z.size - 1) - shift[0], y + shift[1] / focal
+    col_x, row_x, col_0, row_0 = grid[0, 0], grid[1, 0], grid[0, 3], grid[1, 3]
+    col_z, row_z = grid[0, 1] * below + grid[0, 2], grid[1, 1] * below + grid[1, 2]
     per_row, first = np.float32(2 * cols), np.float32(2 * (np.int64(origin[1]) * cols + origin[0]))
-    for u in range(here.size):
-        z = here[u] if here[u] < far else zero
-        x = (np.float32(u) - half * np.float32(here.size - 1)) / focal
-        col, row = z * (col_x * x + col_z) + col_0, z * (row_x * x + row_z) + row_0
+    for u in range(z.size):
+        depth = z[u] * (one - along[u] * shift[0] - down[u] * shift[1])
+        x = (np.float32(u) - left) / focal
+        col, row = depth * (col_x * x + col_z) + col_0, depth * (row_x * x + row_z) + row_0
         c, r = min(max(np.floor(col), west), east), min(max(np.floor(row), south), north)
         north_west = zero if col - c >= row - r else one
-        cells[0, u] = np.int32(r * per_row + (two * c + north_west) + first)  # exact: there are fewer than 2^24 facets
-        range_m[u] = here[u] * np.sqrt(x * x + y * y + one) if here[u] < far else far
-    flat = normals.reshape(-1)
-    for u in range(here.size):
-        cells[1, u] = flat[np.uint32(cells[0, u])]
-    bits, unit = np.int32(16), one / np.float32(UNIT)
-    t00, t01, t02, t10, t11, t12 = turn[0, 0], turn[0, 1], turn[0, 2], turn[1, 0], turn[1, 1], turn[1, 2]
-    t20, t21, t22 = turn[2, 0], turn[2, 1], turn[2, 2]
-    for u in range(here.size):
-        stored = cells[1, u]
-        high, low = np.int32(stored >> bits), np.int32(np.int32(stored << bits) >> bits)
-        a, b = np.float32(high) * unit, np.float32(low) * unit
-        square = a * a + b * b
-        per_n = one / (one + square)
-        nx, ny, nz = two * a * per_n, two * b * per_n, (one - square) * per_n
-        normal[0, u] = t00 * nx + t01 * ny + t02 * nz
-        normal[1, u] = t10 * nx + t11 * ny + t12 * nz
-        normal[2, u] = t20 * nx + t21 * ny + t22 * nz
+        cells[u] = np.int32(r * per_row + (two * c + north_west) + first)  # exact: there are fewer than 2^24 facets
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _unpacked(stored):
+    """Returns the normal (x, y, z) of a stored normal, see `facets`."""
+    bits, one, two, unit = np.int32(16), np.float32(1), np.float32(2), np.float32(1) / np.float32(UNIT)
+    high, low = np.int32(stored >> bits), np.int32(np.int32(stored << bits) >> bits)
+    a, b = np.float32(high) * unit, np.float32(low) * unit
+    square = a * a + b * b
+    per_n = one / (one + square)
+    return two * a * per_n, two * b * per_n, (one - square) * per_n
+
+
+@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+def _turned(turn, vector):
+    """Returns the product of a matrix (3, 3) and a vector (x, y, z)."""
+    x, y, z = vector
+    return (
+        turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
+        turn[1, 0] * x + turn[1, 1] * y + turn[1, 2] * z,
+        turn[2, 0] * x + turn[2, 1] * y + turn[2, 2] * z,
+    )
 
 
 @njit(cache=True, nogil=True, forceinline=True, error_model="numpy")

@@ -26,6 +26,10 @@ MIN_CELLS = 12
 _NEIGHBOURS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2))
 
 
+#: A cell is supported by this many neighbours of agreeing height (`_contradicted`).
+_SUPPORT = 3
+
+
 class ElevationMapper:
     """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
@@ -51,7 +55,7 @@ class ElevationMapper:
     too small over the whole map of a reef, because 1 % of the cells, all at edges, had the height of the wrong side of
     the edge.
 
-    A cell whose height contradicts those of all its neighbours has no result (`_contradicted`).
+    Cells whose heights contradict those of all their neighbours have no result (`_contradicted`).
 
     Args:
         grid: grid of the map.
@@ -114,13 +118,13 @@ class ElevationMapper:
             np.take_along_axis(layers, chosen, 0)[0] for layers in (self._height, self._variance, self._systematic)
         )
         height[_small_groups(np.isfinite(height))] = np.nan
-        step = _step(height)
         lateral_m = self._lateral_m[0] / max(self._lateral_m[1], 1)
         fraction = lateral_m / (2 * self.grid.cell_m)
+        height[_contradicted(height, variance + systematic + self.grid.cell_m**2, fraction)] = np.nan
+        step = _step(height)
         edge_m2 = (fraction * _relief(height)) ** 2 + fraction * np.where(step > self.grid.cell_m, step, 0) ** 2
         choice_m2 = _WRONG_CHOICE * (1 - _WRONG_CHOICE) * np.nan_to_num(gap) ** 2
         sigma = np.sqrt(variance + systematic + edge_m2 + choice_m2)
-        height[_contradicted(height, np.hypot(sigma, self.grid.cell_m))] = np.nan
         sigma = np.where(np.isnan(height), np.nan, sigma).astype(np.float32)
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
@@ -156,26 +160,50 @@ def _small_groups(known: Mask) -> Mask:
     return known & small[np.asarray(label, np.int64)]
 
 
-def _contradicted(height: Map, spread: Map) -> Mask:
-    """Returns a mask (rows, cols) of the known cells whose height h contradicts those of all known neighbours.
+def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
+    """Returns a mask (rows, cols) of the known cells, alone or in twos and threes, that contradict their neighbours.
 
-    Heights h and k contradict each other if (h - k)^2 >= GATE (s^2 + t^2), with s and t the `spread` of the two cells.
-    Such a cell is a mismatch, usually at the border of the map: beside a real step, a cell has neighbours on its own
-    side, and its sigma includes the height of the step. A cell without known neighbours is not in the mask.
+    Heights h and k of neighbouring cells agree if (h - k)^2 < GATE (P + Q + E), with P and Q the `variance` of the two
+    cells, and E the square of `edge_fraction` times the range of heights around the cell. A cell is supported if at
+    least `_SUPPORT` neighbours agree with it, or if one of those that agree is supported so. A cell that is not
+    supported, and contradicts a neighbour, is a mismatch: beside a real step, a cell has neighbours on its own side.
+
+    By the range of heights, a mismatch would excuse itself, so it is that of the neighbours, without the two highest
+    and the two lowest ones. It is computed for the cells only that are not supported without it.
 
     Args:
         height: (rows, cols) heights [m]; NaN where unknown.
-        spread: (rows, cols) standard deviation of the difference from a level floor [m]: that of the height, and one
-            cell side for relief between neighbouring cells.
+        variance: (rows, cols) variance of the difference from a level floor [m^2].
+        edge_fraction: standard deviation of a height due to lateral errors, as a fraction of the range of heights.
     """
     rows, cols = height.shape
-    near, near_spread = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, spread))
-    alone, compared = np.ones(height.shape, np.bool_), np.zeros(height.shape, np.bool_)
+    near, near_variance = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, variance))
+    n_agreeing = np.zeros(height.shape, np.int8)
     for i, j in _NEIGHBOURS:
-        other, other_spread = (layer[i : i + rows, j : j + cols] for layer in (near, near_spread))
-        alone &= ~((height - other) ** 2 < GATE * (spread**2 + other_spread**2))
-        compared |= np.isfinite(other)
-    return np.isfinite(height) & compared & alone
+        other, other_variance = (layer[i : i + rows, j : j + cols] for layer in (near, near_variance))
+        n_agreeing += (height - other) ** 2 < GATE * (variance + other_variance)  # False where unknown
+    supported = np.pad(n_agreeing >= _SUPPORT, 1)
+    row, col = np.nonzero(np.isfinite(height) & (n_agreeing < _SUPPORT))
+    around = tuple(np.array([(row + i, col + j) for i, j in _NEIGHBOURS]).transpose(1, 2, 0))  # (n, 8) each
+    relief = _trimmed_range(near[around])
+    spread = variance[row, col] + (edge_fraction * relief) ** 2
+    agrees = (height[row, col, None] - near[around]) ** 2 < GATE * (spread[:, None] + near_variance[around])
+    supported[row + 1, col + 1] = agrees.sum(axis=1) >= _SUPPORT
+    left = ~supported[row + 1, col + 1] & ~(agrees & supported[around]).any(axis=1)
+    left &= (np.isfinite(near[around]) & ~agrees).any(axis=1)
+    contradicted = np.zeros(height.shape, np.bool_)
+    contradicted[row[left], col[left]] = True
+    return contradicted
+
+
+def _trimmed_range(heights: Map) -> Map:
+    """Returns the range (n,) of the known heights in each row (n, 8) without the two highest and the two lowest ones.
+
+    It is 0 with fewer than six known heights.
+    """
+    ordered, known = np.sort(heights, axis=1), np.isfinite(heights).sum(axis=1)  # NaN last
+    highest = np.take_along_axis(ordered, np.maximum(known - 3, 0)[:, None], axis=1)[:, 0]
+    return np.where(known >= 6, highest - ordered[:, 2], np.float32(0))
 
 
 def _relief(height: Map) -> Map:
