@@ -121,7 +121,7 @@ class _ProgressLines:
         self._tenths = tenths
 
 
-def _fly(mission: Mission, make: Callable[[Mission, World, Path, Stopwatch], Navigator], name: str) -> Flown:
+def _fly(mission: Mission, make: Callable[[Mission, World, Path, Stopwatch], Navigator], name: str = "") -> Flown:
     """Flies a mission with the navigator that `make` returns, and builds the elevation map; name: see `fly_aligned`.
 
     Raises:
