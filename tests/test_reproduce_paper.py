@@ -1,6 +1,7 @@
 """Tables of the paper's mission and budget: every row of the paper, and values against closed forms."""
 
 from contextlib import nullcontext
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 import numpy as np
@@ -124,11 +125,16 @@ class NoKeyframes:
         return self.elevation
 
 
+@dataclass
+class TruthStandIn:
+    albedo: object = len
+
+
 def fly_without_world(monkeypatch, navigator):
-    world = SimpleNamespace(truth=lambda: "truth")
+    world = SimpleNamespace(truth=TruthStandIn)
     monkeypatch.setattr(paper_flight, "open_world", lambda *_: nullcontext(world))
     monkeypatch.setattr(paper_flight, "fly", lambda *_: None)
-    return paper_flight._fly(SimpleNamespace(grid=None), lambda *_: navigator)
+    return paper_flight._fly(SimpleNamespace(grid=None, n_frames=1), lambda *_: navigator)
 
 
 def test_a_failed_alignment_leaves_a_map_and_its_reason(monkeypatch):
