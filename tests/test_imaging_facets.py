@@ -94,10 +94,10 @@ def test_stored_normals_are_exact_to_a_few_thousandths_of_a_degree(rise: float) 
 def test_a_pixel_within_a_facet_is_shaded_by_the_facet_that_its_ray_meets(west_m: float) -> None:
     """Slopes to 70 deg: of the pixels that show a single facet, less than 0.2 % are off by 10 %."""
     pose = geometry.pose(TILTED, np.array([west_m + 0.2, 0.1, 2.2]))
-    found = shading(rough(0.12, 0.15, west_m), pose, 8)
+    found = shading(rough(0.12, 0.18, west_m), pose, 8)
     light, truth = found.rendered[found.one_facet], found.of_rays[found.one_facet, 0]
     assert np.mean(np.abs(light - truth) > 0.1 * truth + 1e-3) < 2e-3
-    assert np.mean(truth == 0) > 0.0001, "no facet is turned away from the lamp"
+    assert np.mean(truth == 0) > 0.001, "no facet is turned away from the lamp"
     assert 0.2 < found.one_facet.mean() < 0.9
 
 

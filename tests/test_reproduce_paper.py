@@ -1,5 +1,6 @@
 """Tables of the paper's mission and budget: every row of the paper, and values against closed forms."""
 
+import pickle
 from contextlib import nullcontext
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -11,7 +12,7 @@ from judge_synthetic import survey
 from twin.core.interrupts import StageGuard
 from twin.core.records import Trajectory
 from twin.core.timing import Stopwatch
-from twin.errors import SurveyAborted, TwinError
+from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.reproduce import paper_flight, paper_sheet
 from twin.reproduce.budget import FRAME_MS, KEYFRAME_MS, MODULES, N_FRAMES, budget_table, keyframe_load_ms
 from twin.reproduce.conclusion import finished
@@ -208,3 +209,9 @@ def test_the_budget_has_every_module_of_the_paper_and_its_load_is_the_sum_of_15_
 def test_a_budget_without_calls_has_dashes():
     rows = budget_table({}, 0, 0).rows
     assert all(row[2] == "-" for row in rows[1:]) and rows[-1][3] == "-"
+
+
+@pytest.mark.parametrize("error", [TwinError("rig", "is odd", "a rig"), TwinError("a", "b"), ScenarioError(["x", "y"])])
+def test_an_error_of_a_flight_in_another_process_keeps_its_message(error):
+    copy = pickle.loads(pickle.dumps(error))
+    assert type(copy) is type(error) and str(copy) == str(error) and vars(copy) == vars(error)

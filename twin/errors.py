@@ -16,6 +16,10 @@ class TwinError(Exception):
         self.field, self.problem, self.allowed = field, problem, allowed
         super().__init__(f"{field}: {problem}" + (f" (allowed: {allowed})" if allowed else ""))
 
+    def __reduce__(self) -> tuple[type[TwinError], tuple[object, ...]]:
+        """Returns class and arguments, from which another process rebuilds the error."""
+        return type(self), (self.field, self.problem, self.allowed)
+
 
 class ScenarioError(TwinError):
     """All errors of one scenario; the message has one line per error, with file and line number or with `--set`."""
@@ -23,6 +27,9 @@ class ScenarioError(TwinError):
     def __init__(self, lines: list[str]):
         self.lines = lines
         Exception.__init__(self, "\n".join(lines))
+
+    def __reduce__(self) -> tuple[type[TwinError], tuple[object, ...]]:
+        return type(self), (self.lines,)
 
 
 class SurveyAborted(Exception):  # noqa: N818 (an outcome of a survey, not an input error)
