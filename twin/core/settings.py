@@ -32,8 +32,10 @@ class EstimatorSettings:
         keyframe_overlap: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is
             expected to be below this fraction, or if tracking has failed; used only if the caller does not choose the
             keyframes.
-        wide_search: whether features are matched over the whole images where a link cannot be measured from the
+        wide_search: whether features are matched over the whole images wherever a link cannot be measured from the
             predicted poses; for large or unpredictable motions between keyframes. It costs time only where links fail.
+            Otherwise this is done only where the covariance of the predicted poses exceeds the search range, and a link
+            must agree with this covariance.
 
     Raises:
         TwinError: a value is out of range.

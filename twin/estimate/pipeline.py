@@ -426,6 +426,7 @@ class Navigator:
         depth_m = float(np.median(points.xyz[:, 2]))
         number = len(self.network.keyframes)
         keyframe = Keyframe(number, row, track, pose, points, frame.readings, depth_m=depth_m, exposure=frame.exposure)
+        self._accumulate(keyframe, self.since_node.cov)
         self.network.add(keyframe)
         is_node = self.network.is_node(keyframe)
         chain = self._follow_chain(keyframe) if is_node else None
@@ -470,18 +471,27 @@ class Navigator:
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
-        to_world, from_world = geometry.adjoint(pose), geometry.adjoint(geometry.inverse(pose))
-        if nodes:
-            keyframe.accumulated_cov = nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
+        self._accumulate(keyframe, step_cov)
         found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None
         if found is not None:
-            source = keyframes[found.reference_keyframe]
-            accumulated = from_world @ (keyframe.accumulated_cov - source.accumulated_cov) @ from_world.T
+            accumulated = keyframe.motion_cov(keyframes[found.reference_keyframe], pose)
             since = clip_covariance(accumulated, np.ascontiguousarray(step_cov), 1.0, np.inf) if nodes else accumulated
             cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
             reduction = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
             if reduction is not None:
+                to_world = geometry.adjoint(pose)
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
+
+    def _accumulate(self, keyframe: Keyframe, step_cov: Array) -> None:
+        """Sets `accumulated_cov` of a keyframe from that of the last node and the motion since then.
+
+        Args:
+            keyframe: keyframe that is not yet a node.
+            step_cov: (6, 6) covariance of the motion since the last node, in the axes of the current camera.
+        """
+        if self.network.nodes:
+            to_world = geometry.adjoint(self.filter.world_from_camera)
+            keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
         """Adds a node to the network, linked to the last node by `chain`, or by the F2F motion if `chain` is None.

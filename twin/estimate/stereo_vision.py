@@ -26,7 +26,7 @@ from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.light_pattern import LightPattern, light_pattern, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration
-from twin.estimate.vision.pair_matching import PairMatcher
+from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
 from twin.estimate.vision.repetition import repetition
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
@@ -242,17 +242,25 @@ class StereoVision:
         for other, matched in zip(others, matches, strict=True):
             with self.stopwatch("network"):
                 motion = None if matched is None else self.matcher.motion(node, other, matched)
-            if motion is None and self.settings.wide_search:
-                motion = self._search_widely(node, other)
-            motions.append(motion)
+            motions.append(self._search_widely(node, other) if motion is None else motion)
         return motions
 
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
         """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
 
-        None if `node` has no points, if the features do not give a prediction, or if the measurement fails.
+        With `settings.wide_search`, this is tried for every motion. Otherwise it is tried only where the predicted
+        poses are too uncertain for the matching of points, and a motion that contradicts these poses is rejected.
+
+        Returns:
+            The motion. None if the search is not tried, if the features do not give a prediction, if the measurement
+            fails, or if the motion is rejected.
         """
-        if node.points is None:
+        if node.points is None or not len(node.points.xyz):
+            return None
+        predicted_cov = node.motion_cov(other)
+        predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
+        anywhere = self.settings.wide_search
+        if not (anywhere or wide_search.may_exceed(SEARCH_PX, node.points, predicted_cov, self.rig)):
             return None
         with self.stopwatch("flow"):
             grays = self.spool.gray(node.row)[0], self.spool.gray(other.row)[0]
@@ -262,7 +270,10 @@ class StereoVision:
             moved = replace(other, world_from_camera=node.world_from_camera @ geometry.inverse(other_from_node))
             matched = self.matcher.match(node, [moved])[0]
         with self.stopwatch("network"):
-            return None if matched is None else self.matcher.motion(node, moved, matched)
+            motion = None if matched is None else self.matcher.motion(node, moved, matched)
+        if motion is None or anywhere or wide_search.agrees(motion.a_from_b, predicted, predicted_cov):
+            return motion
+        return None
 
     def epipolar_error(self) -> EpipolarError:
         return self.calibration.report()

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Displacement, Exposure, Readings
 from twin.estimate.vision.stereo import StereoPoints
@@ -43,3 +44,17 @@ class Keyframe:
     accumulated_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
     depth_m: float = np.nan
     exposure: Exposure | None = None
+
+    def motion_cov(self, earlier: Keyframe, world_from_camera: Array | None = None) -> Array:
+        """Returns the covariance (6, 6) of the motion since an earlier keyframe [rotation, translation] (rad, m).
+
+        It is too large for keyframes that have been aligned globally, because alignments do not decrease
+        `accumulated_cov`.
+
+        Args:
+            earlier: the other keyframe.
+            world_from_camera: (4, 4) pose of the camera whose axes are used; by default the pose of this keyframe.
+        """
+        pose = self.world_from_camera if world_from_camera is None else world_from_camera
+        from_world = geometry.adjoint(geometry.inverse(pose))
+        return from_world @ (self.accumulated_cov - earlier.accumulated_cov) @ from_world.T

@@ -19,7 +19,8 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.pixel_locking import PixelLocking
 
-_LEVELS = 2  # pyramid levels above the full image; predicted positions may be wrong by 8 px
+_LEVELS = 2  # pyramid levels above the full image
+SEARCH_PX = 8.0  #: largest error of a predicted image position from which a point is found, with these levels [px]
 
 
 class MatchedPair(NamedTuple):

@@ -1,4 +1,4 @@
-"""Coarse motion between two keyframes without a prediction: features matched over the whole images."""
+"""Search of a link over the whole images: where the prediction is too uncertain, features give a coarse motion."""
 
 from __future__ import annotations
 
@@ -6,18 +6,56 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
+from scipy.stats import chi2
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.estimate.vision import matching
+from twin.estimate.vision.observation_equations import image_jacobian
 from twin.estimate.vision.stereo import StereoPoints
 
 _MOST_FEATURES = 1000
 _RATIO = 0.8  # largest ratio of the distances of the best and the second best descriptor (Lowe 2004)
 _INLIER_PX = 2.0
 _MIN_INLIERS, _MIN_INLIER_SHARE = 15, 0.3
+_LEAST_DISPARITY_PX = 0.5
 _CONFIDENCE, _ITERATIONS = 0.999, 500
+
+_SIGMAS = 3.0  # errors of the predicted positions up to this number of standard deviations are expected
+_CHI2 = chi2.ppf(0.9999, 6)  # largest chi-square of the difference between a measured and the predicted motion
+
+
+def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig) -> bool:
+    """Returns whether the predicted image positions of the points may be wrong by more than a search range.
+
+    This is so if three times the median standard deviation of the positions, along the direction in which it is
+    largest, exceeds the range.
+
+    Args:
+        range_px: largest error of a predicted position from which it is found [px].
+        points: stereo points of the node.
+        cov: (6, 6) covariance of the predicted motion [rotation, translation] (rad, m), in the axes of the node.
+        rig: calibration at the scale of the image.
+    """
+    x, y, disparity = np.ascontiguousarray(points.measured.T)
+    depth_m = rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX / rig.focal_px)
+    jacobian = image_jacobian(x, y, depth_m) * rig.focal_px
+    variance_px2 = np.linalg.eigvalsh(jacobian @ cov @ jacobian.transpose(0, 2, 1))[:, -1]
+    return bool(_SIGMAS**2 * np.median(variance_px2) > range_px**2)
+
+
+def agrees(found: Array, predicted: Array, cov: Array) -> bool:
+    """Returns whether a motion lies within the error of its prediction (chi-square, 99.99 %).
+
+    Where the texture repeats, features of the whole images may agree on a motion that is wrong by a period.
+
+    Args:
+        found, predicted: (4, 4) motions between the same two cameras.
+        cov: (6, 6) covariance of the prediction [rotation, translation] (rad, m), in the axes of the second camera.
+    """
+    error = geometry.log(geometry.inverse(predicted) @ found)
+    return bool(error @ np.linalg.pinv(cov, hermitian=True) @ error <= _CHI2)
 
 
 def coarse_motion(
@@ -84,5 +122,5 @@ def _at_features(points: StereoPoints, nearest: NDArray[np.int64], pixels: Array
     """
     offset_px = pixels - points.pixels[nearest]
     disparity = points.measured[nearest, 2] * rig.focal_px + (points.disparity_slope[nearest] * offset_px).sum(axis=1)
-    depth_m = rig.focal_px * rig.baseline_m / np.maximum(disparity, 0.5)
+    depth_m = rig.focal_px * rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX)
     return np.column_stack([rig.normalised(pixels), np.ones(len(pixels))]) * depth_m[:, None]
