@@ -11,6 +11,7 @@ from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.estimate import alignment
 from twin.estimate.alignment import align
 from twin.estimate.vision.keyframes import Keyframe
+from twin.judge.consistency import nees, nees_interval
 
 RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
 NOISE = SensorNoise(0.01, 0.003, 0.01)
@@ -190,3 +191,32 @@ def test_gross_outliers_are_removed_and_at_most_1_percent_of_the_inliers():
     assert len(dropped - outliers) <= 0.01 * len(links)
     errors_m = np.linalg.norm([a[:3, 3] - b[:3, 3] for a, b in zip(aligned.poses, poses, strict=True)], axis=1)
     assert errors_m.max() < 3e-3
+
+
+def test_the_number_of_independent_errors_predicts_how_much_the_mean_nees_of_surveys_varies():
+    """400 surveys of the same network with other noise: the variance of the mean NEES has a standard error of 10 %."""
+    means, independent = [], 0.0
+    for seed in range(400):
+        poses, links = small_network(np.random.default_rng(5), share_of_sigma=0)
+        rng = np.random.default_rng(seed)
+        noisy = [
+            link._replace(i_from_j=link.i_from_j @ geometry.exp(np.linalg.cholesky(link.cov) @ rng.normal(size=6)))
+            for link in links
+        ]
+        aligned = align(keyframes(poses), noisy, ANCHOR, RIG, NOISE)
+        error = np.array([geometry.inverse(t) @ f for t, f in zip(poses[1:], aligned.poses[1:], strict=True)])[:, :3, 3]
+        means.append(nees(error, aligned.covs[1:, 3:, 3:]).mean())
+        independent = aligned.independent_errors or independent
+    assert np.mean(means) == pytest.approx(3, abs=4 * np.sqrt(6 / independent / 400))
+    assert 6 / np.var(means) == pytest.approx(independent, rel=0.4)
+    assert 1 < independent < len(poses) - 1
+    low, high = nees_interval(independent) or (0.0, 0.0)
+    assert np.mean((np.array(means) < low) | (np.array(means) > high)) < 0.03
+
+
+def test_independent_and_common_errors_are_counted_exactly():
+    rng, covs = np.random.default_rng(0), np.tile(np.diag([1.0, 4.0, 9.0]), (20, 1, 1))
+    single = rng.normal(size=(20000, 20, 3)) * [1, 2, 3]
+    assert alignment._independent_errors(single, covs) == pytest.approx(20, rel=0.04)
+    assert alignment._independent_errors(np.repeat(single[:, :1], 20, axis=1), covs) == pytest.approx(1, rel=0.04)
+    assert alignment._independent_errors(single, 0 * covs) is None

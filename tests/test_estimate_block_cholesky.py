@@ -87,6 +87,13 @@ def test_inverse_blocks_are_those_of_the_dense_inverse(factored):
     np.testing.assert_allclose(blocks, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
 
 
+def test_samples_of_unit_vectors_are_a_root_of_the_dense_inverse(factored):
+    factor, dense = factored
+    root = np.array([factor.sample(unit.reshape(-1, 6)).ravel() for unit in np.eye(len(dense))]).T
+    expected = np.linalg.inv(dense)
+    np.testing.assert_allclose(root @ root.T, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
+
+
 def test_fill_in_of_a_lawnmower_survey_is_below_3_percent_of_the_dense_triangle():
     n, (i, j) = 1200, lawnmower(20, 60)
     symbolic = elimination.analyse(n, i, j)

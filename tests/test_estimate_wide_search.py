@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-
 import seafloor_scene as scene
+
 from twin.core import geometry
 from twin.core.records import Frame, Readings
 from twin.core.settings import EstimatorSettings

@@ -12,7 +12,7 @@ from twin.core import geometry
 from twin.core.links import Links
 from twin.core.records import ElevationMap, MapGrid, Trajectory, Truth
 from twin.errors import TwinError
-from twin.judge.consistency import consistency_metrics, nees
+from twin.judge.consistency import consistency_metrics, nees, nees_interval
 from twin.judge.control import control_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.metrics import EvaluationInput, check_require, empty_metrics, evaluate
@@ -98,6 +98,16 @@ def test_keyframe_consistency_uses_camera_axes_and_leaves_out_the_anchored_keyfr
     share = np.mean([f["within_2sigma_position"] for f in metrics])
     assert share == pytest.approx(0.9545, abs=4 * np.sqrt(0.9545 * 0.0455 / (3 * n)))
     assert metrics[0]["within_2sigma_map"] is None
+
+
+def test_the_interval_of_the_mean_nees_holds_99_percent_of_consistent_surveys():
+    rng = np.random.default_rng(0)
+    for k in (1, 7):
+        low, high = nees_interval(k) or (0.0, 0.0)
+        drawn = (rng.normal(size=(40_000, 3 * k)) ** 2).sum(axis=1) / k
+        assert [np.mean(drawn < low), np.mean(drawn > high)] == pytest.approx([0.005] * 2, abs=0.0015)
+    assert nees_interval(1e6) == pytest.approx([3, 3], abs=0.01)
+    assert nees_interval(None) is None
 
 
 def test_keyframes_without_a_covariance_are_left_out_of_consistency():

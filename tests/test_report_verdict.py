@@ -10,7 +10,7 @@ from judge_synthetic import evaluated, survey, write_folder
 
 from twin.app import console
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
-from twin.judge.warnings import metric_warnings
+from twin.judge.warnings import NEES_BOUNDS, metric_warnings, nees_bounds
 from twin.report import wording
 from twin.report.run_folder import load_run
 from twin.report.survey_page import write_report
@@ -214,6 +214,16 @@ def test_a_map_with_too_many_holes_has_an_infinite_le90_in_the_text():
 )  # fmt: skip
 def test_the_bounds_of_nees_are_two_and_five(value, n):
     assert len(changed(consistency={"nees_position_mean": value})["warnings"]) == n
+
+
+@pytest.mark.parametrize(("value", "n"), [(0.5, 1), (0.7, 0), (7.5, 0), (7.7, 1)])
+def test_nees_is_accepted_up_to_what_few_independent_errors_allow(value, n):
+    expected = {"nees_position_mean": value, "nees_position_expected": [0.64, 7.6]}
+    assert len(changed(consistency=expected)["warnings"]) == n
+
+
+def test_many_independent_errors_do_not_narrow_the_bounds_of_nees():
+    assert nees_bounds({"nees_position_expected": [2.9, 3.1]}) == NEES_BOUNDS
 
 
 @pytest.mark.parametrize(("value", "n"), [(0.49, 1), (0.5, 0), (2.0, 0), (2.01, 1), (None, 0)])

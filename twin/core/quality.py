@@ -58,6 +58,8 @@ class EstimationQuality(NamedTuple):
             keyframe.
         disparity_offset: offset common to all disparities, estimated from the links; None without images, or if
             the offset is not observable.
+        independent_errors: number of independent errors to which the correlated position errors of the keyframes are
+            equivalent, by their joint covariance; None without a final alignment.
     """
 
     frames_lost: int = 0
@@ -70,6 +72,7 @@ class EstimationQuality(NamedTuple):
     epipolar: EpipolarError | None = None
     frame_sigma_m: float | None = None
     disparity_offset: DisparityOffset | None = None
+    independent_errors: float | None = None
 
 
 class Finding(NamedTuple):

@@ -28,6 +28,7 @@ _MIN_SHARE_OF_WORST = 0.01  # a link with a chi2 below this fraction of the larg
 _MAX_ROUNDS = 10
 _MAX_ITERATIONS = 100
 _ROUND_ITERATIONS = 10  # iterations per round; the Huber weights converge slowly while the graph has gross outliers
+_DRAWS = 200  # drawn errors of all poses, from which the number of independent errors is estimated to about 15 %
 _HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
@@ -41,6 +42,8 @@ class AlignmentResult(NamedTuple):
         dropped: links that were removed as outliers.
         link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links.
         converged: false if the iterations ended before the minimum was reached.
+        independent_errors: number of independent position errors to which those of all nodes are equivalent
+            (`_independent_errors`); None unless the covariances of all nodes were requested.
     """
 
     poses: Array
@@ -48,6 +51,7 @@ class AlignmentResult(NamedTuple):
     dropped: list[Link]
     link_chi2: float
     converged: bool
+    independent_errors: float | None = None
 
 
 def align(
@@ -90,8 +94,31 @@ def align(
         del solution
         solution = window.optimise(state, _MAX_ITERATIONS)
     link_chi2 = _mean_chi2(window.links, solution.chi2[0])
+    rng = np.random.default_rng(0)
+    draws = np.array([solution.sample(rng)[1:, 3:] for _ in range(_DRAWS)]) if marginals_of is None else None
     covs = _marginals(solution, marginals_of, index_of)
-    return AlignmentResult(solution.state.poses, covs, dropped, link_chi2, solution.converged)
+    independent = None if draws is None else _independent_errors(draws, covs[1:, 3:, 3:])
+    return AlignmentResult(solution.state.poses, covs, dropped, link_chi2, solution.converged, independent)
+
+
+def _independent_errors(draws: Array, covs: Array) -> float | None:
+    """Returns the number of independent position errors whose mean NEES varies as much as that of all nodes.
+
+    The mean of 3 k squared independent standard normal numbers, times 3, has the variance 6 / k. The errors of the
+    nodes of a survey are correlated, so k is much smaller than the number of nodes.
+
+    Args:
+        draws: (m, n, 3) errors of the positions of n nodes, drawn m times from their joint covariance [m].
+        covs: (n, 3, 3) covariances of the positions [m2].
+
+    Returns:
+        The number k; None without a node of known covariance.
+    """
+    known = np.linalg.eigvalsh(covs)[:, 0] > 0
+    if not known.any():
+        return None
+    whitened = np.linalg.solve(np.linalg.cholesky(covs[known]), draws[:, known, :, None])[..., 0]
+    return float(6 / np.var(np.sum(whitened**2, axis=(1, 2)) / known.sum()))
 
 
 def _mean_chi2(links: Links, chi2: Array) -> float:

@@ -91,6 +91,7 @@ class AlignmentHistory:
             from frame-to-frame motion alone [m]; keyframes at which it is not known are left out.
         nodes_bridged: number of nodes linked to the previous node by the F2F motion (predicted where tracking failed),
             because this link could not be measured.
+        independent_errors: see `AlignmentResult`, of the final alignment; None before it.
     """
 
     alignments: list[Alignment] = field(default_factory=list[Alignment])
@@ -101,6 +102,7 @@ class AlignmentHistory:
     disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
     frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0
+    independent_errors: float | None = None
 
 
 class KeyframeNetwork:
@@ -248,6 +250,7 @@ class KeyframeNetwork:
             return None
         with self.stopwatch("ga"):
             aligned = self._align(self.nodes, self.nodes[-1].track, marginals=None)
+        self.history.independent_errors = aligned.independent_errors
         numbers = [k.number for k in self.keyframes]
         return aligned.covs[np.searchsorted([n.number for n in self.nodes], numbers, side="right") - 1]
 

@@ -342,6 +342,7 @@ class Navigator:
             disparity_offset=disparity_offset.combine(
                 history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px
             ),
+            independent_errors=history.independent_errors,
         )
 
     @property

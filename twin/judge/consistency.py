@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from scipy.stats import chi2
 
 from twin.core.records import Array, ElevationMap, SurveyResult, Truth
 from twin.judge.map_error import normalised_error
@@ -10,18 +13,21 @@ from twin.judge.summary_statistics import mean
 from twin.judge.trajectory import anchor
 
 
-def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
+def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, Any]:
     """Returns `consistency.*` of metrics.json.
 
     For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
-    within two sigma is 0.954. `within_2sigma_position` is the fraction over the three camera axes of the keyframes that
-    `keyframe_errors` returns, `within_2sigma_map` the fraction over the map cells that `normalised_error` returns.
+    within two sigma is 0.954. `nees_position_expected` is the interval that holds the mean NEES of 99 % of the surveys
+    whose covariances are consistent. `within_2sigma_position` is the fraction over the three camera axes of the
+    keyframes that `keyframe_errors` returns, `within_2sigma_map` the fraction over the map cells that
+    `normalised_error` returns.
     """
     error, cov = keyframe_errors(result, truth)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     cells = np.zeros(0) if elevation is None else normalised_error(elevation, truth)
     return {
         "nees_position_mean": mean(nees(error, cov)),
+        "nees_position_expected": nees_interval(result.quality.independent_errors),
         "within_2sigma_position": mean(np.abs(error) <= 2 * sigma),
         "within_2sigma_map": mean(np.abs(cells) <= 2),
     }
@@ -55,6 +61,23 @@ def nees(error: Array, cov: Array) -> Array:
     Its expectation is d for consistent covariances (Bar-Shalom, Li & Kirubarajan 2001, section 5.4.2).
     """
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0])
+
+
+def nees_interval(independent_errors: float | None, share: float = 0.99) -> list[float] | None:
+    """Returns the bounds between which the mean NEES of the positions lies for a share of consistent surveys.
+
+    The mean NEES is distributed as chi-square with 3 k degrees of freedom, divided by k (Bar-Shalom, Li & Kirubarajan
+    2001, section 5.4.2), for k independent errors. A survey is equivalent to few of them, because its errors are
+    correlated along the path.
+
+    Args:
+        independent_errors: number k, not necessarily whole; None gives None.
+        share: probability that the mean NEES lies in the interval.
+    """
+    if independent_errors is None:
+        return None
+    tail = (1 - share) / 2
+    return [float(chi2.ppf(p, 3 * independent_errors) / independent_errors) for p in (tail, 1 - tail)]
 
 
 def _positive_definite(cov: Array) -> np.ndarray:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-#: Bounds of the mean NEES of the positions; outside them a survey is reported as inconsistent. The expectation is 3.
+#: Bounds of the mean NEES of the positions: a survey is reported as inconsistent if its value is outside them and
+#: outside the interval expected of consistent covariances (`consistency.nees_interval`). The expectation is 3.
 NEES_BOUNDS = (2.0, 5.0)
 #: Bounds of the sigma ratio (RMS of height error / sigma); outside them the sigmas of a map are reported as
 #: miscalibrated. The expectation is 1.
@@ -18,8 +19,9 @@ def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
     """Returns a sentence for each metric that is out of its bounds: NEES, sigma ratio, and saturation of the images."""
     found = (
         _out_of_bounds(
-            metrics["consistency"]["nees_position_mean"], NEES_BOUNDS,
-            "The position covariances are {}: the mean NEES is {:.3g}, where 3 is expected and {:g} to {:g} accepted.",
+            metrics["consistency"]["nees_position_mean"], nees_bounds(metrics["consistency"]),
+            "The position covariances are {}: the mean NEES is {:.3g}, where 3 is expected and {:.3g} to {:.3g} "
+            "accepted.",
         ),
         _out_of_bounds(
             metrics["map"]["sigma_ratio"], SIGMA_RATIO_BOUNDS,
@@ -29,6 +31,12 @@ def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
         _saturation(metrics["vision"]["saturated_median"]),
     )  # fmt: skip
     return [sentence for sentence in found if sentence]
+
+
+def nees_bounds(consistency: Mapping[str, Any]) -> tuple[float, float]:
+    """Returns the smallest and largest accepted mean NEES of the positions, given `consistency` of metrics.json."""
+    low, high = consistency.get("nees_position_expected") or NEES_BOUNDS
+    return min(low, NEES_BOUNDS[0]), max(high, NEES_BOUNDS[1])
 
 
 def _out_of_bounds(value: float | None, bounds: tuple[float, float], sentence: str) -> str:

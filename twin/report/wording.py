@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from twin.judge.warnings import nees_bounds
 from twin.scenario.water_sources import WATER_SOURCES
 
 DASH = "–"  # noqa: RUF001
@@ -267,12 +268,12 @@ def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
 def _position_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     """Returns the key figures of the trajectories."""
     f2f, online, final = (metrics["trajectory"][key] for key in ("f2f", "online", "final"))
-    nees = plain(metrics["consistency"]["nees_position_mean"])
+    nees, (low, high) = plain(metrics["consistency"]["nees_position_mean"]), nees_bounds(metrics["consistency"])
     return [
         KeyFigure("Position error, final", length(final["ate_rmse_m"]), f"RMSE; maximum {length(final['ate_max_m'])}"),
         KeyFigure("Position error, online", length(online["ate_rmse_m"]), "RMSE of the estimate used for control"),
         KeyFigure("Position error, F2F", length(f2f["ate_rmse_m"]), f"RMSE; drift {_drift(f2f)}"),
-        KeyFigure("NEES of positions", nees, "mean; 3 is consistent, larger is overconfident"),
+        KeyFigure("NEES of positions", nees, f"mean; 3 is expected, {low:.2g} to {high:.2g} accepted"),
     ]
 
 

@@ -48,6 +48,16 @@ class CholeskyFactor(NamedTuple):
         _solve_in_place(s, self.panels, x.reshape(-1))
         return x[s.permutation]
 
+    def sample(self, normals: Array) -> Array:
+        """Returns vectors (n, 6) whose covariance is the inverse matrix, from standard normal numbers (n, 6).
+
+        The vectors are L^-T z, with the numbers z in elimination order.
+        """
+        s = self.symbolic
+        x = normals.reshape(-1).copy()
+        _solve_transposed_in_place(s, self.panels, x)
+        return x.reshape(normals.shape)[s.permutation]
+
     def inverse_block(self, node: int) -> Array:
         """Returns the diagonal block (6, 6) of the inverse matrix that belongs to a node.
 
@@ -313,6 +323,12 @@ def _solve_in_place(s, panels, x):
             for k in range(s.row_start[p], s.row_start[p + 1]):
                 for i in range(_D):
                     x[_D * s.rows[k] + i] -= product[_D * (k - s.row_start[p]) + i]
+    _solve_transposed_in_place(s, panels, x)
+
+
+@njit(cache=True, nogil=True)
+def _solve_transposed_in_place(s, panels, x):
+    """Solves the linear system of the transposed factor, L' y = x; x (6 n,), in elimination order, becomes y."""
     for p in range(len(s.panel_start) - 2, -1, -1):
         own = x[_D * s.panel_start[p] : _D * s.panel_start[p + 1]]
         panel = _panel_matrix(s, panels, p)

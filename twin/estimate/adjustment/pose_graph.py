@@ -162,6 +162,14 @@ class Solution(NamedTuple):
         """Returns the marginal covariance (6, 6) of pose k."""
         return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
+    def sample(self, rng: np.random.Generator) -> Array:
+        """Returns errors (n, 6) of all poses, drawn from their joint covariance; units and axes as of `marginal`."""
+        errors = self.cholesky.sample(rng.standard_normal((len(self.state.poses), 6)))
+        if self.border is None:
+            return errors
+        by_shared, information = self.border
+        return errors + by_shared * rng.standard_normal() / information**0.5
+
     def _add_shared(self, covs: Array, rows: slice) -> Array:
         """Returns the covariances of the poses `rows`, plus the part due to the uncertainty of the shared parameter."""
         if self.border is None:
