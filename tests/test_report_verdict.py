@@ -218,12 +218,12 @@ def test_the_bounds_of_nees_are_two_and_five(value, n):
 
 @pytest.mark.parametrize(("value", "n"), [(0.5, 1), (0.7, 0), (7.5, 0), (7.7, 1)])
 def test_nees_is_accepted_up_to_what_few_independent_errors_allow(value, n):
-    expected = {"nees_position_mean": value, "nees_position_expected": [0.64, 7.6]}
+    expected = {"nees_position_mean": value, "nees_position_low": 0.64, "nees_position_high": 7.6}
     assert len(changed(consistency=expected)["warnings"]) == n
 
 
 def test_many_independent_errors_do_not_narrow_the_bounds_of_nees():
-    assert nees_bounds({"nees_position_expected": [2.9, 3.1]}) == NEES_BOUNDS
+    assert nees_bounds({"nees_position_low": 2.9, "nees_position_high": 3.1}) == NEES_BOUNDS
 
 
 @pytest.mark.parametrize(("value", "n"), [(0.49, 1), (0.5, 0), (2.0, 0), (2.01, 1), (None, 0)])

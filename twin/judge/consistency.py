@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from scipy.stats import chi2
 
@@ -13,21 +11,23 @@ from twin.judge.summary_statistics import mean
 from twin.judge.trajectory import anchor
 
 
-def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, Any]:
+def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
     """Returns `consistency.*` of metrics.json.
 
     For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
-    within two sigma is 0.954. `nees_position_expected` is the interval that holds the mean NEES of 99 % of the surveys
-    whose covariances are consistent. `within_2sigma_position` is the fraction over the three camera axes of the
-    keyframes that `keyframe_errors` returns, `within_2sigma_map` the fraction over the map cells that
-    `normalised_error` returns.
+    within two sigma is 0.954. The mean NEES of 99 % of the surveys with consistent covariances lies between
+    `nees_position_low` and `nees_position_high`; they are None without a final alignment. `within_2sigma_position` is
+    the fraction over the three camera axes of the keyframes that `keyframe_errors` returns, `within_2sigma_map` the
+    fraction over the map cells that `normalised_error` returns.
     """
     error, cov = keyframe_errors(result, truth)
+    low, high = nees_interval(result.quality.independent_errors) or (None, None)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     cells = np.zeros(0) if elevation is None else normalised_error(elevation, truth)
     return {
         "nees_position_mean": mean(nees(error, cov)),
-        "nees_position_expected": nees_interval(result.quality.independent_errors),
+        "nees_position_low": low,
+        "nees_position_high": high,
         "within_2sigma_position": mean(np.abs(error) <= 2 * sigma),
         "within_2sigma_map": mean(np.abs(cells) <= 2),
     }
@@ -63,7 +63,7 @@ def nees(error: Array, cov: Array) -> Array:
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0])
 
 
-def nees_interval(independent_errors: float | None, share: float = 0.99) -> list[float] | None:
+def nees_interval(independent_errors: float | None, share: float = 0.99) -> tuple[float, float] | None:
     """Returns the bounds between which the mean NEES of the positions lies for a share of consistent surveys.
 
     The mean NEES is distributed as chi-square with 3 k degrees of freedom, divided by k (Bar-Shalom, Li & Kirubarajan
@@ -77,7 +77,8 @@ def nees_interval(independent_errors: float | None, share: float = 0.99) -> list
     if independent_errors is None:
         return None
     tail = (1 - share) / 2
-    return [float(chi2.ppf(p, 3 * independent_errors) / independent_errors) for p in (tail, 1 - tail)]
+    low, high = chi2.ppf([tail, 1 - tail], 3 * independent_errors) / independent_errors
+    return float(low), float(high)
 
 
 def _positive_definite(cov: Array) -> np.ndarray:

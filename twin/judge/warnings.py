@@ -35,7 +35,9 @@ def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
 
 def nees_bounds(consistency: Mapping[str, Any]) -> tuple[float, float]:
     """Returns the smallest and largest accepted mean NEES of the positions, given `consistency` of metrics.json."""
-    low, high = consistency.get("nees_position_expected") or NEES_BOUNDS
+    low, high = (consistency.get(f"nees_position_{end}") for end in ("low", "high"))
+    if low is None or high is None:
+        return NEES_BOUNDS
     return min(low, NEES_BOUNDS[0]), max(high, NEES_BOUNDS[1])
 
 
