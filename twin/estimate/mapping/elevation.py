@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from twin.core.records import ElevationMap, Image, MapGrid
 from twin.estimate.mapping.depth_filter import GATE, Mask
 from twin.estimate.mapping.surface import HeightPatch
+from twin.estimate.mapping.visibility import hidden, main_surface
 
 Map = NDArray[np.float32]
 
@@ -43,6 +44,9 @@ class ElevationMapper:
     and the one chosen by this rule in 84 %. Where fewer than three of the neighbours support this choice, the other
     hypothesis is the result (`_isolated`).
 
+    A hypothesis is dropped if the camera that measured it last cannot have seen it, because the line of sight passes
+    below the connected surface of the map (`visibility`).
+
     The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their
     part, the depth variance, decreases with each fusion. Errors due to the pose and to the smoothing of slopes are
     common to all patches of a leg and mostly to all legs, so their part is the weighted mean of the variances of the
@@ -67,6 +71,8 @@ class ElevationMapper:
         self._height = np.full((2, *shape), np.nan, np.float32)
         self._variance = np.full((2, *shape), np.inf, np.float32)
         self._systematic = np.zeros((2, *shape), np.float32)
+        self._camera = np.full((2, *shape), -1, np.int32)  # index in `_cameras_m` of the last measurement
+        self._cameras_m: list[NDArray[np.float64]] = []
         self._colour = np.zeros((*shape, 4), np.float32)
         self._lateral_m: list[float] = [0.0, 0.0]  # sum and number of the lateral errors of the patches
 
@@ -87,7 +93,11 @@ class ElevationMapper:
         if successor is not None and inherited is not None:
             height = height.copy()
             _remove_propagated(*patch[:5], *successor[:6], inherited, GATE, height)
-        _fuse_cells(patch.row, patch.col, height, *patch[3:5], GATE, self._height, self._variance, self._systematic)
+        camera = -1 if patch.camera_m is None else len(self._cameras_m)
+        if patch.camera_m is not None:
+            self._cameras_m.append(patch.camera_m)
+        layers = self._height, self._variance, self._systematic, self._camera
+        _fuse_cells(patch.row, patch.col, height, *patch[3:5], camera, GATE, *layers)
 
     def add_colours(self, patch: HeightPatch, rgb: Image, gain: Map) -> None:
         """Adds an image to the orthomosaic, a weighted mean of images whose weights decrease from their centres.
@@ -111,8 +121,30 @@ class ElevationMapper:
         first, second = (np.take_along_axis(self._height, which, 0)[0] for which in (chosen, 1 - chosen))
         return np.where(_isolated(first, second), 1 - chosen, chosen)
 
+    def _drop_hidden(self) -> None:
+        """Drops the hypotheses that their cameras cannot have seen.
+
+        The surface consists of the chosen hypotheses in large connected groups. Hypotheses in small groups are checked,
+        those that were chosen and the others.
+        """
+        chosen, surface = self._choice(), None
+        for which in (chosen, 1 - chosen):
+            height, depth_m2, systematic, camera = (
+                np.take_along_axis(layers, which, 0)[0]
+                for layers in (self._height, self._variance, self._systematic, self._camera)
+            )
+            variance = depth_m2 + systematic + self.grid.cell_m**2
+            large = main_surface(height, variance)
+            surface = surface or (np.where(large, height, np.float32(np.nan)), variance)
+            island = np.where(large, np.float32(np.nan), height)
+            dropped = hidden(island, camera, np.array(self._cameras_m), surface, self.grid)[None]
+            for layers, unknown in ((self._height, np.nan), (self._variance, np.inf)):
+                kept = np.take_along_axis(layers, which, 0)
+                np.put_along_axis(layers, which, np.where(dropped, np.float32(unknown), kept), 0)
+
     def result(self) -> ElevationMap:
         """Returns the map: the chosen height of each cell, its standard deviation and the orthomosaic."""
+        self._drop_hidden()
         chosen, gap = self._choice(), self._height.max(axis=0) - self._height.min(axis=0)
         height, variance, systematic = (
             np.take_along_axis(layers, chosen, 0)[0] for layers in (self._height, self._variance, self._systematic)
@@ -251,7 +283,9 @@ def _remove_propagated(
 
 
 @njit(cache=True, nogil=True)
-def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances, systematics):
+def _fuse_cells(
+    row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
+):  # fmt: skip
     """Fuses each height of a height patch (rows, cols) with one hypothesis of its cell, in place.
 
     The hypothesis is the one that fits best within the gate. A height that fits none becomes a hypothesis itself. If
@@ -276,12 +310,13 @@ def _fuse_cells(row, col, height, variance, systematic, gate, heights, variances
                 worse = 0 if variances[0, a, b] >= variances[1, a, b] else 1
                 if r < variances[worse, a, b]:
                     heights[worse, a, b], variances[worse, a, b], systematics[worse, a, b] = z, r, q
+                    cameras[worse, a, b] = camera
                 continue
             p = variances[best, a, b]
             gain = p / (p + r)
             heights[best, a, b] += gain * (z - heights[best, a, b])
             systematics[best, a, b] += gain * (q - systematics[best, a, b])
-            variances[best, a, b] = p * r / (p + r)
+            variances[best, a, b], cameras[best, a, b] = p * r / (p + r), camera
 
 
 @njit(cache=True, nogil=True)

@@ -35,6 +35,7 @@ class HeightPatch(NamedTuple):
             common to all views.
         pixel: (rows, cols, 2) position (u, v) of the cell centre in the image [px].
         lateral_m: standard deviation of the lateral error at the mean depth of the depth map [m].
+        camera_m: (3,) position of the camera in the frame of the map [m]; None if it is not known.
     """
 
     row: int
@@ -44,6 +45,7 @@ class HeightPatch(NamedTuple):
     systematic_m2: Map
     pixel: Map
     lateral_m: float
+    camera_m: Array | None = None
 
 
 def rasterise(
@@ -79,7 +81,7 @@ def rasterise(
         return None
     row, col, rows, cols = window
     lateral = LATERAL_SIGMA_PX * float(np.nanmean(depth_map.depth_m)) / rig.focal_px
-    patch = HeightPatch(row, col, *_empty_layers(rows, cols), lateral)
+    patch = HeightPatch(row, col, *_empty_layers(rows, cols), lateral, world_from_camera[:3, 3].copy())
     rotation = np.kron(np.eye(2), world_from_camera[:3, :3])
     view = _ViewGeometry(
         world_from_camera[:3, 3] - [grid.west_m, grid.north_m, 0],
