@@ -83,7 +83,7 @@ def _large_groups(height, variance, gate, largest):
     """Compiled kernel of `main_surface`: groups are filled until they exceed `largest` cells or meet a large one."""
     rows, cols = height.shape
     state = np.zeros((rows, cols), np.int8)  # 0: not visited, 1: in a large group, 2: in a small one, 3: in this group
-    group = np.empty((largest + 1, 2), np.int64)
+    group = np.empty((largest, 2), np.int64)
     for row in range(rows):
         for col in range(cols):
             if state[row, col] != 0 or np.isnan(height[row, col]):
@@ -98,7 +98,7 @@ def _large_groups(height, variance, gate, largest):
                         other = height[i, j] - height[r, c]
                         if state[i, j] == 3 or not other * other < gate * (variance[i, j] + variance[r, c]):
                             continue
-                        large = large or state[i, j] == 1 or size > largest
+                        large = large or state[i, j] == 1 or size >= largest
                         if state[i, j] == 0 and not large:
                             group[size, 0], group[size, 1], state[i, j] = i, j, 3
                             size += 1
