@@ -12,7 +12,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig, SurveyResult
 
-_MOST_CELLS = 2.5e7  # the cells of a map with more cells are enlarged; at 117 bytes per cell it takes 2.9 GB
+_MOST_CELLS = 2.5e7  # the cells of a map with more cells are enlarged; at 125 bytes per cell it takes 3.1 GB
 _CELL_PX = 3.0  # side of a map cell in pixels at the median depth, so that several disparities support each height
 _TILE_CELLS = 1024  # side of a tile; at 100 bytes per cell it takes 100 MB while it is built
 _MARGIN = 0.25  # fraction of its size by which an image on the floor may be larger than at the median depth
