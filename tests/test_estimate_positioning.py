@@ -592,6 +592,19 @@ def test_keyframes_outside_the_window_are_discarded():
     assert camera.discarded == set(range(4, 15))  # tracks 2 to 5 of 8, but keyframe 3
 
 
+def test_when_a_link_is_measured_the_covariance_of_its_prediction_is_known():
+    smallest = []
+
+    class Watched(Script):
+        def measure_motions(self, node, others):
+            smallest.extend(np.linalg.eigvalsh(node.motion_cov(other))[0] for other in others)
+            return super().measure_motions(node, others)
+
+    result = navigated(Watched(line(0.3 * np.arange(8))), [1] * 4 + [2] * 4).finish()
+    assert len(smallest) >= 7 and min(smallest) > 0
+    assert 1 <= result.quality.independent_errors <= 7
+
+
 def test_frame_to_frame_motion_bridges_a_failed_link():
     """Keyframe 3 cannot be matched: one link bridges it, and the F2F motion includes the DVL."""
     poses = line(0.3 * np.arange(6))

@@ -117,6 +117,7 @@ def test_a_pit_that_the_cameras_see_is_kept():
         _, depth = render_view(floor, RIG, pose, samples=1)
         variance = np.full(depth.shape, 1e-6, np.float32)
         found = surface.rasterise(DepthMap(depth.astype(np.float32), variance), pose, np.zeros((6, 6)), RIG, GRID)
+        np.testing.assert_array_equal(found.camera_m, pose[:3, 3])
         mapper.fuse(found)
         unchecked.fuse(found._replace(camera_m=None))
     heights = mapper.result().height_m

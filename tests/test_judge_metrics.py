@@ -108,6 +108,11 @@ def test_the_interval_of_the_mean_nees_holds_99_percent_of_consistent_surveys():
         assert [np.mean(drawn < low), np.mean(drawn > high)] == pytest.approx([0.005] * 2, abs=0.0015)
     assert nees_interval(1e6) == pytest.approx([3, 3], abs=0.01)
     assert nees_interval(None) is None
+    result = copy.copy(RESULT)
+    for k, expected in ((7, nees_interval(7)), (None, (None, None))):
+        result.quality = RESULT.quality._replace(independent_errors=k)
+        metrics = consistency_metrics(result, None, TRUTH)
+        assert (metrics["nees_position_low"], metrics["nees_position_high"]) == expected
 
 
 def test_keyframes_without_a_covariance_are_left_out_of_consistency():

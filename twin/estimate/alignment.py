@@ -94,17 +94,22 @@ def align(
         del solution
         solution = window.optimise(state, _MAX_ITERATIONS)
     link_chi2 = _mean_chi2(window.links, solution.chi2[0])
-    rng = np.random.default_rng(0)
-    draws = np.array([solution.sample(rng)[1:, 3:] for _ in range(_DRAWS)]) if marginals_of is None else None
+    draws = None if marginals_of is not None else _draw_positions(solution)  # `_marginals` overwrites the factor
     covs = _marginals(solution, marginals_of, index_of)
     independent = None if draws is None else _independent_errors(draws, covs[1:, 3:, 3:])
     return AlignmentResult(solution.state.poses, covs, dropped, link_chi2, solution.converged, independent)
 
 
+def _draw_positions(solution: Solution) -> Array:
+    """Returns errors (`_DRAWS`, n - 1, 3) of the positions of all nodes but the first, the reference [m]."""
+    rng = np.random.default_rng(0)
+    return np.array([solution.sample(rng)[1:, 3:] for _ in range(_DRAWS)])
+
+
 def _independent_errors(draws: Array, covs: Array) -> float | None:
     """Returns the number of independent position errors whose mean NEES varies as much as that of all nodes.
 
-    The mean of 3 k squared independent standard normal numbers, times 3, has the variance 6 / k. The errors of the
+    The sum of 3 k squared independent standard normal numbers, divided by k, has the variance 6 / k. The errors of the
     nodes of a survey are correlated, so k is much smaller than the number of nodes.
 
     Args:
