@@ -6,8 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -43,7 +44,7 @@ class ThrustAllocation(NamedTuple):
         return allocate_wrench(self, wrench)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def allocate_wrench(allocation, wrench):
     """Compiled kernel of `ThrustAllocation.commands`."""
     thrusts, table = allocation.thrusts_from_wrench @ wrench, allocation.thrust_table_n

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter1d
 
 from controllers.segments import Reference
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -86,7 +86,7 @@ def surface_above_floor(
     return CameraSurface(RectBivariateSpline(x, y, coarse.T + altitude_m))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _limit_slope(height_m, step_y_m, step_x_m, max_slope):
     """Returns heights raised as little as possible, so that the slope to each of 8 neighbours is at most `max_slope`.
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from controllers.allocation import ThrustAllocation, allocate_wrench
 from controllers.segments import Reference
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -34,7 +34,7 @@ class HullModel(NamedTuple):
     quadratic_drag: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
     """Returns the wrench (6,) that sustains a body velocity (3,) in still water against drag and the Munk moment.
 
@@ -75,7 +75,7 @@ def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
     return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), lever_arm_m))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
     """Rotates a lever arm (3,) [m] from a level body at the given yaw [rad] to the world."""
     c, s = np.cos(yaw), np.sin(yaw)
@@ -141,7 +141,7 @@ class PoseController:
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def control_thrusters(controller, pose, twist, position, velocity, acceleration, yaw):
     """Compiled kernel of `PoseController.command`; position, velocity, acceleration and yaw are the reference."""
     wrench, error = _wrench(
@@ -152,7 +152,7 @@ def control_thrusters(controller, pose, twist, position, velocity, acceleration,
     return commands
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, integral):
     """Returns the wrench (6,) [moment, force] in the body, and the pose error (6,) that is integrated.
 
@@ -172,7 +172,7 @@ def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, int
     return wrench, integrated_error
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _integrate(integral, gain, error, saturated):
     """Updates the integral in place within INTEGRAL_LIMIT; stops its growth while a thruster saturates: anti-windup."""
     for k in range(6):
@@ -181,7 +181,7 @@ def _integrate(integral, gain, error, saturated):
             integral[k] = updated
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _rotate_to_body(pose, vector):
     """Rotates a vector (3,) from the world to the body."""
     result = np.zeros(3)
@@ -191,7 +191,7 @@ def _rotate_to_body(pose, vector):
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pose_error(pose, position, yaw):
     """Returns the motion (6,) from the pose to a level reference, [rotation, translation] in the body [rad, m]."""
     c, s = np.cos(yaw), np.sin(yaw)

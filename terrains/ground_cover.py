@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from terrains.lattice_noise import Table, cells, fractal_noise, lattice_table, value_noise
+from twin.kernels import kernel
 
 GRAINS, STONES, CRACKS, POLYPS, BLADES, BURROWS, SHELLS = range(7)
 Colour = tuple[int, int, int]
@@ -99,7 +99,7 @@ def _ramp(cover: Cover) -> NDArray[np.float32]:
     return np.stack([np.interp(tones, (0.0, 0.5, 1.0), band) for band in bands], axis=1).astype(np.float32)
 
 
-@njit(cache=True)
+@kernel
 def _paint(
     material: NDArray[np.uint8],
     tone: NDArray[np.uint8],
@@ -137,7 +137,7 @@ def _paint(
     return colour
 
 
-@njit(cache=True)
+@kernel
 def _structure(kind: int, x: float, y: float, size: float, table: Table) -> float:  # pragma: no cover (compiled)
     """Returns the change along the ramp, about -1 to 1, due to a structure at the point (x, y) [m].
 
@@ -177,7 +177,7 @@ def _structure(kind: int, x: float, y: float, size: float, table: Table) -> floa
     return (0.9 if own < 0.3 else -0.5) * _soft(0.5 * radius - nearest, 0.02) if own < 0.5 else 0.0
 
 
-@njit(cache=True)
+@kernel
 def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (compiled)
     """Returns the change along the ramp at (x, y) due to crossing blades of seagrass in three layers, dark in between.
 
@@ -194,7 +194,7 @@ def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (com
     return min(tone, 0.6)
 
 
-@njit(cache=True)
+@kernel
 def _soft(inside: float, width: float) -> float:  # pragma: no cover (compiled)
     """Returns 0 outside and 1 inside a spot, from the distance `inside` its edge and the `width` of the soft edge."""
     return min(max(inside / width + 0.5, 0.0), 1.0)

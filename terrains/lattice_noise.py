@@ -6,8 +6,9 @@ Cellular noise: Worley 1996, A cellular texture basis function. The functions ar
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 #: (LATTICE, LATTICE) float32 uniform random numbers, 0 to 1. All noise is periodic with LATTICE lattice spacings.
 Table = NDArray[np.float32]
@@ -20,7 +21,7 @@ def lattice_table(rng: np.random.Generator) -> Table:
     return rng.random((LATTICE, LATTICE), np.float32)
 
 
-@njit(cache=True)
+@kernel
 def value_noise(x: float, y: float, table: Table, layer: int) -> float:  # pragma: no cover (compiled)
     """Returns smooth noise, 0 to 1: the numbers at the points of the lattice, interpolated between the points.
 
@@ -39,7 +40,7 @@ def value_noise(x: float, y: float, table: Table, layer: int) -> float:  # pragm
     return (1.0 - v) * (a + u * (b - a)) + v * (c + u * (d - c))
 
 
-@njit(cache=True, inline="always")
+@kernel(inline="always")
 def fractal_noise(x: float, y: float, octaves: int, table: Table, layer: int) -> float:  # pragma: no cover (compiled)
     """Returns a sum of octaves of value noise, about -1 to 1 with a mean of about 0.
 
@@ -55,7 +56,7 @@ def fractal_noise(x: float, y: float, octaves: int, table: Table, layer: int) ->
     return _octaves(x, y, np.int64(octaves), table, np.int64(layer))  # pyright: ignore[reportArgumentType]
 
 
-@njit(cache=True)
+@kernel
 def _octaves(x: float, y: float, octaves: int, table: Table, layer: int) -> float:  # pragma: no cover (compiled)
     """Compiled loop of `fractal_noise`."""
     total, amplitude = 0.0, 1.0
@@ -65,7 +66,7 @@ def _octaves(x: float, y: float, octaves: int, table: Table, layer: int) -> floa
     return total
 
 
-@njit(cache=True)
+@kernel
 def cells(x: float, y: float, table: Table, layer: int) -> tuple[float, float, float]:  # pragma: no cover (compiled)
     """Returns the distances to the nearest and second nearest point of cellular noise, and a random number.
 

@@ -8,8 +8,9 @@ difference through the overlap (Efros & Freeman 2001, Image quilting for texture
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 BLOCK_FRACTION = 5  #: shorter side of the photo divided by the side of a block
 OVERLAP_FRACTION = 4  #: side of a block divided by the overlap of neighbouring blocks
@@ -83,7 +84,7 @@ def quilt(photo: NDArray[np.uint8], shape: tuple[int, int], rng: np.random.Gener
     return np.ascontiguousarray(texture[:rows, :cols])
 
 
-@njit(cache=True)
+@kernel
 def _lay(
     texture: NDArray[np.uint8],
     photo: NDArray[np.uint8],
@@ -124,7 +125,7 @@ def _lay(
             _join(target, photo[r : r + side, c : c + side], overlap, i > 0, j > 0)
 
 
-@njit(cache=True)
+@kernel
 def _difference(
     target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
 ) -> float:  # pragma: no cover (compiled)
@@ -144,14 +145,14 @@ def _difference(
     return total
 
 
-@njit(cache=True)
+@kernel
 def _squared(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:  # pragma: no cover (compiled)
     """Returns the squared distance of two colours."""
     d0, d1, d2 = float(a[0]) - b[0], float(a[1]) - b[1], float(a[2]) - b[2]
     return d0 * d0 + d1 * d1 + d2 * d2
 
 
-@njit(cache=True)
+@kernel
 def _join(
     target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
 ) -> None:  # pragma: no cover (compiled)
@@ -180,7 +181,7 @@ def _join(
                 target[r, c, k] = np.uint8(round(weight * block[r, c, k] + (1.0 - weight) * target[r, c, k]))
 
 
-@njit(cache=True)
+@kernel
 def _cheapest_path(cost: NDArray[np.float64]) -> NDArray[np.float64]:  # pragma: no cover (compiled)
     """Returns the connected path through all rows of costs (n, m) with the least sum: its column (n,) in each row."""
     n, m = cost.shape

@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 SHARPNESS = 4  #: exponent of the weights of the two horizontal projections
 #: Cosines of the slope from which on walls have a texture of their own (50 deg), and no other (65 deg).
@@ -95,7 +96,7 @@ def _cell_normals(height_m: NDArray[np.float32], spacing_m: float) -> NDArray[np
     return normals / np.linalg.norm(normals, axis=2, keepdims=True)
 
 
-@njit(cache=True)
+@kernel
 def _weights(
     normals: NDArray[np.float32], allowed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:  # pragma: no cover (compiled)
@@ -128,7 +129,7 @@ def _weights(
     return number, weights[:n].copy()
 
 
-@njit(cache=True)
+@kernel
 def _corner_weights(
     normals: NDArray[np.float32], r: int, c: int, i: int, j: int, weight: NDArray[np.float32]
 ) -> None:  # pragma: no cover (compiled)

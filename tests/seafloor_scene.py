@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.records import StereoRig
+from twin.kernels import kernel
 
 
 class Seafloor(NamedTuple):
@@ -97,7 +97,7 @@ def digitise(image: np.ndarray, rng: np.random.Generator, noise: float) -> np.nd
     return np.clip(np.round(image + rng.normal(size=image.shape) * noise), 0, 255).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _height(z, spacing, west, south, x, y):
     """Returns the bilinear height at one point [m]."""
     c = min(max((x - west) / spacing, 0.0), z.shape[1] - 1.000001)
@@ -107,7 +107,7 @@ def _height(z, spacing, west, south, x, y):
     return (1 - a) * ((1 - b) * z[i, j] + b * z[i, j + 1]) + a * ((1 - b) * z[i + 1, j] + b * z[i + 1, j + 1])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _heights(z, spacing, west, south, x, y):
     """Returns the bilinear heights at points (n,) [m]."""
     out = np.empty(x.size)
@@ -116,7 +116,7 @@ def _heights(z, spacing, west, south, x, y):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _colour(texture, px, x, y):
     """Returns the bilinear grey level of the tiled texture at one point."""
     n, m = texture.shape
@@ -129,7 +129,7 @@ def _colour(texture, px, x, y):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _crossing(z, spacing, west, south, position, dx, dy, dz, low, high):
     """Returns the ray parameter between `low` (above the floor) and `high` (below) at the floor: regula falsi."""
     x, y = position[0] + low * dx, position[1] + low * dy
@@ -150,7 +150,7 @@ def _crossing(z, spacing, west, south, position, dx, dy, dz, low, high):
     return t
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cast(z, spacing, west, south, texture, px, rotation, position, focal, width, height, samples):
     """Renders image and depth (H, W): ray marching, then regula falsi; depth is NaN unless samples is 1."""
     image = np.zeros((height, width), np.float32)

@@ -194,7 +194,7 @@ def parameters(node):
 
 def test_no_function_outside_compiled_kernels_has_more_than_seven_parameters():
     """The parameters of a command are the options of the command line, however many."""
-    exempt = ("njit", "app.command")
+    exempt = ("kernel", "app.command")
     wide = [
         f"{dotted(path)}.{node.name}"
         for path in modules()

@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from terrains.objects.mesh import Mesh
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -54,7 +54,7 @@ def parts_of(mesh: Mesh) -> Parts:
     return parts
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _bound(vertices, faces, centre_m, half_m, axis, cos_sin, behind_m):
     """Fills the fields of `Parts` for the vertices (k, 3) and triangles (m, 3) of a mesh."""
     normal = np.empty((PART_FACES, 3))
@@ -87,7 +87,7 @@ def _bound(vertices, faces, centre_m, half_m, axis, cos_sin, behind_m):
         behind_m[p] = behind if known else np.inf
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _normal(vertices, face):
     """Returns the unit normal x, y, z of a triangle, and whether the triangle is thin."""
     a, b, c = vertices[face[0]], vertices[face[1]], vertices[face[2]]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
+from twin.kernels import kernel
 
 
 class HeightField(NamedTuple):
@@ -69,7 +69,7 @@ def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array)
     return _cast_directions(field, np.ascontiguousarray(poses, np.float64), rig.normalised(pixels))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cast_directions(field, poses, directions):
     """Compiled kernel of `cast_pixels`; directions (m, 2) are normalised coordinates."""
     depth = np.empty((len(poses), len(directions)))
@@ -79,7 +79,7 @@ def _cast_directions(field, poses, directions):
     return depth
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cast_camera_ray(field, pose, a, b):
     """Returns the depth at which the ray through the normalised point (a, b) meets the floor; inf if it does not."""
     dx = pose[0, 0] * a + pose[0, 1] * b + pose[0, 2]
@@ -88,7 +88,7 @@ def cast_camera_ray(field, pose, a, b):
     return cast_ray(field, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cast_ray(field, ox, oy, oz, dx, dy, dz):
     """Returns the smallest t >= 0 at which the ray o + t d meets the floor; 0 if o lies below the floor.
 
@@ -126,7 +126,7 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
     return np.inf
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
     """Returns the least t in [start, end] where the ray meets the floor of a cell; inf if none, NaN if a corner is NaN.
 

@@ -11,8 +11,9 @@ centre of the top-left pixel.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ Array = NDArray[np.float64]
 BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def copy_into(target: Array, values: Array) -> None:
     """Assigns target[...] = values, both of the same shape (n,) or (n, m).
 
@@ -34,13 +35,13 @@ def copy_into(target: Array, values: Array) -> None:
                 target[i, k] = values[i, k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def skew(v: Array) -> Array:
     """Returns the skew-symmetric matrix (3, 3) of a vector (3,): skew(v) @ x is the cross product of v and x."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pose(rotation: Array, position: Array) -> Array:
     """Returns the pose (4, 4) with a rotation (3, 3) and a position (3,) [m]."""
     result = np.zeros((4, 4))
@@ -50,7 +51,7 @@ def pose(rotation: Array, position: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def inverse(a_from_b: Array) -> Array:
     """Returns b_from_a (4, 4). The rotation is inverted by transposition."""
     result = np.zeros((4, 4))
@@ -62,7 +63,7 @@ def inverse(a_from_b: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def compose(a_from_b: Array, b_from_c: Array) -> Array:
     """Returns a_from_c (4, 4), the product a_from_b @ b_from_c, without BLAS."""
     result = np.zeros((4, 4))
@@ -76,7 +77,7 @@ def compose(a_from_b: Array, b_from_c: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def transform_covariance(matrix: Array, cov: Array) -> Array:
     """Returns matrix @ cov @ matrix.T (6, 6), exactly symmetric, for a matrix (6, 6) and a symmetric cov (6, 6)."""
     half, result = np.empty((6, 6)), np.empty((6, 6))
@@ -95,7 +96,7 @@ def transform_covariance(matrix: Array, cov: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def product(a: Array, b: Array) -> Array:
     """Returns the product (n, k) of small matrices (n, m) and (m, k), without BLAS."""
     result = np.zeros((a.shape[0], b.shape[1]))
@@ -116,7 +117,7 @@ def nearest_rigid(matrices: Array) -> Array:
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _nearest_rigid(matrices):
     """Compiled kernel of `nearest_rigid` for matrices (n, 4, 4).
 
@@ -134,7 +135,7 @@ def _nearest_rigid(matrices):
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def so3_exp(w: Array) -> Array:
     """Returns the rotation matrix (3, 3) of a rotation vector (3,) [rad] by Rodrigues' formula.
 
@@ -149,7 +150,7 @@ def so3_exp(w: Array) -> Array:
     return _skew_polynomial(w, a, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _left_jacobian(w: Array) -> Array:
     """Returns the left Jacobian (3, 3) of SO(3) at a rotation vector (3,); `exp` multiplies the translation by it."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
@@ -161,7 +162,7 @@ def _left_jacobian(w: Array) -> Array:
     return _skew_polynomial(w, a, b)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _skew_polynomial(w: Array, a: float, b: float) -> Array:
     """Returns I + a K + b K^2 (3, 3) with K = skew(w) and K^2 = w w' - |w|^2 I."""
     x, y, z = w[0], w[1], w[2]
@@ -176,7 +177,7 @@ def _skew_polynomial(w: Array, a: float, b: float) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def so3_log(rotation: Array) -> Array:
     """Returns the rotation vector (3,) [rad] of a rotation matrix (3, 3), with an angle in [0, pi]."""
     w = np.empty(3)
@@ -200,7 +201,7 @@ def so3_log(rotation: Array) -> Array:
     return w
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def exp(motion: Array) -> Array:
     """Returns the pose (4, 4) that a constant twist (6,) [rotation, translation] (rad, m) reaches in unit time."""
     w, result = motion[:3], np.zeros((4, 4))
@@ -213,7 +214,7 @@ def exp(motion: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def log(a_from_b: Array) -> Array:
     """Returns the twist (6,) [rotation, translation] (rad, m) of a pose (4, 4), the inverse of `exp`."""
     w, result = so3_log(a_from_b[:3, :3]), np.zeros(6)
@@ -226,7 +227,7 @@ def log(a_from_b: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def log_derivative(motion: Array) -> Array:
     """Returns the inverse right Jacobian J (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
 
@@ -250,7 +251,7 @@ def log_derivative(motion: Array) -> Array:
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _inverse_jacobian_coefficient(angle2: float) -> tuple[float, float]:
     """Returns c = 1 / a^2 - cot(a / 2) / (2 a) and dc/d(a^2), given the squared rotation angle a^2 [rad^2]."""
     if angle2 < 1e-2:
@@ -264,7 +265,7 @@ def _inverse_jacobian_coefficient(angle2: float) -> tuple[float, float]:
     return 1.0 / angle2 - cot / (2.0 * angle), slope
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def adjoint(a_from_b: Array) -> Array:
     """Returns the adjoint Ad (6, 6) of a pose: a_from_b exp(m) = exp(Ad m) a_from_b for a twist m (6,) in frame b."""
     result = np.zeros((6, 6))
@@ -283,7 +284,7 @@ def transform(a_from_b: Array, points_b: Array) -> Array:
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
     """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
 
@@ -294,7 +295,7 @@ def transport_covariance(cov: Array, a_from_b: Array) -> Array:
     return transform_covariance(adjoint(inverse(a_from_b)), cov)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """Returns the rotation world_from_body (3, 3) of angles [rad]: yaw about z, pitch about y', roll about x''."""
     cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
@@ -308,7 +309,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rpy_from_rotation(rotation: Array) -> Array:
     """Returns roll, pitch, yaw (3,) [rad] of the rotation world_from_body (3, 3), the inverse of `rotation_from_rpy`.
 
@@ -321,7 +322,7 @@ def rpy_from_rotation(rotation: Array) -> Array:
     return np.array([np.arctan2(rotation[2, 1], rotation[2, 2]), pitch, np.arctan2(rotation[1, 0], rotation[0, 0])])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def wrap_angle(angle: Array) -> Array:
     """Returns angles wrapped to [-pi, pi) [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
@@ -344,7 +345,7 @@ def quaternion_xyzw(rotation: Array) -> Array:
     return quaternions_xyzw(np.asarray(rotation, np.float64)[None])[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def quaternions_xyzw(rotations: Array) -> Array:
     """Returns the quaternions [x, y, z, w] (n, 4) of rotation matrices (n, 3, 3), w >= 0.
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from twin.core.floor_rays import HeightField, cast_camera_ray, cast_ray, ray_grid
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
+from twin.kernels import kernel
 
 #: Columns of the grid of rays. A cell that the edge of the second image cuts is weighted by its fraction inside; the
 #: error of an overlap is therefore far smaller than the share of one cell.
@@ -40,7 +40,7 @@ def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRi
     return _overlaps(field, first, second, camera, rig.normalised(pixels), cell)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _overlaps(field, first, second, camera, directions, cell):
     """Compiled kernel of `image_overlap`; directions (m, 2) are the normalised coordinates of the rays."""
     result = np.empty(len(first))
@@ -59,7 +59,7 @@ def _overlaps(field, first, second, camera, directions, cell):
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _share_seen(field, pose, camera, cell, x, y, z, depth):
     """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
 

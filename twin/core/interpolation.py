@@ -6,10 +6,11 @@ Fractions are positions between two neighbouring samples, in [0, 1).
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from twin.kernels import kernel
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def bilinear(image, row, col, row_fraction, col_fraction):
     """Returns the image value interpolated bilinearly between pixels (row, col) and (row + 1, col + 1)."""
     top = image[row, col] * (1 - col_fraction) + image[row, col + 1] * col_fraction
@@ -17,7 +18,7 @@ def bilinear(image, row, col, row_fraction, col_fraction):
     return top * (1 - row_fraction) + bottom * row_fraction
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def catmull_rom(a, b, c, e, t):
     """Returns value and derivative of the Catmull-Rom cubic through samples a, b, c, e, at fraction t between b and c.
 
@@ -29,7 +30,7 @@ def catmull_rom(a, b, c, e, t):
     return b + t * (c1 + t * (c2 + t * c3)), c1 + t * (2 * c2 + 3 * t * c3)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def catmull_rom_weights(t):
     """Returns the weights of four samples in the Catmull-Rom cubic at the fraction t (float32) between the middle two.
 
@@ -41,7 +42,7 @@ def catmull_rom_weights(t):
     return first, second, one - first - second - last, last
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def bicubic_with_gradient(image, x, y):
     """Returns the value of an image at column x and row y, and its derivatives with respect to x and y.
 
@@ -64,7 +65,7 @@ def bicubic_with_gradient(image, x, y):
     return value, catmull_rom(ga, gb, gc, ge, t)[0], gy
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
+@kernel(forceinline=True, fastmath=True)
 def bspline_weights(s):
     """Returns the weights of four cubic B-spline coefficients at the fraction s (float32) between the middle two."""
     one, sixth = np.float32(1), np.float32(1 / 6)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -14,6 +13,7 @@ from twin.core.links import Link
 from twin.core.records import StereoRig
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
+from twin.kernels import kernel
 
 _SAME_SWATH = 2  # number of immediately preceding nodes to link, as in Negahdaripour & Madjidi 2003
 _LARGEST_OVERLAP = 0.95  # larger overlaps occur where the vehicle keeps station, not along a path
@@ -188,7 +188,7 @@ def _reach_m(points: Array, rig: StereoRig) -> float:
     return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _overlaps(world, position, poses, reach, view):
     """Compiled kernel of `overlaps`; returns the overlaps (n,).
 

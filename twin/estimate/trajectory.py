@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.kernels import kernel
 
 
 def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
@@ -41,7 +41,7 @@ def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distribute(world_from_start, f2f, misclosure, out):
     """Writes the poses `world_from_start` @ `f2f`, corrected for the twist `misclosure` (6,), to `out` (n, 4, 4).
 

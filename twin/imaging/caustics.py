@@ -21,7 +21,6 @@ import threading
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import j0
 
@@ -29,6 +28,7 @@ from twin.imaging.illumination import Illumination
 from twin.imaging.phase_function import PhaseTable, table_of
 from twin.imaging.water import Medium
 from twin.imaging.waves import angular_frequency, slope_density, slope_variance
+from twin.kernels import kernel
 from twin.scenario.model import SEA_WATER_INDEX
 
 Array = NDArray[np.float64]
@@ -196,7 +196,7 @@ def _packed(transfer: Array) -> Array:
     return transfer[rows, half]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _add_waves(east, north, cosine, sine, spectrum):
     """Adds waves to the spectrum of a complex image: real part slope towards east, imaginary part slope towards north.
 
@@ -223,7 +223,7 @@ def _add_waves(east, north, cosine, sine, spectrum):
             opposite[k, 1] += b.real - a.imag
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
     """Traces one vertical ray per cell through the surface; adds each to four cells of `light` with bilinear weights.
 

@@ -11,7 +11,6 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.imaging.illumination import Daylight
@@ -20,6 +19,7 @@ from twin.imaging.phase_function import Scatterer, table_of
 from twin.imaging.spread import Absorbed
 from twin.imaging.sun_sky import SunSky
 from twin.imaging.water import Medium
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -151,7 +151,7 @@ class DaylightVeil:
         return out
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def _add_veil(terms, ray, towards_sun, fade, light, out):
     """Fills `out` with the sum of `light` and the radiance of the veil, see `DaylightVeil.added_to`.
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -74,7 +75,7 @@ class Facets:
         return FacetView(self._normals, origin.astype(np.int32), grid.astype(np.float32), camera_from_world)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _stored_normals(height, spacing):
     """Returns the stored normals (rows, cols, 2) int32 of the triangles of a height grid (rows + 1, cols + 1)."""
     rows, cols = height.shape[0] - 1, height.shape[1] - 1
@@ -88,7 +89,7 @@ def _stored_normals(height, spacing):
     return stored
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _store(rise_east, rise_north, spacing):
     """Returns the stored normal (x, y, z) of a triangle, with x east and y north.
 

@@ -18,7 +18,6 @@ from typing import NamedTuple, TypeAlias
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
@@ -27,6 +26,7 @@ from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.spread import NODES_M, Absorbed, camera_mixture, over_path
 from twin.imaging.water import Medium
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Radiance: TypeAlias = NDArray[np.float32]
@@ -284,7 +284,7 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
     return [np.ascontiguousarray(np.clip(WIDENING * np.log2(one), 0.0, 1.0), np.float32) for one in secants]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
     """Fills `plane` and `place` with the results of `ForwardScatter.plane`.
 
@@ -312,7 +312,7 @@ def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
             plane[v, u], place[v, u] = z, steps * near / (near + scale)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def _weigh(image, place, table, widening, wider):
     """Multiplies one level by its weights and adds the wider levels, in place.
 
@@ -342,7 +342,7 @@ def _weigh(image, place, table, widening, wider):
             filled[3 * u + 2] = filled[3 * u + 2] * blue + added[3 * u + 2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def _add_upsampled(small, light, first, end):
     """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows `first` to `end` - 1 of `light` (H, 3 W).
 

@@ -16,7 +16,6 @@ from functools import lru_cache
 from typing import TypeAlias
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.imaging.lamps import LightSources, beam_share
@@ -24,6 +23,7 @@ from twin.imaging.phase_function import phase_at
 from twin.imaging.shading import RANGE_SCALE_M
 from twin.imaging.spread import LAMP_SIGMA_RAD, NODES_M, Absorbed, Receiver, lamp_mixture, over_path, ring_shares
 from twin.imaging.water import Medium
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Beam: TypeAlias = tuple[tuple[float, ...], ...]
@@ -175,7 +175,7 @@ def _on_rings(beam: Beam) -> Array:
     return mean @ ring_shares(edges, LAMP_SIGMA_RAD)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"arcp", "contract"})
+@kernel(error_model="numpy", fastmath={"arcp", "contract"})
 def _from_table(points, position, axis, strength, table, lux, from_lamp):
     """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
 

@@ -23,13 +23,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
 from twin.imaging.bands import CENTRE_NM
 from twin.imaging.port import pinhole
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 from twin.scenario.model import LensConfig, Scenario, SensorConfig
 
 Array = NDArray[np.float64]
@@ -247,28 +247,28 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
     return whole.astype(np.int64) - 1 - np.arange(n), np.ascontiguousarray(np.moveaxis(cubic, 0, 2), np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _split_rows(light, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
     for v in range(first, end):
         _split_row(light[v], out[v, 0], out[v, 1], out[v, 2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_rows(bands, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, 3 W) from `bands` (H, 3, W)."""
     for v in range(first, end):
         _join_row(bands[v, 0], bands[v, 1], bands[v, 2], out[v])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _split_row(row, red, green, blue):
     """Copies R, G, B, which alternate in `row` (3 W,), to one array (W,) each."""
     for u in range(red.size):
         red[u], green[u], blue[u] = row[3 * u], row[3 * u + 1], row[3 * u + 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join_row(red, green, blue, row):
     """Fills `row` (3 W,) with alternating R, G, B, at least 0."""
     zero = np.float32(0.0)
@@ -276,7 +276,7 @@ def _join_row(red, green, blue, row):
         row[3 * u], row[3 * u + 1], row[3 * u + 2] = max(red[u], zero), max(green[u], zero), max(blue[u], zero)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _convolve(light, down, across, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
 
@@ -310,21 +310,21 @@ def _convolve(light, down, across, out, first, end):
                 _add_across(wide, across[band, i], filled, i == 0)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _weigh_line(values, weight, out):
     """Fills `out` (n,) with `values` (n,) times a weight."""
     for k in range(out.size):
         out[k] = weight * values[k]
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _add_pairs(before, after, weight, earlier, later, other_weight, out):
     """Adds two pairs of filter taps to `out` (n,): the sum of each pair of values (n,), times its weight."""
     for k in range(out.size):
         out[k] += weight * (before[k] + after[k]) + other_weight * (earlier[k] + later[k])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _add_across(wide, weights, out, is_first):
     """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,).
 
@@ -341,7 +341,7 @@ def _add_across(wide, weights, out, is_first):
         out[k] += w0 * e[k] + near + (w3 * (b[k] + h[k]) + w4 * (a[k] + i[k]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _magnify(light, runs, across, lines, down, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
 
@@ -367,14 +367,14 @@ def _magnify(light, runs, across, lines, down, out, first, end):
         _join_row(filled[0], filled[1], filled[2], out[v])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _weighted_sum(a, b, c, d, of_a, of_b, of_c, of_d, out):
     """Fills `out` (n,) with the weighted sum of four arrays (n,)."""
     for k in range(out.size):
         out[k] = of_a * a[k] + of_b * b[k] + of_c * c[k] + of_d * d[k]
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
     """Fills `out` (n,) with sums of TAPS consecutive `values` (n + TAPS - 1,), weighted by the arrays `of_...` (n,)."""
     second, third, fourth = values[1:], values[2:], values[3:]
@@ -383,7 +383,7 @@ def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
         out[k] = left + of_third[k] * third[k] + of_fourth[k] * fourth[k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _defocus(light, near, scale, focus, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
 
@@ -409,7 +409,7 @@ def _defocus(light, near, scale, focus, out, first, end):
             _gather(light, v, u, wide[3 * u], rows, width, out[v, 3 * u : 3 * u + 3])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _defocus_row(above, here, below, diameter, out):
     """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel that has the moments of a disc.
 
@@ -429,7 +429,7 @@ def _defocus_row(above, here, below, diameter, out):
         out[k] = total + (np.float32(1.0) - np.float32(4.0) * (side + corner)) * b1[k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(light, v, u, diameter, rows, width, out):
     """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u).
 

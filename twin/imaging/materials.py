@@ -29,8 +29,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from twin.kernels import kernel
 from twin.scenario.model import TerrainConfig
 
 OPPOSITION, OPPOSITION_WIDTH = 0.5, 0.07  # B0 and h of Hapke's model: a floor of opaque grains
@@ -71,7 +71,7 @@ def material_of(terrain: TerrainConfig) -> Material | None:
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def reflectance(material, albedo, mu_i, mu_o, phase):
     """Returns the bidirectional reflectance [1/sr].
 
@@ -104,7 +104,7 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
     return (one - specular) * diffuse + specular * distribution / (mask_i * mask_o)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
     """Adds the light of one lamp that the floor reflects to the camera to `reflected`, for one row of W pixels.
 

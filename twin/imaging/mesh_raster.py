@@ -18,12 +18,12 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from terrains.objects.mesh import Mesh
 from terrains.objects.parts import PART_FACES, UNKNOWN, Parts
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -124,7 +124,7 @@ def draw_meshes(drawn: Sequence[DrawnMesh], projection: Projection, target: Targ
     in_row_bands(draw_rows, len(target.depth))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _draw(
     points, faces, colours, uv, parts, matrix, projection, depth, albedo, normal, label, places, number, closed, first,
     end,
@@ -188,7 +188,7 @@ def _draw(
                         places[v, u, t] = pa * uv[i, t] + pb * uv[j, t] + pc * uv[m, t]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _list_parts(parts, matrix, projection, window, closed, shown):
     """Writes the numbers of the parts that the image may show to `shown`; returns how many there are.
 
@@ -234,7 +234,7 @@ def _list_parts(parts, matrix, projection, window, closed, shown):
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _interval(row, centre, half):
     """Returns centre and half extent of a box along one axis of the camera.
 
@@ -246,7 +246,7 @@ def _interval(row, centre, half):
     return middle, abs(row[0]) * half[0] + abs(row[1]) * half[1] + abs(row[2]) * half[2]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _inverse(matrix):
     """Returns the inverse (3, 3) of the linear part of a map (3, 4); zeros if it mirrors."""
     a, b, c = matrix[0, :3], matrix[1, :3], matrix[2, :3]
@@ -256,7 +256,7 @@ def _inverse(matrix):
     return inverse / determinant if determinant > 0 else np.zeros((3, 3))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _project(points, matrix, projection, point, place):
     """Computes the points (3, n) in camera axes, and their `place` (3, n): column, row and 1 / depth or -depth.
 
@@ -283,7 +283,7 @@ def _project(points, matrix, projection, point, place):
             q[i] = -z[i]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _list_triangles(faces, start, end, place, window, closed, kept):
     """Writes to `kept` those of the triangles `start` to `end` - 1 that may cover pixel centres; returns their number.
 
@@ -301,7 +301,7 @@ def _list_triangles(faces, start, end, place, window, closed, kept):
     return n
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _rectangle(ua, va, ub, vb, uc, vc, window):
     """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle.
 
@@ -313,7 +313,7 @@ def _rectangle(ua, va, ub, vb, uc, vc, window):
     return u0, u1, v0, v1
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _list_pixels(
     faces, kept, n_kept, k, row, place, window, block_face, block_u, block_v, weight_b, weight_c, hits
 ):  # fmt: skip
@@ -357,7 +357,7 @@ def _list_pixels(
     return n_hits, k, row
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _normal(point, i, j, k, perspective):
     """Returns the unit normal of a triangle in camera axes, towards the camera.
 

@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from terrains.objects.texture_pyramid import Textures
 from twin.imaging.mesh_raster import Projection, Target
+from twin.kernels import kernel
 
 LEAST_COSINE = 0.1  #: smallest cosine of the angle between ray and normal; smaller ones count as this value
 
@@ -41,7 +41,7 @@ def paint_textures(target: Target, projection: Projection, surface: TexturedSurf
     _paint(*target, projection, *surface.textures, surface.of_label)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _paint(depth, albedo, normal, label, uv, projection, texels, levels, of_label):
     """Compiled kernel of `paint_textures`."""
     focal, cx, cy, _, perspective = projection
@@ -70,7 +70,7 @@ def _paint(depth, albedo, normal, label, uv, projection, texels, levels, of_labe
             albedo[v, u, 0], albedo[v, u, 1], albedo[v, u, 2] = np.uint8(r + 0.5), np.uint8(g + 0.5), np.uint8(b + 0.5)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline="always")
 def _sample(texels, level, across, down):
     """Returns red, green and blue of a level at texture coordinates, interpolated bilinearly; the texture repeats.
 

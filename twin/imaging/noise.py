@@ -5,9 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.special import ndtri
+
+from twin.kernels import kernel
 
 NORMAL_BITS = 12  # random bits that index the table of normal numbers, which fits into the first-level cache
 NORMAL_MASK = (1 << NORMAL_BITS) - 1
@@ -25,7 +26,7 @@ def seed_of(rng: np.random.Generator) -> np.uint64:
     return rng.integers(1 << 64, dtype=np.uint64)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def random_bits(seed, index):
     """Returns 64 random bits: element `index` of the sequence of `seed` (SplitMix64; Steele, Lea & Flood 2014)."""
     z = seed + index * np.uint64(0x9E3779B97F4A7C15)

@@ -13,7 +13,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
@@ -21,6 +20,7 @@ from twin.core.records import StereoRig
 from twin.imaging.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.object_view import Objects
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -195,7 +195,7 @@ def _looking(rotation: Array, position_m: Array) -> Array:
     return geometry.inverse(geometry.pose(rotation, position_m))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
     """Sets `lit` (H, W) to 0 in the rows `first` to `end` - 1 where the map `nearest` shows an object that occludes.
 
@@ -225,7 +225,7 @@ def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first
                 lit[v, u] = 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
     """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map.
 
@@ -257,7 +257,7 @@ def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
         bias[u] = 1 / (scale * share)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", forceinline=True)
+@kernel(error_model="numpy", forceinline=True)
 def _cosine(depth, x, y, normal, matrix, perspective):
     """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light.
 

@@ -6,7 +6,6 @@ from typing import Protocol
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import Exposure, Image, StereoRig
@@ -17,6 +16,7 @@ from twin.imaging.sensor import Array, AutoExposure, ExposureSetting, PlainSenso
 from twin.imaging.shutter import ExposureMotion
 from twin.imaging.tone import linear_of, tone
 from twin.imaging.white_balance import WhiteBalance
+from twin.kernels import kernel
 from twin.scenario.model import Scenario, SensorConfig
 
 BLACK_SHARE = 1 / 64  # black level as a fraction of the number of levels, so that dark noise is not clipped at zero
@@ -166,7 +166,7 @@ class PhotoSensor:
         return np.clip(255 * tone(white[:, None] * signal, self._sensor.tone_curve) + 0.5, 0, 255).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+@kernel(fastmath={"contract", "reassoc"})
 def _weighted_mean(light, weights):
     """Returns the mean (3,) of `light` (H, W, 3) times `weights` (H, W) over all pixels, for each band."""
     total = np.zeros(3)
@@ -181,7 +181,7 @@ def _weighted_mean(light, weights):
     return total / weights.size
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tone(raw, tones, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` with the 8-bit values of `raw` (H, W, 1 or 3), from the tone table."""
     _, width, bands = raw.shape

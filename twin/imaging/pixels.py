@@ -11,11 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.imaging.noise import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Raw = NDArray[np.uint16]
 
@@ -68,7 +68,7 @@ def read_out(
     return out[..., 0] if bayer else out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`.
 
@@ -105,7 +105,7 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
         _digitise(shot, read, response, out[v].reshape(-1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _normal_to_poisson(expected, shot):
     """Replaces standard normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
 
@@ -121,7 +121,7 @@ def _normal_to_poisson(expected, shot):
         shot[k] = max(np.floor(m + sigma * z + skew + half), zero)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _poisson(expected, uniform):
     """Returns a Poisson-distributed number of electrons of mean `expected`, by inversion, from 32 random bits."""
     uniform = (np.float64(uniform) + 0.5) * 2.0**-32
@@ -134,7 +134,7 @@ def _poisson(expected, uniform):
     return np.float32(count)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _digitise(electrons, noise, response, out):
     """Fills `out` (n,) with the digital numbers of `electrons` plus read noise; `noise` is standard normal."""
     full_well, read_noise, dn_per_e, black, top = response[3], response[4], response[5], response[6], response[7]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from twin.kernels import kernel
 
 LOG2_E = 1.4426950408889634
 LEAST = -126.0  # exponent of the smallest normal number in single precision; smaller exponents are clipped to it
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def two_to(t):
     """Returns 2^t for t from -126 to 127 with a relative error of 2e-7, exactly 1 at 0; a smaller t counts as -126.
 

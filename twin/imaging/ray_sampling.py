@@ -17,12 +17,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.imaging.resample import Positions, Radiance, spline_row
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
@@ -95,7 +95,7 @@ def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[flo
     return np.ascontiguousarray(motion.twist, np.float64), motion.readout_s, motion.focal_px, motion.principal_px
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _intersect(near, positions, parallax, motion, out, first, end):
     """Writes the intersections of rows `first` to `end` - 1 to `out`; `near` is the inverse depth."""
     rays, cells = np.empty((8, out.shape[1]), np.float32), np.empty(out.shape[1], np.int32)
@@ -105,7 +105,7 @@ def _intersect(near, positions, parallax, motion, out, first, end):
             out[v, u, 0], out[v, u, 1] = rays[0, u], rays[1, u]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_rays(source, near, positions, parallax, motion, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W); `near` is the inverse depth."""
     n = out.shape[1]
@@ -115,7 +115,7 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
         spline_row(source, rays[0], rays[1], weights, cells, out[v].reshape(-1))
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath={"contract"})
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
 
@@ -153,7 +153,7 @@ def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
         x[u], y[u] = base_x[u] + slope_x[u] * inverse[u], base_y[u] + slope_y[u] * inverse[u]
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath={"contract"})
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _move(pose, focal, cx, cy, rays):
     """Turns and shifts the rays of a row (8, w), see `_hit_row`, by a pose (4, 4)."""
     base_x, base_y, slope_x, slope_y = rays[2], rays[3], rays[4], rays[5]
@@ -171,7 +171,7 @@ def _move(pose, focal, cx, cy, rays):
         slope_x[u], slope_y[u] = shift_x - shift_z * along_x, shift_y - shift_z * along_y
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath={"contract"})
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_y, cells):
     """Computes the square of four pixel centres that each ray falls in, and the position in the square.
 
@@ -186,7 +186,7 @@ def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_
         cells[u] = np.int32(row) * n_cols + np.int32(col)
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy", fastmath={"contract"})
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _look_up(near, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
     """Replaces `inverse` by the inverse depth at the positions of the rays.
 

@@ -9,13 +9,13 @@ are interpolated: a prefilter makes the spline pass through the value of every p
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.interpolation import bspline_weights
 from twin.core.records import Image
 from twin.imaging.pixel_sum import sum_of_pixels
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Radiance = NDArray[np.float32]
 Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
@@ -49,7 +49,7 @@ def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_from(source, positions, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W)."""
     n = out.shape[1]
@@ -59,7 +59,7 @@ def _fill_from(source, positions, out, first, end):
         spline_row(source, x, y, weights, cells, out[v].reshape(-1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_rounded_from(source, positions, out, first, end):
     """Fills rows `first` to `end` - 1 of 8-bit `out` as `_fill_from` does; the values are rounded and clipped."""
     n = out.shape[1]
@@ -73,21 +73,21 @@ def _fill_rounded_from(source, positions, out, first, end):
             filled[k] = np.uint8(min(max(row[k] + np.float32(0.5), least), most))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _row_memory(n):
     """Returns uninitialised source columns and rows (n,) of n output pixels, `weights` and `cells` of `spline_row`."""
     x, y = np.empty(n, np.float32), np.empty(n, np.float32)
     return x, y, np.empty((8, n), np.float32), np.empty(n, np.int32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _unpack(place, x, y):
     """Copies columns and rows, which alternate in `place` (2 w,), to x and y (w,)."""
     for u in range(x.size):
         x[u], y[u] = place[2 * u], place[2 * u + 1]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def spline_row(source, x, y, weights, cells, out):
     """Fills `out` (3 w,) with the values of the cubic B-spline of an image (H, 3 W) at columns x and rows y (w,).
 
@@ -98,7 +98,7 @@ def spline_row(source, x, y, weights, cells, out):
     sum_row(source, x, y, weights, cells, out)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sum_row(source, x, y, weights, cells, out):
     """Fills `out` as `spline_row` does, with given weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
     rows, cols = source.shape[0], source.shape[1] // 3
@@ -111,14 +111,14 @@ def sum_row(source, x, y, weights, cells, out):
             _sum_at_border(source, x[u], y[u], weights, u, out)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _spline_weights(at, before, here, after, last):
     """Computes the B-spline weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
     for u in range(at.size):
         before[u], here[u], after[u], last[u] = bspline_weights(at[u] - np.floor(at[u]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _inner_cells(x, y, rows, cols, cells):
     """Computes the index of the first of the 4 x 4 pixels around each position; -1 if not all are inside the image."""
     zero, last_x, last_y = np.float32(0.0), np.float32(cols - 2), np.float32(rows - 2)
@@ -130,7 +130,7 @@ def _inner_cells(x, y, rows, cols, cells):
         cells[u] = cell if inside else -one
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_at_border(source, x, y, weights, u, out):
     """Fills pixel u of `out` with the result of `sum_of_pixels`; beyond the image, its border pixels are repeated."""
     rows, cols = source.shape[0], source.shape[1] // 3
@@ -145,14 +145,14 @@ def _sum_at_border(source, x, y, weights, u, out):
         out[3 * u + band] = total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _filter_columns(image, first, end):
     """Replaces columns `first` to `end` - 1 of an image (H, n) by cubic B-spline coefficients; borders are mirrored."""
     for start in range(first, end, BLOCK):
         _filter_block(image, start, min(start + BLOCK, end))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _filter_block(image, first, end):
     """Filters columns `first` to `end` - 1 of an image, see `_filter_columns`.
 
@@ -178,7 +178,7 @@ def _filter_block(image, first, end):
             here[k] = pole * (after[k] - np.float32(6.0) * here[k])
 
 
-@njit(cache=True, nogil=True, fastmath={"contract"})
+@kernel(fastmath={"contract"})
 def _filter_rows(image, first, end):
     """Replaces rows `first` to `end` - 1 of an image (H, 3 W) as `_filter_columns` does with columns.
 
@@ -206,7 +206,7 @@ def _filter_rows(image, first, end):
             row[k] = total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mirrored(at, size):
     """Returns the position of a pixel in an image that is mirrored at the centres of its first and last pixel."""
     period = max(2 * (size - 1), 1)

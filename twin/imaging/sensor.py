@@ -9,13 +9,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import Exposure, Image
 from twin.imaging.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shutter import ExposureMotion
+from twin.kernels import kernel
 from twin.scenario.model import ImagingConfig, Scenario
 
 Array = NDArray[np.float64]
@@ -155,7 +155,7 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
     return image
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mean(light):
     """Returns the mean (3,) of each band of an image (H, 3 W); each column is averaged first, then all columns."""
     columns, total = np.zeros(light.shape[1]), np.zeros(3)
@@ -168,7 +168,7 @@ def _mean(light):
     return total / (light.shape[1] // 3)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
     """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values.
 

@@ -8,12 +8,12 @@ colour images are accessed in memory order.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from twin.imaging.facets import UNIT
 from twin.imaging.materials import add_reflected
 from twin.imaging.pixel_sum import sum_of_entries
 from twin.imaging.powers import LOG2_E, two_to
+from twin.kernels import kernel
 
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
 RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
@@ -24,7 +24,7 @@ SAMPLES = np.array([(-7, -7), (-5, -1), (-3, 5), (-1, -5), (1, 1), (3, 7), (5, -
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 def shade(
     albedo, depth, focal, lamps, beams, soft, lamp_loss, scatter_table, sky, facets, lit, material, objects, out,
     other, kept, place, first, end,
@@ -125,7 +125,7 @@ def shade(
             _join(out[v], v, kept, place, range_m, backscatter, lookup, other[v])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, range_m, normal):
     """Computes range (W,) and normals (3, W) of the facets in a row of pixels.
 
@@ -183,7 +183,7 @@ def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, 
         normal[0, u], normal[1, u], normal[2, u] = _turned(turn, (total[0, i], total[1, i], total[2, i]))
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _cells_of_points(facets, floor, y, focal, shift, cells):
     """Fills `cells` (W,) with the number of the facet that each pixel of a row shows at a point within the pixel.
 
@@ -214,7 +214,7 @@ def _cells_of_points(facets, floor, y, focal, shift, cells):
         cells[u] = np.int32(r * per_row + (two * c + north_west) + first)  # exact: there are fewer than 2^24 facets
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _unpacked(stored):
     """Returns the normal (x, y, z) of a stored normal, see `facets`."""
     bits, one, two, unit = np.int32(16), np.float32(1), np.float32(2), np.float32(1) / np.float32(UNIT)
@@ -225,7 +225,7 @@ def _unpacked(stored):
     return two * a * per_n, two * b * per_n, (one - square) * per_n
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _turned(turn, vector):
     """Returns the product of a matrix (3, 3) and a vector (x, y, z)."""
     x, y, z = vector
@@ -236,7 +236,7 @@ def _turned(turn, vector):
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True, error_model="numpy")
+@kernel(forceinline=True, error_model="numpy")
 def _take_normals(objects, v, normal):
     """Replaces the unit normals (3, W) of row v by those of the objects, in the pixels that show objects."""
     normals, labels = objects
@@ -245,7 +245,7 @@ def _take_normals(objects, v, normal):
             normal[0, u], normal[1, u], normal[2, u] = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
     """Computes range (W,) and unit normals (3, W) of the floor in a row of pixels.
 
@@ -272,7 +272,7 @@ def _range_and_normal(depth, v, y, focal, range_m, normal):
         range_m[u] = z * np.sqrt(x * x + y * y + one) if z < far else far
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _illuminate(lamp, here, y, focal, normal, out):
     """Computes the illumination of the floor by a lamp for a row of pixels, without beam pattern and attenuation.
 
@@ -299,7 +299,7 @@ def _illuminate(lamp, here, y, focal, normal, out):
         out[2, u] = distance
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
     """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp.
 
@@ -321,7 +321,7 @@ def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
             light[c, u] += share[u] * colour * two_to(by_path * lamplight[2, u])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
     """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`.
 
@@ -355,7 +355,7 @@ def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
         light[2, u] += e * blue * b
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _attenuate(per_m, range_m, light):
     """Attenuates `light` (3, W) on the path from the floor to the camera, with the coefficients `per_m` (3,) [1/m]."""
     for c in range(3):
@@ -364,7 +364,7 @@ def _attenuate(per_m, range_m, light):
             light[c, u] *= two_to(by_range * range_m[u])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
     """Fills `share` (W,) with the daylight on the floor relative to its mean, for a row of pixels; 0 without floor."""
     half, one, zero, far = np.float32(0.5), np.float32(1.0), np.float32(0.0), np.float32(FAR_M)
@@ -391,7 +391,7 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
         share[u] *= south + to_north[u] * (north - south)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
     """Computes the cosine of the angle between floor normal and sun, and the depth in water, for a row of W pixels.
 
@@ -413,7 +413,7 @@ def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
         daylight[2, u] = max(deep, zero)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(sky, normal, range_m, daylight, light):
     """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera.
 
@@ -438,7 +438,7 @@ def _add_daylight(sky, normal, range_m, daylight, light):
             ) * two_to(slope * below + square * near * near + lost)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_rows(table, row, out):
     """Fills `out` (cols, ranges, 4) with the backscatter at the fractional row `row` of `table`, by interpolation."""
     j = min(int(row), table.shape[0] - 2)
@@ -448,7 +448,7 @@ def _interpolate_rows(table, row, out):
         filled[i] = lower[i] + w * (upper[i] - lower[i])
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_backscatter(table, range_m, lookup, backscatter):
     """Fills `backscatter` (3, W) for a row of pixels by bilinear interpolation of `table` in column and range."""
     cols, ranges, _ = table.shape
@@ -473,7 +473,7 @@ def _interpolate_backscatter(table, range_m, lookup, backscatter):
         backscatter[0, u], backscatter[1, u], backscatter[2, u] = sum_of_entries(flat, (i, j, k, m), shares)  # pyright: ignore
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, backscatter, out):
     """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus `backscatter`.
 
@@ -488,7 +488,7 @@ def _reflect(albedo, light, backscatter, out):
         filled[3 * u + 2] = light[2, u] * (reflected * np.float32(white[3 * u + 2])) + backscatter[2, u]
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
     """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept` of the floor's light (W, 3).
 

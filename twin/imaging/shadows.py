@@ -16,7 +16,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
@@ -25,6 +24,7 @@ from twin.imaging.facets import Heights
 from twin.imaging.illumination import Daylight
 from twin.imaging.optics import Depth, Lit
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -107,7 +107,7 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
     return cells, np.maximum.reduceat(np.maximum.reduceat(cells, starts[0], axis=0), starts[1], axis=1)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
     """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W).
 
@@ -133,7 +133,7 @@ def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
                     out[:, v, u] = OPEN
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _find_floor(here, y, focal, pose, there, east, north, up):
     """Fills the positions in the world of the points that the pixels of a row show.
 
@@ -157,7 +157,7 @@ def _find_floor(here, y, focal, pose, there, east, north, up):
         east[u], north[u], up[u] = z * (a * x + b) + c, z * (d * x + e) + f, z * (g * x + h) + i
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _find_cells(at, start, spacing, n, part, cells, stride, is_first):
     """Computes the grid cells of positions (w,) along an axis of n nodes, and the fractional positions in the cells.
 
@@ -171,7 +171,7 @@ def _find_cells(at, start, spacing, n, part, cells, stride, is_first):
         cells[u] = np.int32(cell) * np.int32(stride) + (np.int32(0) if is_first else cells[u])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _find_rises(height, cols, part_x, part_y, cells, to_east, to_north):
     """Computes the rise of the facet in each cell towards east and north [m per cell]."""
     for u in range(cells.size):
@@ -184,7 +184,7 @@ def _find_rises(height, cols, part_x, part_y, cells, to_east, to_north):
         to_north[u] = north_east - south_east if is_south_east else north_west - south_west
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _face_lamp(lamp, spacing, east, north, up, to_east, to_north, there, out):
     """Fills a row `out` (w,) with the marks of `_test_facing`, for one lamp at the position (3,) [m]."""
     x, y, z = lamp[0], lamp[1], lamp[2]
@@ -194,7 +194,7 @@ def _face_lamp(lamp, spacing, east, north, up, to_east, to_north, there, out):
         out[u] = tested if there[u] else CLEAR
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
     """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing.
 
@@ -228,7 +228,7 @@ def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
             mask[i] = min(mask[i], OPEN)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _any_dark(row):
     """Returns whether a row (w,) of marks has DARK pixels; without branches, so that the compiler can vectorize it."""
     least = OPEN
@@ -237,7 +237,7 @@ def _any_dark(row):
     return least == DARK
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline="always")
 def _point_of(depth, focal, pose, v, u):
     """Returns the point of the floor in pixel (v, u) in the world [m]."""
     z = np.float64(depth[v, u])
@@ -248,7 +248,7 @@ def _point_of(depth, focal, pose, v, u):
     return east, north, pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _cast(grid, depth, focal, pose, lamp, v, u):
     """Returns DARK if the floor occludes `lamp` (3,) as seen from the point in pixel (v, u), else CLEAR."""
     height, cell_tops, block_tops, west, south, spacing = grid
@@ -258,7 +258,7 @@ def _cast(grid, depth, focal, pose, lamp, v, u):
     return DARK if dark else CLEAR
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline="always")
 def _grid_steps(at, along, cell, size):
     """Prepares the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart.
 
@@ -272,7 +272,7 @@ def _grid_steps(at, along, cell, size):
     return step, ((cell + (along > 0)) * size - at) * per_along, step * size * per_along
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _occluded(height, cell_tops, block_tops, x, y, z, dx, dy, dz):
     """Returns whether the floor is above the ray from (x, y, z) to (x + dx, y + dy, z + dz); x, y in cells, z [m]."""
     rows, cols = block_tops.shape
@@ -295,7 +295,7 @@ def _occluded(height, cell_tops, block_tops, x, y, z, dx, dy, dz):
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end, block_r, block_c):
     """Returns the result of `_occluded` for the part of the ray from t to `end`, which lies in one block."""
     first_r, first_c = block_r * BLOCK_CELLS, block_c * BLOCK_CELLS
@@ -321,7 +321,7 @@ def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _above_in_cell(height, r, c, x, y, z, dx, dy, dz, t, leave):
     """Returns whether the floor of a cell is above the ray between t and `leave`.
 

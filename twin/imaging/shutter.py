@@ -26,12 +26,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.interpolation import catmull_rom_weights
 from twin.imaging.resample import sum_row
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Radiance = NDArray[np.float32]
@@ -105,7 +105,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
     return out
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _flow(x, y, near, scale, twist):
     """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth.
 
@@ -117,7 +117,7 @@ def _flow(x, y, near, scale, twist):
     return scale * du, scale * dv
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
     """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur.
 
@@ -143,7 +143,7 @@ def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
                 _average_along_path(flat, du, dv, u, v, width, height, 1, width, out[v, u])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _blur_weights(depth, x, y, scale, twist, weights):
     """Computes the weights (4, W) of `_blur_row`; returns whether all paths of the row are short (`SHORT_PX`).
 
@@ -163,7 +163,7 @@ def _blur_weights(depth, x, y, scale, twist, weights):
     return n_long == 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _repeat_for_bands(values, out):
     """Fills `out` (3 W,) with each of the `values` (W,) three times, for R, G, B."""
     for u in range(values.size):
@@ -171,7 +171,7 @@ def _repeat_for_bands(values, out):
         out[3 * u], out[3 * u + 1], out[3 * u + 2] = value, value, value
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _blur_row(above, here, below, weights, out):
     """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel of `_blur_weights`, here (4, 3 W)."""
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
@@ -187,7 +187,7 @@ def _blur_row(above, here, below, weights, out):
         out[k] = max(b1[k] + total, np.float32(0.0))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
     """Writes to `out` the mean radiance over a straight path centred on pixel (a, b), from an odd number of samples.
 
@@ -221,7 +221,7 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
     out[0], out[1], out[2] = max(red, zero), max(green, zero), max(blue, zero)
 
 
-@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
+@kernel(error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter.
 
@@ -250,7 +250,7 @@ def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, en
             filled[k] = max(filled[k], zero)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath={"contract"})
+@kernel(forceinline=True, fastmath={"contract"})
 def _cubic_weights(at, before, here, after, last):
     """Computes the Catmull-Rom weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
     for u in range(at.size):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.imaging.daylight import FloorDaylight
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ class Sky:
         return to_sun, self._beam, form, self._change, self._fitted, loss, lines, from_camera.astype(np.float32)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def world_axes(from_camera):
     """Returns the unit vectors east, north and up in the axes of the camera, as columns (3, 3).
 
@@ -63,7 +63,7 @@ def world_axes(from_camera):
     return axes
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _turn(axes, to_sun, rest_lx, sun, form):
     """Fills `sun` (3,) with the direction to the sun, `form` (3, 10) with the quadratic form of `rest_lx`.
 

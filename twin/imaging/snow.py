@@ -20,7 +20,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
@@ -32,6 +31,7 @@ from twin.imaging.row_parallel import in_row_bands
 from twin.imaging.shading import FAR_M
 from twin.imaging.shutter import ExposureMotion
 from twin.imaging.water import Medium
+from twin.kernels import kernel
 from twin.scenario.model import SnowConfig
 
 Array = NDArray[np.float64]
@@ -228,7 +228,7 @@ def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float
     return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
     """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`.
 
@@ -245,7 +245,7 @@ def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
             fading[k, c], path_loss[k, c] = -day_per_m[c] * (z + below_m), -loss_per_m[c] * range_m
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
     """Fills `centre` (n, 2) with the middle of each particle's path, and `path` (n, 2) with the vector along it [px].
 
@@ -277,7 +277,7 @@ def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
         centre[k, 0], centre[k, 1] = pixel[k, 0] + along * delay_s, pixel[k, 1] + down * delay_s
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+@kernel(error_model="numpy", inline="always")
 def _image_velocity(x, y, z, focal, drift, twist):
     """Returns the image velocity (columns, rows) [px/s] of a point (x, y, z), in the axes of the camera.
 
@@ -289,7 +289,7 @@ def _image_velocity(x, y, z, focal, drift, twist):
     return focal * across / z, focal * down / z
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_px, reach_px_m, farthest_m):
     """Returns the indices (n,) of the particles in view, their positions in the axes of the camera, and their pixels.
 
@@ -313,7 +313,7 @@ def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_
     return found[:n], points[:n], pixel[:n]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
     """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened.
 
@@ -334,7 +334,7 @@ def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
         zs[k] = i * x + j * y + m * z + o
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, farthest_m, seen):
     """Fills `seen` with whether each particle is in view, see `_in_view`; a loop that the compiler can vectorize."""
     for k in range(seen.size):
@@ -345,7 +345,7 @@ def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, 
         seen[k] = across & (v > -margin) & (v < height * z + margin) & (z > NEAREST_M) & (z <= farthest_m)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
     """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer.
 
@@ -390,7 +390,7 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
                     light[v, u, c] += np.float32(share * (radiance[k, c] - light[v, u, c]))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _swept(radius, du, dv, step_u, step_v, steps):
     """Returns the mean coverage (0 to 1) of a pixel by a disc at `steps` evenly spaced positions, see `_rim`.
 
@@ -402,7 +402,7 @@ def _swept(radius, du, dv, step_u, step_v, steps):
     return total / steps
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _rim(radius, du, dv):
     """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px].
 

@@ -15,12 +15,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from terrains import Terrain
 from twin.core.records import Image
 from twin.imaging.row_parallel import in_row_bands
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -134,7 +134,7 @@ def paint_walls_from_above(
     _paint_from_above(surface, albedo, columns, rows, np.float32(step_m / surface.texel_m))
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 def _paint(surface, albedo, depth, view, origin, focal, first, end):
     """Compiled kernel of `paint_walls` for the rows first to end - 1.
 
@@ -156,7 +156,7 @@ def _paint(surface, albedo, depth, view, origin, focal, first, end):
         _blend(surface, albedo[v], work, steep, n, total, used)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model="numpy")
+@kernel(fastmath=_FAST, error_model="numpy")
 def _paint_from_above(surface, albedo, columns, rows, step):
     """Compiled kernel of `paint_walls_from_above`; columns, rows and step are in cells, cells and texels."""
     n_rows, n_cols = surface.number.shape
@@ -181,7 +181,7 @@ def _paint_from_above(surface, albedo, columns, rows, step):
         _blend(surface, albedo[v], work, steep, n, total, used)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _find(surface, depth, y, view, origin, focal, work, steep):
     """Finds the pixels of a row that show steep cells; returns their number.
 
@@ -219,7 +219,7 @@ def _find(surface, depth, y, view, origin, focal, work, steep):
     return n
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _place(surface, origin, work, steep, n):
     """Fills the rows _EAST and _NORTH of `work` with the slopes of the facets, _X and _Y with the signed weights.
 
@@ -245,7 +245,7 @@ def _place(surface, origin, work, steep, n):
         )
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _project(depth, y, view, focal, spacing, work, steep, n):
     """Fills the rows _ACROSS_X to _BELOW of `work`: displacement on the facet to the next pixel along both axes.
 
@@ -272,7 +272,7 @@ def _project(depth, y, view, focal, spacing, work, steep, n):
         work[_BELOW, i] = down_0 + far[i] * dz
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _blend(surface, albedo, work, steep, n, total, used):
     """Blends the texture of the walls into the n steep pixels of a row of the image `albedo` (W, 3)."""
     texels, levels, spacing, length = surface.texels, surface.levels, surface.spacing, surface.length
@@ -299,7 +299,7 @@ def _blend(surface, albedo, work, steep, n, total, used):
             albedo[u, 2] = mixed >> (_BLUE + _SHIFT) & _LANE
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _footprints(across, down, work, n):
     """Fills the rows _MAJOR_ALONG to _LEVEL of `work`: the filter of the pixels.
 
@@ -328,7 +328,7 @@ def _footprints(across, down, work, n):
         size[i] = half * (np.float32(bits[i]) * np.float32(2**-23) - np.float32(127))
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _filtered(texels, levels, weight, along, turned, work, i, total, used):
     """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added.
 
@@ -352,7 +352,7 @@ def _filtered(texels, levels, weight, along, turned, work, i, total, used):
     return total, used + samples * each
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_FAST, error_model="numpy")
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _sample(texels, levels, level, along, below, weight):
     """Returns `weight` times the colour of a level at a point [finest texels], interpolated bilinearly.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
@@ -13,6 +12,7 @@ from twin.core.links import Links
 from twin.core.records import Array, SurveyResult, Truth
 from twin.judge.consistency import nees
 from twin.judge.summary_statistics import mean, rms
+from twin.kernels import kernel
 
 #: A link is "along" if it connects a node to one of the two nodes before it (Negahdaripour & Madjidi 2003). All other
 #: links are "across": to earlier nodes of the same swath, to neighbouring swaths, to the start of a loop.
@@ -63,7 +63,7 @@ def motion_errors(links: Links, estimates: Array, world_from_keyframe: Array) ->
     return _motion_errors(world_from_keyframe[links.i], world_from_keyframe[links.j], np.ascontiguousarray(estimates))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _motion_errors(true_i, true_j, estimates):
     """Compiled kernel of `motion_errors`."""
     errors = np.empty((len(true_i), 6))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.floor_rays import cast_ray, map_height_field
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
+from twin.kernels import kernel
 
 #: A floor point is hidden if its ray meets the map earlier by more than this fraction of the distance to the camera.
 HIDDEN_BEFORE = 1e-3
@@ -40,7 +40,7 @@ def hidden_cells(height_m: NDArray[np.floating], grid: MapGrid, poses: Array, ri
     return hidden
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _hidden(field, poses, camera, xs, ys, z):
     """Compiled kernel of `hidden_cells`, for the floor points (xs, ys, z)."""
     fx, fy, cx, cy, last_u, last_v, baseline = camera

@@ -10,12 +10,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.core import geometry
 from twin.errors import SurveyAborted
+from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
@@ -105,14 +105,14 @@ class CompiledVehicle:
             raise SurveyAborted(f"the physics diverged at {self._time_s:.3f} s")
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def body_twist(body):
     """Compiled kernel of `CompiledVehicle.twist_body`."""
     velocity = body.velocity + 0.5 * body.timestep_s * body.acceleration
     return twist_from_free_joint(body.pose[:3, :3], velocity)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def has_diverged(body):
     """Returns whether a component of the velocity is NaN or its magnitude reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS.
 
@@ -122,7 +122,7 @@ def has_diverged(body):
     return not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def advance(body, command, n_steps):
     """Advances the state in place by `n_steps` timesteps under thruster commands (8,), clipped to [-1, 1]."""
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration

@@ -17,8 +17,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ def angular_first(linear_first: Array) -> Array:
     return np.roll(linear_first, 3, axis=0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: int) -> None:
     """Adds a cross product in place: out[at:at+3] += sign * a[i:i+3] x b[j:j+3]."""
     out[at] += sign * (a[i + 1] * b[j + 2] - a[i + 2] * b[j + 1])
@@ -57,7 +58,7 @@ def _add_cross(out: Array, at: int, sign: float, a: Array, i: int, b: Array, j: 
     out[at + 2] += sign * (a[i] * b[j + 1] - a[i + 1] * b[j])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: Array, wrench: Array) -> Array:
     """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
 
@@ -93,7 +94,7 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     return force / (hull.inertia + hull.added_inertia)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def free_joint_acceleration(
     hull: Hull, world_from_body: Array, velocity: Array, current_mps: Array, wrench: Array
 ) -> Array:
@@ -118,7 +119,7 @@ def free_joint_acceleration(
     return result
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
     """Returns the [angular, linear] velocity (6,) in body axes from the velocity (6,) of a free joint of MuJoCo.
 

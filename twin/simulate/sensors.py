@@ -7,11 +7,11 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import BeaconDetection, Readings, SensorNoise, StereoRig
+from twin.kernels import kernel
 from twin.scenario.model import NavigationConfig
 from twin.simulate.inertial_sensor import InertialSensor
 
@@ -120,7 +120,7 @@ class PerFrameSensors(NamedTuple):
     has_dvl: bool
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_numbers):
     """Returns simulated readings of the per-frame sensors; the readings of sensors not used for aiding are NaN.
 
@@ -171,7 +171,7 @@ def read_pressure_and_attitude(
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _height_and_attitude(world_from_body, body_from_camera, pressure_sigma_m, attitude_sigmas_rad, numbers):
     """Returns measured height of the left camera [m] and roll, pitch, yaw (3,) of the body [rad].
 
@@ -200,7 +200,7 @@ class DopplerVelocityLog:
         return _dvl_velocity(velocity_mps, self.gain, self._sigma_mps, self._rng.standard_normal(3))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dvl_velocity(velocity_mps, gain, sigma_mps, numbers):
     """Returns the measured velocity (3,) [m/s]; `numbers` (3,) are standard normal."""
     return gain * velocity_mps + sigma_mps * numbers

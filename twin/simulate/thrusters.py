@@ -5,18 +5,18 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from scenes.bluerov2 import VehicleParameters
 from twin.core import geometry
+from twin.kernels import kernel
 from twin.simulate.hydrodynamics import angular_first
 
 Array = NDArray[np.float64]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def steady_thrust_n(command: Array, coefficients: Array) -> Array:
     """Returns the steady thrust (n,) [N] of a thruster at rest in the water for commands u in [-1, 1].
 
@@ -86,14 +86,14 @@ class LaggedThrusters:
         step_thrusters(self.state)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def set_thruster_command(thrusters, command):
     """Compiled kernel of `LaggedThrusters.command`."""
     clipped = np.minimum(np.maximum(command, -1.0), 1.0)
     geometry.copy_into(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def step_thrusters(thrusters):
     """Compiled kernel of `LaggedThrusters.step`."""
     previous, order = thrusters.lag_state.copy(), len(thrusters.a)
@@ -104,7 +104,7 @@ def step_thrusters(thrusters):
                 thrusters.lag_state[i, n] += thrusters.a[i, k] * previous[k, n]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def thruster_wrench(thrusters):
     """Compiled kernel of `LaggedThrusters.wrench`."""
     wrench = np.zeros(6)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.estimate.navigation.dead_reckoning import dead_reckon
 from twin.estimate.pipeline import Navigator
+from twin.kernels import kernel
 from twin.simulate.compiled_vehicle import CompiledVehicle, advance, body_twist, has_diverged
 from twin.simulate.hull import whole_timesteps
 from twin.simulate.sensors import read_per_frame_sensors
@@ -57,7 +57,7 @@ def compiled_loop(
     return fast_forward
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, reference, normals, n_steps, interval_s):
     """Runs the closed loop over n frames.
 

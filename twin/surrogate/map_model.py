@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
@@ -24,6 +23,7 @@ from twin.core.map_slopes import map_slopes
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
+from twin.kernels import kernel
 from twin.surrogate.error_model import DepthLaw
 from twin.surrogate.measured_view import IDEAL_TABLE, ViewTable, measure_point
 from twin.world.coverage import DEPTH_TOLERANCE
@@ -303,7 +303,7 @@ class MapModel:
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _window(pose, camera, geotransform, lowest, size):
     """Returns the rows and columns of the map that the image can show; compiled kernel of `MapModel._window`."""
     focal, cx, cy = camera[:3]
@@ -348,7 +348,7 @@ def heavy_tailed(noise: Map) -> Map:
     return np.asarray(noise * np.abs(noise) / np.float32(np.sqrt(3)), np.float32)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _border_of(camera, x, y, disparity):
     """Returns the distance of a normalised (x, y, disparity) from the nearest border of the two images [px]."""
     focal, cx, cy, right, bottom, _ = camera
@@ -356,7 +356,7 @@ def _border_of(camera, x, y, disparity):
     return min(min(v, bottom - v), min(right - u, u - focal * disparity))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
     """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error.
 
@@ -367,7 +367,7 @@ def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
     return 2 * x - px, 2 * y - py, z + slope[0] * (x - px) + slope[1] * (y - py)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _transformed(m, x, y, z):
     """Returns the point (x, y, z) transformed by a pose (4, 4)."""
     return (
@@ -377,7 +377,7 @@ def _transformed(m, x, y, z):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z):
     """Returns the estimated world position of a world point that the camera sees from its true pose."""
     baseline, m = camera[5], camera_from_world
@@ -490,7 +490,7 @@ def _odd(window_cells: float) -> int:
     return 2 * max(round((window_cells - 1) / 2), 1) + 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_hidden(poses, baseline, field, x, y, depth):
     """Returns whether relief hides the floor point at normalised (x, y) and `depth` from either camera."""
     nearest = (1 - DEPTH_TOLERANCE) * depth
@@ -499,7 +499,7 @@ def _is_hidden(poses, baseline, field, x, y, depth):
     return cast_camera_ray(field, poses[2], x - baseline / depth, y) < nearest
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark(seen, height, geotransform, camera, view, poses, floor, row, end_row, col, end_col):
     """Sets `seen` for the cells of a window that both cameras see."""
     (west, north, cell), (field, may_be_hidden), baseline = geotransform, floor, camera[5]
@@ -519,7 +519,7 @@ def _mark(seen, height, geotransform, camera, view, poses, floor, row, end_row, 
                 seen[i, j] = not hidden
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _observe(out, row, col, cells, camera, view, image_information, poses, estimated_from_true, floor):
     """Compiled kernel of `MapModel.observe`; writes depth, distance from the border and information to `out`."""
     (height, slope, (west, north, cell)), (depth_out, border, information) = cells, out
@@ -549,7 +549,7 @@ def _observe(out, row, col, cells, camera, view, image_information, poses, estim
             information[i, j] = _information_at(image_information, camera, seen_a, seen_b)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _information_at(table, camera, x, y):
     """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation.
 
@@ -583,7 +583,7 @@ class _Runs(NamedTuple):
     information: Map
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sample_patch(
     out, variance, systematic, floor, runs, fused, observed, following, step, camera, view,
     camera_from_world, estimated_from_true, position, cov, depth_noise, errors,
@@ -666,7 +666,7 @@ def _sample_patch(
     return total / max(count, 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def relief_error_px(rough_px, gain, limit_px):
     """Returns the standard deviation of a height error due to relief within the matching window [px of disparity].
 
@@ -681,7 +681,7 @@ def relief_error_px(rough_px, gain, limit_px):
     return limit_px * share / np.sqrt(1 + share**2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _relative_variance(law, n_views, step_baselines, noise_share):
     """Compiled form of `DepthLaw.relative_variance`, with the result of `DepthLaw.noise_share`."""
     squared = step_baselines * step_baselines
@@ -690,7 +690,7 @@ def _relative_variance(law, n_views, step_baselines, noise_share):
     return law.common + (1 - law.common) / (1 + gain * (n_views - 1))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _interval(ascending, value):
     """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it.
 
@@ -702,7 +702,7 @@ def _interval(ascending, value):
     return k, min(max((value - ascending[k]) / (ascending[k + 1] - ascending[k]), 0.0), 1.0)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _interpolate(values, k, fraction):
     """Returns the tabulated value interpolated linearly at a relative position within interval k."""
     return (1 - fraction) * values[k] + fraction * values[k + 1]

@@ -14,13 +14,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.estimate.vision.epipolar_calibration import CORRECTED, NOTICEABLE_PX, row_jacobian
 from twin.imaging.true_cameras import TrueCameras
+from twin.kernels import kernel
 
 _SHAPE = (5, 31, 41)  # grid points along disparity, y and x
 _MARGIN = 1.3  # extent of the grid, in units of the image
@@ -206,7 +206,7 @@ def _flow(points: Array, baseline_m: float, image_of) -> Array:
     return np.column_stack(columns)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def measure_point(table, x, y, disparity):
     """Returns the measured (x, y, disparity) of a true point; outside the grid, the table is extrapolated linearly."""
     values = table.values
@@ -229,7 +229,7 @@ def measure_point(table, x, y, disparity):
     return m0, m1, m2
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _interval(position, n):
     """Returns the index of the grid interval that contains a position, and the relative position in it.
 
@@ -239,7 +239,7 @@ def _interval(position, n):
     return k, position - k
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def measure_all(table, points):
     """Returns the measured positions (n, 3) of true points (n, 3)."""
     measured = np.empty_like(points)

@@ -6,10 +6,10 @@ from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
+from twin.kernels import kernel
 
 _CELL_M = 0.1  # side of a floor cell [m]
 _MIN_COVERAGE = 0.1  # smallest fraction of a keyframe's field of view that the mosaic must cover for a registration
@@ -17,7 +17,7 @@ _MIN_COVERAGE = 0.1  # smallest fraction of a keyframe's field of view that the 
 Cells = NDArray[np.int64]  #: floor cells, each with column and row packed into one integer
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def floor_cells(pose, points, baseline):
     """Returns the floor cell (n,) of each point (n, 3), given as normalised (x, y, disparity) in a camera.
 

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.vision import observation_equations
 from twin.estimate.vision.two_view_motion import CUTOFF, HUBER
+from twin.kernels import kernel
 from twin.surrogate.measured_view import measure_point
 
 MIN_POINTS = 6  # smallest number of points from which a motion is estimated
 _MORE_ITERATIONS = 5  # further least-squares iterations of a link if points are not measured at their true positions
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     """Samples the frame-to-frame motion previous_from_current (4, 4) between two true poses (4, 4).
 
@@ -34,7 +34,7 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     return geometry.compose(motion, geometry.exp(error))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
     bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation, noise_share,
@@ -119,7 +119,7 @@ def sample_link(
     return n, motion, inverse * inflation + common @ common.T
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _robust_weights(normalised_residual, noise_share):
     """Returns approximate weights (n,) of single matches in `two_view_motion.pair_motion`: Huber, 0 beyond a cutoff.
 
@@ -132,7 +132,7 @@ def _robust_weights(normalised_residual, noise_share):
     return np.minimum(1.0, HUBER * scale / size) * (size < CUTOFF * scale)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _floor_cell(pose, point, baseline, cell_m, n):
     """Returns row and column (modulo n) of the floor cell of a point (x, y, disparity) in a camera at `pose`."""
     depth = baseline / point[2]
@@ -141,7 +141,7 @@ def _floor_cell(pose, point, baseline, cell_m, n):
     return int(np.floor(y / cell_m)) % n, int(np.floor(x / cell_m)) % n
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple[Array, Array]:
     """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its lower Cholesky factor.
 
@@ -160,7 +160,7 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
     return cov, np.linalg.cholesky(cov)  # pyright: ignore[reportReturnType]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def measured_motion(points, earlier_pose, later_pose, camera, cov):
     """Returns the motion earlier_from_later (4, 4) that is estimated from points without noise; see `sample_link`.
 
@@ -175,7 +175,7 @@ def measured_motion(points, earlier_pose, later_pose, camera, cov):
     )[1]  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mosaic_correction(estimated, measured_motions, fractions, predicted_pose):
     """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors.
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import Array, MapGrid, StereoRig
+from twin.kernels import kernel
 
 #: Four neighbouring pixels whose depths differ by more than this fraction are taken to span an occluding edge. If
 #: pixels are 0.2 deg apart, a continuous surface inclined at 86 deg to the image plane reaches this limit.
@@ -68,7 +68,7 @@ def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> N
     return height
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_seen(seen, raster, pose, camera, left, right, top):
     """Compiled kernel of `Coverage.add`.
 
@@ -107,7 +107,7 @@ def _mark_seen(seen, raster, pose, camera, left, right, top):
                 )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _in_both(u, v, left, right, camera):
     """Returns whether both cameras see the floor point at pixel (u, v) of the left image.
 
@@ -124,7 +124,7 @@ def _in_both(u, v, left, right, camera):
     return min(a, b) - slack <= z <= max(a, b) + slack
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _floor_cell(u, v, z, pose, camera, raster):
     """Returns column and row in the grid of the floor point at pixel (u, v) with depth z; integers are cell centres."""
     xc, yc = (u - camera[1]) * z / camera[0], (v - camera[2]) * z / camera[0]
@@ -133,14 +133,14 @@ def _floor_cell(u, v, z, pose, camera, raster):
     return (x - raster[0]) / raster[2] - 0.5, (raster[1] - y) / raster[2] - 0.5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _height(u, v, z, pose, camera):
     """Returns the height in the world [m] of the point at pixel (u, v) with depth z [m]."""
     xc, yc = (u - camera[1]) * z / camera[0], (v - camera[2]) * z / camera[0]
     return pose[2, 0] * xc + pose[2, 1] * yc + pose[2, 2] * z + pose[2, 3]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_top_triangle(seen, top, slack, a, b, c):
     """Marks the cells whose centre lies in a triangle where the triangle is at most `slack` [m] below `top`.
 
@@ -162,7 +162,7 @@ def _mark_top_triangle(seen, top, slack, a, b, c):
                     seen[r, k] = (p * zc + q * za + s * zb) / (p + q + s) >= top[r, k] - slack
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _is_surface(left, u, v):
     """Returns whether the four pixels from (u, v) to (u + 1, v + 1) show one surface, without an occluding edge."""
     a, b, c, d = left[v, u], left[v, u + 1], left[v + 1, u], left[v + 1, u + 1]
@@ -170,7 +170,7 @@ def _is_surface(left, u, v):
     return high - low <= EDGE_SHARE * low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _mark_triangle(seen, ca, ra, cb, rb, cc, rc):
     """Marks the cells whose centre lies inside or on the edge of the triangle a, b, c.
 

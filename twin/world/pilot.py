@@ -6,13 +6,13 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from controllers.segments import Reference
 from controllers.tracking import ControllerState, commanded_velocity, control_thrusters, rotate_lever_arm
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Readings
+from twin.kernels import kernel
 from twin.simulate.autopilot import nominal_controller
 from twin.world.mission import Mission
 from twin.world.plugin_pilot import PluginPilot
@@ -109,7 +109,7 @@ class RovPilot:
         )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
     """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`.
 

@@ -19,12 +19,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.adjustment.elimination import BLOCK as _D
 from twin.estimate.adjustment.elimination import SymbolicFactor
+from twin.kernels import kernel
 
 _MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smaller pivot counts as zero
 
@@ -134,7 +134,7 @@ class BlockMatrix(NamedTuple):
         return CholeskyFactor(s, self.panels)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _set_diagonal(s, diagonal, panels):
     """Copies the diagonal blocks (n, 6, 6) into the panels."""
     for k in range(len(diagonal)):
@@ -143,7 +143,7 @@ def _set_diagonal(s, diagonal, panels):
         geometry.copy_into(_panel_matrix(s, panels, p)[_D * x : _D * x + _D, _D * x : _D * x + _D], diagonal[k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add(s, start, blocks, panels):
     """Compiled kernel of `BlockMatrix.add`: adds `blocks` (k, 6, 6) to the off-diagonal blocks from index `start`."""
     for k in range(len(blocks)):
@@ -158,13 +158,13 @@ def _add(s, start, blocks, panels):
                 panel[_D * y + i, _D * x + j] += blocks[k, j, i] if s.transposed[start + k] else blocks[k, i, j]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _panel_matrix(s, panels, p):
     """Returns the panel p as a matrix, a view of `panels`."""
     return panels[s.offset[p] : s.offset[p + 1]].reshape(-1, _D * (s.panel_start[p + 1] - s.panel_start[p]))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _factorise(s, original, panels):
     """Factorises the matrix in the panels: each then holds L1^-1 above L2 (see the module).
 
@@ -192,7 +192,7 @@ def _factorise(s, original, panels):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _invert_root(matrix, original, inverse):
     """Computes the inverse of the lower Cholesky factor of a dense matrix, row by row.
 
@@ -225,7 +225,7 @@ def _invert_root(matrix, original, inverse):
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _next_ancestor(s, positions, start):
     """Finds the panel that holds positions[start], and the block rows of positions[start:] in this panel.
 
@@ -253,7 +253,7 @@ def _next_ancestor(s, positions, start):
     return end, p, at
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _subtract(product, at, panel):
     """Subtracts the lower block triangle of `product` from a panel.
 
@@ -269,7 +269,7 @@ def _subtract(product, at, panel):
                     panel[_D * at[b] + i, _D * at[a] + k] -= product[_D * b + i, _D * a + k]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather(panel, at, width):
     """Returns a copy (6 m, 6 width) of a panel's blocks in the block rows `at` (m,) and block columns at[:width]."""
     part = np.empty((_D * len(at), _D * width))
@@ -281,7 +281,7 @@ def _gather(panel, at, width):
     return part
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _invert(s, panels, diagonal):
     """Replaces the factor by the blocks of the inverse that lie within its sparsity pattern.
 
@@ -311,7 +311,7 @@ def _invert(s, panels, diagonal):
             geometry.copy_into(diagonal[s.panel_start[p] + k], own[_D * k : _D * k + _D, _D * k : _D * k + _D])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_in_place(s, panels, x):
     """Solves the factorised linear system; the right-hand side x (6 n,), in elimination order, becomes the solution."""
     for p in range(len(s.panel_start) - 1):
@@ -326,7 +326,7 @@ def _solve_in_place(s, panels, x):
     _solve_transposed_in_place(s, panels, x)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _solve_transposed_in_place(s, panels, x):
     """Solves the linear system of the transposed factor, L' y = x; x (6 n,), in elimination order, becomes y."""
     for p in range(len(s.panel_start) - 2, -1, -1):

@@ -10,10 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
+
+from twin.kernels import kernel
 
 Indices = NDArray[np.int64]
 
@@ -128,7 +129,7 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
     return [(own[::-1], below[start[own[0]] : start[own[0] + 1]]) for own in reversed(panels)]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill_in(n, start, later):
     """Returns the nonzero rows below the diagonal of each column of the factor (Davis 2006, chapter 4).
 

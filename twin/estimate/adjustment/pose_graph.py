@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from scipy import sparse
 
 from twin.core import geometry
@@ -25,6 +24,7 @@ from twin.core.geometry import Array
 from twin.core.links import Link, Links, symmetric_inverses
 from twin.estimate.adjustment import block_cholesky, elimination
 from twin.estimate.adjustment.elimination import Indices
+from twin.kernels import kernel
 
 #: A step that increases the cost by more than this is rejected. The iteration ends when the decrease of the cost by an
 #: undamped step agrees with the prediction of the linear model to this tolerance. The next step could then decrease the
@@ -322,7 +322,7 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
     return _NormalEquations(diagonal, gradient, border, corner, shared_gradient)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
     """Adds the contributions of binary factors to the diagonal blocks and gradients of both poses.
 
@@ -365,7 +365,7 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
         geometry.copy_into(diagonal[i], diagonal[i] + geometry.transform_covariance(to_i, matrix))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_border(first, second, by_j, weighted, i_from_j, border):
     """Adds the mixed second derivatives (poses and shared parameter) of binary factors to the border.
 
@@ -420,7 +420,7 @@ def prior_factors(pose_index: Sequence[int], poses: Array, covs: Array) -> Unary
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pose_residuals(measured, estimated):
     """Returns the residuals log(measured^-1 estimated) (m, 6) of m measured and m estimated poses (m, 4, 4)."""
     residuals = np.empty((len(estimated), 6))
@@ -429,7 +429,7 @@ def pose_residuals(measured, estimated):
     return residuals
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pose_residual_jacobians(residuals):
     """Returns the Jacobians (m, 6, 6) of `pose_residuals` with respect to increments of the estimated poses.
 
@@ -442,7 +442,7 @@ def pose_residual_jacobians(residuals):
     return jacobians
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _retract(poses, increments):
     """Returns the poses (n, 4, 4), each moved by its increment (n, 6) in its own axes."""
     moved = np.empty_like(poses)
@@ -451,7 +451,7 @@ def _retract(poses, increments):
     return moved
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _relative_poses(poses, i, j):
     """Returns the relative poses i_from_j (m, 4, 4) of the pairs of poses with the indices i and j (m,)."""
     relative = np.empty((len(i), 4, 4))

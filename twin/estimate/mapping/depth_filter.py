@@ -11,13 +11,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.estimate.vision import epipolar
 from twin.estimate.vision.disparity import Disparity
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -148,7 +148,7 @@ def motion_depth(
     return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fuse(depth, variance, measured, measured_variance, gate):
     """Compiled kernel of `fuse`: updates `depth` and `variance` in place; returns a mask (H, W) of updated pixels."""
     updated = np.zeros(depth.shape, np.bool_)
@@ -168,7 +168,7 @@ def _fuse(depth, variance, measured, measured_variance, gate):
     return updated
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _forward_project(old, rotation, translation, guess, camera):
     """Fills unknown pixels of the new depth map `guess` (H, W), in place, from the old depth map.
 
@@ -198,7 +198,7 @@ def _forward_project(old, rotation, translation, guess, camera):
                 filled[i, j] = True
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
     """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth `depth` [m] in the first camera.
 
@@ -212,7 +212,7 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
     """Returns depth and variance at column x and row y, interpolated between the four neighbouring pixels.
 
@@ -237,7 +237,7 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
     ]
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     """Returns the surface normal (x, y, z) at a pixel, scaled so that normal . ray = 1 / depth, for a ray with z = 1.
 
@@ -259,7 +259,7 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     return nx, ny, 1 / z - nx * (u - cx) / focal - ny * (v - cy) / focal
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
     """Returns depth and variance (H, W) of the old map in the new image, linearised at the depths `guess` (H, W).
 
@@ -299,7 +299,7 @@ def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, ca
     return depth, variance
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _quadratic(row, cov):
     """Returns the quadratic form row cov row' of a row vector (6,) and a covariance (6, 6)."""
     total = 0.0
@@ -309,7 +309,7 @@ def _quadratic(row, cov):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
     """Returns the variance (H, W) [px^2] of the disparity from motion that is due to the error of the relative pose.
 

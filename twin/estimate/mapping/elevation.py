@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import ElevationMap, Image, MapGrid
 from twin.estimate.mapping.depth_filter import GATE, Mask
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.mapping.visibility import hidden, main_surface
+from twin.kernels import kernel
 
 Map = NDArray[np.float32]
 
@@ -262,7 +262,7 @@ def _step(height: Map) -> Map:
     return step
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
@@ -282,7 +282,7 @@ def _remove_propagated(
                 remaining[a, b] = np.nan
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fuse_cells(
     row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
 ):  # fmt: skip
@@ -319,7 +319,7 @@ def _fuse_cells(
             variances[best, a, b], cameras[best, a, b] = p * r / (p + r), camera
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_colours(row, col, height, pixel, rgb, gain, colour):
     """Adds the weighted image colour of each cell with a height to `colour` (grid rows, grid cols, 4).
 

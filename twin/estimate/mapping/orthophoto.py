@@ -17,12 +17,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.interpolation import catmull_rom_weights
 from twin.core.records import Array, MapGrid, StereoRig
+from twin.kernels import kernel
 
 Map = NDArray[np.float32]
 
@@ -146,7 +146,7 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
     return int(rows[0]), int(rows[1]), int(cols[0]), int(cols[1])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
     """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each pixel of an image shows.
 
@@ -169,7 +169,7 @@ def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nea
                     nearest[row, col] = min(nearest[row, col], np.float32(depth))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _blend(
     height, colour, weight, best, first, end, left, right, steps, origin, camera_at, camera, image, clipped,
     nearest,
@@ -219,7 +219,7 @@ def _blend(
             _add_sample(image, u, v, w, colour[i, j])
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@kernel(error_model="numpy")
 def _add_sample(image, u, v, w, colour):
     """Adds w times the colour of an image at column u and row v, interpolated bicubically, to `colour` (3,)."""
     rows, cols, _ = image.shape

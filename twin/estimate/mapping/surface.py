@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -137,7 +137,7 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
     return (int(low[0]), int(low[1]), int(rows), int(cols)) if rows > 0 and cols > 0 else None
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _grid_points(depth, pose, camera, west, north, cell):
     """Converts a depth map to grid coordinates.
 
@@ -168,13 +168,13 @@ def _grid_points(depth, pose, camera, west, north, cell):
     return points, bounds
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _contains_integer(a, b, c, e):
     """Returns whether an integer lies between the smallest and the largest of four numbers."""
     return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
     """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch.
 
@@ -201,7 +201,7 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
             _triangle(v + 1, u + 1, v, u + 1, v + 1, u, *out)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
@@ -246,7 +246,7 @@ def _triangle(
             pixel[p, q, 1] = va + s * (vb - va) + t * (vc - va)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def pose_variance(px, py, pz, sx, sy, cov):
     """Returns the variance [m^2] of a surface's height at the x and y of a point, due to the error of the camera pose.
 

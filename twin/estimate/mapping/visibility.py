@@ -8,11 +8,11 @@ through its opening, so that no line of sight to its floor passes below the surf
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.records import MapGrid
 from twin.estimate.mapping.depth_filter import GATE
+from twin.kernels import kernel
 
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -78,7 +78,7 @@ def _lowest(height: Map) -> Map:
     return low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _large_groups(height, variance, gate, largest):
     """Compiled kernel of `main_surface`: groups are filled until they exceed `largest` cells or meet a large one."""
     rows, cols = height.shape
@@ -107,7 +107,7 @@ def _large_groups(height, variance, gate, largest):
     return state == 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blocked(height, camera, cameras_m, low, variance, highest, corner):
     """Compiled kernel of `hidden`.
 

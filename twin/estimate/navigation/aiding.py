@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -22,6 +21,7 @@ from twin.estimate.adjustment import BinaryFactors, UnaryFactors, pose_residual_
 from twin.estimate.navigation import pose_filter
 from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.keyframes import Keyframe
+from twin.kernels import kernel
 
 
 def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> list[UnaryFactors]:
@@ -79,7 +79,7 @@ def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
     return UnaryFactors(np.array(index, np.int64), information, residuals, jacobians)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _camera_poses_at_origin(angles, body_from_camera):
     """Returns world_from_camera (m, 4, 4), with zero translation, for roll, pitch and yaw (m, 3) of the body [rad]."""
     poses, mount_rotation = np.empty((len(angles), 4, 4)), body_from_camera.copy()
@@ -178,7 +178,7 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
     return BinaryFactors(i, j, information, residuals, jacobians)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _body_displacements(motions, body_from_camera):
     """Returns the displacements (m, 3) [m] and Jacobians (m, 3, 6) from `body_displacement` for motions (m, 4, 4)."""
     displacements, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings
 from twin.estimate.navigation.dvl import DvlModel, DvlState, fuse_dvl
 from twin.estimate.navigation.pose_filter import PressureAhrsModel, fuse_pressure_ahrs, predict
+from twin.kernels import kernel
 
 
 class DeadReckoningState(NamedTuple):
@@ -57,7 +57,7 @@ def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def dead_reckon(
     last: DeadReckoningState,
     aiding: FrameAiding,

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Displacement, SensorNoise, StereoRig
 from twin.estimate.navigation.pose_filter import kalman_update
+from twin.kernels import kernel
 
 
 class DvlModel(NamedTuple):
@@ -102,7 +102,7 @@ class DvlIntegrator:
         return displacement
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
     """Computes the displacement of the body's origin that corresponds to a motion of the camera.
 
@@ -125,7 +125,7 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
     return geometry.compose(body_a_from_b, camera_from_body)[:3, 3].copy(), by_motion
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fuse_dvl(state, model, a_from_b, cov, velocity):
     """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
@@ -153,19 +153,19 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
     return fused, fused_cov
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _body_motion(a_from_b, body_from_camera):
     """Returns the motion (4, 4) of the body that corresponds to a motion of the camera."""
     return geometry.compose(geometry.compose(body_from_camera, a_from_b), geometry.inverse(body_from_camera))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _length(step):
     """Returns the length of a vector (3,)."""
     return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _step_cov(state, model, step):
     """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
 
@@ -181,7 +181,7 @@ def _step_cov(state, model, step):
     return cov
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _accumulate(state, model, step, a_from_b, cov):
     """Adds a frame to the integration since the node.
 
@@ -205,14 +205,14 @@ def _accumulate(state, model, step, a_from_b, cov):
     geometry.copy_into(state.rotation_cov, state.rotation_cov + added)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _displacement_cov(state):
     """Returns the covariance (3, 3) [m^2] of the displacement since the node due to white noise and attitude error."""
     lever = geometry.skew(state.displacement_m)  # conservative: applies the final attitude error to the whole path
     return state.cov + geometry.product(geometry.product(lever, state.rotation_cov), lever.T)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _restart(state):
     """Resets the integration at a node, in place; the last reading is kept."""
     geometry.copy_into(state.node_from_body, np.eye(3))
@@ -220,7 +220,7 @@ def _restart(state):
     state.complete[:] = True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera):
     """Updates a camera motion with a measured displacement of the body's origin (Kalman update).
 

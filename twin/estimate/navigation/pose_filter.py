@@ -9,11 +9,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings, SensorNoise, StereoRig
+from twin.kernels import kernel
 
 _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a pose in `correct_pose`; above it, the pose is rejected
 
@@ -139,7 +139,7 @@ class PressureAhrsModel(NamedTuple):
     attitude_sigmas_rad: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     """Updates a pose with readings of height and attitude (Kalman update).
 
@@ -165,7 +165,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
     return pose, cov
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def predict(world_from_camera, cov, a_from_b, motion_cov):
     """Returns the pose (4, 4) and its covariance (6, 6) after a motion `a_from_b` with covariance `motion_cov`.
 
@@ -174,7 +174,7 @@ def predict(world_from_camera, cov, a_from_b, motion_cov):
     return geometry.compose(world_from_camera, a_from_b), geometry.transport_covariance(cov, a_from_b) + motion_cov
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
     """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
@@ -190,7 +190,7 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
     return axes * np.minimum(np.maximum(values, lower), upper) @ axes.T
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def kalman_update(world_from_camera, prior, residual, jacobian, cov):
     """Updates a pose with an observation (Kalman update in Joseph form).
 
@@ -214,7 +214,7 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
     return geometry.compose(world_from_camera, geometry.exp(step)), geometry.transform_covariance(keep, prior) + noise
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gain(prior, jacobian, cov):
     """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination.
 
@@ -248,7 +248,7 @@ def _gain(prior, jacobian, cov):
     return gain
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _correct(world_from_camera, prior, measured, cov, motion_cov):
     """Compiled kernel of `PoseFilter.correct_pose`, without the gate; `prior` (6, 6) is the covariance of the pose.
 
@@ -275,7 +275,7 @@ def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise)
     return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _camera_attitude(rpy, camera_from_body, sigmas):
     """Compiled kernel of `camera_attitude`, for a rotation `camera_from_body` (3, 3) and `sigmas` (3,) [rad]."""
     to_camera = np.ascontiguousarray(camera_from_body)

@@ -14,11 +14,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import ImuReadings
+from twin.kernels import kernel
 
 GRAVITY_MPS2 = 9.81
 _ACCELERATION_MPS2, _ACCELERATION_S = 0.1, 1.0  # standard deviation and correlation time of a vehicle's acceleration
@@ -65,7 +65,7 @@ def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array
     return up / np.linalg.norm(up, axis=1, keepdims=True), (information[0] + information[1]) ** -0.5
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _filtered(times_s, rates, forces, rate_density2, rate_walk2, force_density2):
     """Returns the vertical (n, 3) after each reading and its variance (n,) about each perpendicular axis [rad^2].
 
@@ -113,7 +113,7 @@ def _filtered(times_s, rates, forces, rate_density2, rate_walk2, force_density2)
     return up, variance
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _first_vertical(times_s, rates, forces):
     """Returns the direction (3,), at the first reading, of the mean specific force over the first `_START_S`."""
     mean, turned = forces[0].copy(), np.eye(3)
@@ -125,7 +125,7 @@ def _first_vertical(times_s, rates, forces):
     return mean / np.linalg.norm(mean)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _level(up):
     """Returns a rotation (3, 3) world_from_body whose third row is the unit vector `up` (3,)."""
     other = np.zeros(3)

@@ -11,10 +11,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.interpolation import bicubic_with_gradient
+from twin.kernels import kernel
 
 Array = NDArray[np.float64]
 Map = NDArray[np.float32]
@@ -270,7 +270,7 @@ def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
     return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _warp(reference, other, disparity, matrix, epipole, warped, slope, locking):
     """Warps the other image O to the reference image, and returns a mask (H, W) of the pixels that are visible in O.
 
@@ -316,14 +316,14 @@ def _warp(reference, other, disparity, matrix, epipole, warped, slope, locking):
     return visible
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def _interpolated_noise(t):
     """Returns the sum of the squared Catmull-Rom weights at the fraction t between two pixels, and its derivative."""
     q = t * (1 - t)
     return 1 - q * q * (4.5 + 5 * q), -q * (9 + 15 * q) * (1 - 2 * t)
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
+@kernel(forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
     """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fit at each pixel.
 
@@ -354,7 +354,7 @@ def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight,
         s12[u] += w * locking[u]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fit_planes(disparity, residual, slope, locking, noise, window, support, priors):
     """Fits a plane to the disparities around each pixel.
 

@@ -9,8 +9,9 @@ from typing import Any, TypeVar
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from twin.kernels import kernel
 
 Image = NDArray[np.uint8]
 Gray = NDArray[np.float32]
@@ -100,7 +101,7 @@ def scaled_rows(image: Image, scale: float) -> Image:
     return np.asarray(cv2.warpAffine(image, matrix, (columns, rows), borderMode=cv2.BORDER_REPLICATE), np.uint8)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@kernel(fastmath=True)
 def _normalise(gray, mean, square, normalised):
     """Compiled kernel of `normalise`: writes `normalised` (n,) uint8 from grey levels and their local moments (n,)."""
     low, high, middle = np.float32(0), np.float32(255), np.float32(128.5)
@@ -206,7 +207,7 @@ def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
     return _summed_overlap(np.ascontiguousarray(points, np.float64), float(patch_px)) / len(points)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _summed_overlap(points, patch):
     """Returns the sum of the overlaps, 0 to 1, over all ordered pairs of patches; a patch also pairs with itself.
 

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core import geometry
@@ -26,6 +25,7 @@ from twin.core.interpolation import bilinear
 from twin.core.records import StereoRig
 from twin.estimate.vision import matching, two_view_motion
 from twin.estimate.vision.tiles import TiledRaster
+from twin.kernels import kernel
 
 _MAX_CELLS = 4000
 _MIN_CELLS = 300
@@ -184,7 +184,7 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
     return strength
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
     """Fills the empty cells of a window, in place, from one keyframe.
 
@@ -229,7 +229,7 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
             brightness[row, col] = bilinear(image, i, j, v - i, u - j)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
     """Linearises the brightness residuals of the cells that are visible in the frame at a known depth.
 
@@ -286,7 +286,7 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
     return jacobian[:m], frame_jacobian[:m], residuals[:m], block[:m], used
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _normal_equations(jacobian, frame_jacobian, residuals, block):
     """Computes the normal equations of the increment of the pose, with Huber weights.
 

@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from twin.core.geometry import Array
+from twin.kernels import kernel
 
 _MIN_DISPARITY = 1e-4  # keeps adjusted points in front of the camera
 
@@ -55,7 +55,7 @@ class LinearisedObservations(NamedTuple):
     normalised_residual: Array
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def image_jacobian(x, y, depth):
     """Returns the Jacobian of normalised image positions with respect to the twist of the camera [w, t] (rad, m).
 
@@ -76,7 +76,7 @@ def image_jacobian(x, y, depth):
     return jacobian
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def normal_equations(jacobian, weight, residual):
     """Returns the normal matrix (6, 6) and the right-hand side (6,) of a weighted least-squares problem.
 
@@ -96,7 +96,7 @@ def normal_equations(jacobian, weight, residual):
     return normal, right
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def transfer(points_b, a_from_b, baseline):
     """Transfers points measured in pair b to pair a.
 
@@ -138,7 +138,7 @@ def transfer(points_b, a_from_b, baseline):
     return points_a, jacobian_point, jacobian_motion
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def linearise(measured, structure, a_from_b, baseline):
     """Returns the `LinearisedObservations` of two stereo pairs.
 
@@ -174,7 +174,7 @@ def linearise(measured, structure, a_from_b, baseline):
     return LinearisedObservations(residual, jacobian_point, jacobian_motion, information, normalised_residual)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _invert(m, out):
     """Writes the inverse of a (3, 3) matrix to `out`, by cofactors."""
     for r in range(3):
@@ -185,7 +185,7 @@ def _invert(m, out):
     out /= det
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def motion_normal_equations(observations, weight):
     """Returns the normal equations of the unknowns of the motion, with the structure eliminated.
 
@@ -221,7 +221,7 @@ def motion_normal_equations(observations, weight):
     return normal, right, bias_jacobian
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def adjust_structure(observations, measured, update):
     """Returns the adjusted points (n, 3) of stereo pair b, normalised (x, y, disparity), after an update of the motion.
 

@@ -29,10 +29,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from twin.core.interpolation import bspline_weights
+from twin.kernels import kernel
 
 Image = NDArray[np.float32]
 Spline = NDArray[np.float32]
@@ -164,7 +164,7 @@ def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floati
     return _slope(disparity_px, np.round(points).astype(np.int64), patch_px // 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _slope(disparity, points, half):
     """Compiled kernel of `disparity_slope`."""
     out = np.zeros((len(points), 2))
@@ -204,7 +204,7 @@ def _slope(disparity, points, half):
     return out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _extract(source, centres, half):
     """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches at `centres` (n, 2) [px].
 
@@ -224,7 +224,7 @@ def _extract(source, centres, half):
     return energy, gradient, nuisance
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_REASSOCIATE)
+@kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _prepare(source, u0, v0, half, rows):
     """Prepares a patch of m pixels for matching: writes its nuisance basis and projected gradient to `rows` (8, m).
 
@@ -270,7 +270,7 @@ def _prepare(source, u0, v0, half, rows):
     return energy
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=_REASSOCIATE)
+@kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _dot(a, b):
     """Returns the dot product of two vectors (n,), summed in double precision."""
     total = 0.0
@@ -279,7 +279,7 @@ def _dot(a, b):
     return total
 
 
-@njit(cache=True, nogil=True, forceinline=True, fastmath=True)
+@kernel(forceinline=True, fastmath=True)
 def _sample(spline, u0, v0, warp, half, values):
     """Writes the values of the target's cubic B-spline at the m pixels of a warped patch to `values` (m,).
 
@@ -314,7 +314,7 @@ def _sample(spline, u0, v0, warp, half, values):
             )
 
 
-@njit(cache=True, nogil=True, fastmath=_REASSOCIATE)
+@kernel(fastmath=_REASSOCIATE)
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
     """Matches patches at one pyramid level.
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from twin.core.floor_rays import cast_ray
+from twin.kernels import kernel
 
 LIFT_M = 1e-6  # distance by which a path vertex on the floor is moved off the floor, along the normal
 TOLERANCE_M = 1e-4  # an intersection with the floor this close to the end of a ray does not block the ray
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
     """Returns the distance [m] at which the ray from (ox, oy, oz) intersects the floor; inf if it does not.
 
@@ -27,7 +27,7 @@ def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
     return _distance_upwards(field, ox, oy, oz, dx, dy, max(dz, 1e-9))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _distance_upwards(field, ox, oy, oz, dx, dy, dz):
     """Returns the result of `floor_distance` for a rising ray (dz > 0) and a height field.
 
@@ -56,14 +56,14 @@ def _distance_upwards(field, ox, oy, oz, dx, dy, dz):
     return np.inf
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gap(field, x, y, z):
     """Returns the height of a point above the floor [m]; inf where the floor has no height."""
     height, _, _ = _height_and_slopes(field, x, y)
     return z - height if not np.isnan(height) else np.inf
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _height_and_slopes(field, x, y):
     """Returns the height of the floor [m] and its slopes towards east and north; NaN, 0, 0 outside the grid."""
     rows, cols = field.height_m.shape
@@ -78,7 +78,7 @@ def _height_and_slopes(field, x, y):
     return h00 + u * east + v * north, east / field.spacing_m, north / field.spacing_m
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def floor_normal(is_plane, field, x, y):
     """Returns the unit normal x, y, z of the triangle of the floor at (x, y), upwards; 0, 0, 1 outside the grid."""
     if is_plane:
@@ -88,7 +88,7 @@ def floor_normal(is_plane, field, x, y):
     return -east / length, -north / length, 1 / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sees(is_plane, field, ax, ay, az, bx, by, bz):
     """Returns whether the straight line between two points above the floor is not blocked by the floor."""
     if is_plane:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from twin.kernels import kernel
 
 GUIDE_G = 0.9  # mean cosine of the wider lobe around a lamp or the sun, see `sample_guide`
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def density_at(density_per_sr, cosine):
     """Returns the value of a phase function table [1/sr] at the cosine of the scattering angle."""
     cells = density_per_sr.shape[0]
@@ -16,7 +17,7 @@ def density_at(density_per_sr, cosine):
     return density_per_sr[min(int(x * cells), cells - 1)]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def cell_of(cumulative, u):
     """Returns the cell i of a table for which cumulative[i] <= u < cumulative[i + 1], for u in [0, 1)."""
     low, high = 0, cumulative.shape[0] - 1
@@ -29,7 +30,7 @@ def cell_of(cumulative, u):
     return low
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_cosine(cumulative, rng):
     """Returns a random cosine of the scattering angle, sampled from the phase function."""
     cells = cumulative.shape[0] - 1
@@ -38,7 +39,7 @@ def sample_cosine(cumulative, rng):
     return 1 - 2 * (low + (high - low) * rng.random())
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_angle(cumulative_angle, rng):
     """Returns a random angle in [0, pi] with a density proportional to the phase function times the angle."""
     cells = cumulative_angle.shape[0] - 1
@@ -47,7 +48,7 @@ def sample_angle(cumulative_angle, rng):
     return np.sqrt(low**2 + (high**2 - low**2) * rng.random())
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turn(x, y, z, cosine, sine, azimuth):
     """Returns the unit vector at a polar angle and an azimuth [rad] around the unit vector (x, y, z).
 
@@ -65,14 +66,14 @@ def turn(x, y, z, cosine, sine, azimuth):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def turn_by_cosine(x, y, z, cosine, rng):
     """Returns the unit vector at an angle of given cosine from the unit vector (x, y, z), with a random azimuth."""
     sine = np.sqrt(max(1 - cosine * cosine, 0.0))
     return turn(x, y, z, cosine, sine, 2 * np.pi * rng.random())
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sample_guide(cumulative_angle, rng):
     """Returns the cosine of a random angle from the direction to a lamp or the sun, for directions sampled around it.
 
@@ -88,7 +89,7 @@ def sample_guide(cumulative_angle, rng):
     return min((1 + g * g - part * part) / (2 * g), 1.0)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def guide_density(density_per_sr, beyond, angle_integral, cosine):
     """Returns the density [1/sr] of the directions of `sample_guide` at the cosine of the angle from the lamp or sun.
 

@@ -27,7 +27,6 @@ the weight of a walk. Russian roulette ends walks of small weight; no contributi
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from twin.imaging.reference.floor import LIFT_M, floor_distance, floor_normal, sees
 from twin.imaging.reference.sampling import (
@@ -39,6 +38,7 @@ from twin.imaging.reference.sampling import (
     turn,
     turn_by_cosine,
 )
+from twin.kernels import kernel
 
 #: Indices of the sums to which `walk` adds light; the bins of the blurred light start at FIRST_BIN.
 DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE, FIRST_BIN = 0, 1, 2, 3, 4
@@ -49,7 +49,7 @@ ON_FLOOR, IN_WATER = np.int64(0), np.int64(1)
 WEAK, STEPS = 0.002, 10000  # share of the first weight below which Russian roulette starts; most vertices of a walk
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def beam_at(beam, cosine):
     """Returns the relative intensity of a lamp at the cosine of the angle from its beam axis; 0 beyond 90 deg.
 
@@ -62,7 +62,7 @@ def beam_at(beam, cosine):
     return beam[k] + (at - k) * (beam[k + 1] - beam[k])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def response(scene, kind, normal, direction, ox, oy, oz):
     """Returns the share of the light from a direction that a vertex sends back along the path, per solid angle [1/sr].
 
@@ -78,7 +78,7 @@ def response(scene, kind, normal, direction, ox, oy, oz):
     return density_at(scene.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def towards(lamp, point):
     """Returns the unit direction x, y, z from a point to a lamp, and their distance [m]."""
     x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
@@ -86,7 +86,7 @@ def towards(lamp, point):
     return x / d, y / d, z / d, d
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def straight(scene, kind, point, normal, direction, before, density, step_m):
     """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
 
@@ -116,7 +116,7 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
     """Returns an estimate of the light of lamps that reaches a vertex after one scattering, times its `response`.
 
@@ -157,7 +157,7 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def sunlight(scene, kind, point, normal, direction, guided, rng):
     """Returns the unscattered sunlight at a vertex, times the `response` of the vertex [cd/m2].
 
@@ -183,7 +183,7 @@ def sunlight(scene, kind, point, normal, direction, guided, rng):
     return light
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def share_of_escape(scene, density, path_m):
     """Returns the weight of the walk's estimate of the light of the sun's disc.
 
@@ -198,7 +198,7 @@ def share_of_escape(scene, density, path_m):
     return by_walk / (by_walk + by_connection)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def light_above(scene, from_water, density, path_m, x, y, z):
     """Returns the radiance just below the surface from a direction: that of the sky and of the sun's disc [cd/m2].
 
@@ -223,7 +223,7 @@ def light_above(scene, from_water, density, path_m, x, y, z):
     return light
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def axis_of(scene, k, point):
     """Returns the unit direction from a point to lamp k; to the sun if k is the number of lamps."""
     if k == scene.lamps.shape[0]:
@@ -232,14 +232,14 @@ def axis_of(scene, k, point):
     return x, y, z
 
 
-@njit(cache=True, nogil=True, inline="always")
+@kernel(inline="always")
 def upward_share(scene, kind, direction, guided):
     """Returns the share of directions sampled upwards, among those that are not sampled around a lamp or the sun."""
     sunny = scene.sun_lx > 0 or scene.sky.shape[0] > 1
     return UPWARDS if sunny and kind == IN_WATER and guided > 0 and direction[2] < 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def next_direction(scene, kind, point, normal, direction, guided, rng):
     """Returns the next direction of a walk, sampled from the mixture whose density `direction_density` returns."""
     n = scene.lamps.shape[0] + (1 if scene.sun_lx > 0 else 0)
@@ -257,7 +257,7 @@ def next_direction(scene, kind, point, normal, direction, guided, rng):
     return x / length, y / length, z / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def direction_density(scene, kind, point, direction, guided, own, x, y, z):
     """Returns the density [1/sr] of `next_direction` at the direction (x, y, z).
 
@@ -283,7 +283,7 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
     return (1 - guided) * own + guided * lobes
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
     """Returns the weight of the walk's estimate of the light that leaves a lamp and is first scattered at a point.
 
@@ -303,7 +303,7 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
     return by_walk / (by_walk + by_connection)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def bin_of(view, bin_edges_px, x, y, z):
     """Returns the bin of the distance in the image between a pixel and the projection of a point.
 
@@ -329,7 +329,7 @@ def bin_of(view, bin_edges_px, x, y, z):
     return k
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
     """Adds the light of one random walk to `sums`.
 
@@ -406,7 +406,7 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
                 at_bin = bin_of(view, bin_edges_px, point[0], point[1], point[2])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
     """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2] by component and bin, ordered as `sums` of `walk`.
 
@@ -446,7 +446,7 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
     return sums / n_walks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def trace_plane(scene, point, normal, n_walks, rng):
     """Returns the illuminance (3,) of a plane that does not disturb the light [lx].
 

@@ -1,0 +1,106 @@
+"""Compiled code on disk follows the sources: an edit of a called function or of a constant, in any file, is seen."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import twin.kernels
+
+CONSTANTS = "HALF = 0.5\n"
+CALLEE = """
+from twin.constants import HALF
+from twin.kernels import kernel
+
+@kernel
+def scale(x):
+    return HALF * x
+"""
+CALLER = """
+from twin import (  # in brackets, and by the package
+    callee,
+)
+from twin.kernels import kernel
+
+scale = callee.scale
+
+@kernel(error_model="numpy")
+def apply(x):
+    return scale(x) + 1.0
+
+if __name__ == "__main__":
+    value = apply(8.0)
+    print(value, sum(apply.stats.cache_hits.values()))
+"""
+
+
+@pytest.fixture
+def package(tmp_path):
+    """A package of two kernels and a constant in three files, with the project's `kernels.py`."""
+    folder = tmp_path / "source" / "twin"
+    folder.mkdir(parents=True)
+    for name, text in {"__init__": "", "constants": CONSTANTS, "callee": CALLEE, "caller": CALLER}.items():
+        (folder / f"{name}.py").write_text(text)
+    shutil.copy(twin.kernels.__file__, folder)
+    return folder
+
+
+def run(package, **environment):
+    """Returns what the caller gives for 8, and how often its code came from the disk, in a new process."""
+    variables = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": "",
+        "XDG_CACHE_HOME": str(package.parents[1] / "cache"),
+        **environment,
+    }
+    command = [sys.executable, "-B", "-m", "twin.caller"]
+    done = subprocess.run(command, cwd=package.parent, env=variables, capture_output=True, text=True, check=True)
+    value, hits = done.stdout.split()
+    return float(value), int(hits)
+
+
+def replace(file: Path, old, new):
+    """Edits a file and keeps its length and time, which numba's own cache goes by."""
+    before = file.stat()
+    text = file.read_text()
+    assert text.count(old) == 1 and len(old) == len(new)
+    file.write_text(text.replace(old, new))
+    os.utime(file, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def test_an_edit_of_a_called_function_or_of_a_constant_in_another_file_is_seen(package):
+    assert run(package) == (5.0, 0)
+    assert run(package) == (5.0, 1)
+    replace(package / "callee.py", "HALF * x", "HALF - x")
+    assert run(package) == (-6.5, 0)
+    replace(package / "constants.py", "0.5", "2.5")
+    assert run(package) == (-4.5, 0)
+    replace(package / "constants.py", "2.5", "0.5")
+    assert run(package) == (-6.5, 1)
+
+
+def test_two_checkouts_of_the_same_sources_share_the_compiled_code(package):
+    run(package)
+    other = package.parents[1] / "other" / "twin"
+    shutil.copytree(package, other)
+    assert run(other) == (5.0, 1)
+
+
+def test_without_a_folder_to_write_to_the_kernels_are_compiled_in_each_process(package, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.touch()
+    for _ in range(2):
+        assert run(package, XDG_CACHE_HOME=str(blocked)) == (5.0, 0)
+    assert not list(package.rglob("*.nbi"))
+
+
+def test_old_versions_of_a_module_are_removed(package):
+    for k in range(twin.kernels._VERSIONS_KEPT + 2):
+        (package / "constants.py").write_text(f"HALF = {k}.0\n")
+        run(package)
+    versions = list((package.parents[1] / "cache" / "seabed-twin" / "kernels" / "twin.callee").iterdir())
+    assert len(versions) == twin.kernels._VERSIONS_KEPT
+    assert run(package)[1] == 1

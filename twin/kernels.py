@@ -1,0 +1,171 @@
+"""Compiled kernels: `numba.njit` with a cache on disk that no edit of a source file can make stale.
+
+numba's own cache looks at the file of the called function only, not at the functions and constants that it takes from
+other files. Here the code of a kernel is kept in a folder named by a hash of its source file and of all project files
+that this one imports, directly or not. The folder lies in the user's cache: an installation may be read-only, and two
+checkouts with the same sources share it. The module imports no other one of the project, so every package can use it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import llvmlite.binding
+import numba
+import platformdirs
+
+_ROOT = Path(__file__).parents[1]
+_VERSIONS_KEPT = 8  #: of each module; those of the least recent processes are removed
+
+# `from .a.b import c, d`, also with its names in brackets over several lines, and `import a.b`
+_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\.*)([\w.]*)[ \t]+)?import[ \t]+(\([^)]*\)|[^\n]+)", re.MULTILINE)
+_NAME = re.compile(r"[\w.]+")
+
+
+def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
+    """Compiles a function with `numba.njit` without the interpreter's lock and keeps the machine code on disk.
+
+    Args:
+        function: the function, where the decorator is used without options.
+        options: of `numba.njit`; `nogil` is True unless given.
+    """
+    if function is None:
+        return lambda decorated: kernel(decorated, **options)
+    dispatcher = numba.njit(**{"nogil": True, **options})(function)
+    if _cache_folder(Path(function.__code__.co_filename).resolve()) is not None:
+        _enable_caching(dispatcher)
+    return dispatcher
+
+
+class KernelLocator:
+    """Tells numba where a function's machine code is kept (its interface of `NUMBA_CACHE_LOCATOR_CLASSES`)."""
+
+    def __init__(self, folder: Path, first_line: int):
+        self._folder, self._first_line = folder, first_line
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> KernelLocator | None:
+        """Returns the locator of a function, None where no folder can be written."""
+        folder = _cache_folder(Path(file).resolve())
+        return cls(folder, function.__code__.co_firstlineno) if folder is not None else None
+
+    def ensure_cache_path(self) -> None:
+        """Makes the folder again if it was removed since."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        """Returns the folder."""
+        return str(self._folder)
+
+    def get_source_stamp(self) -> str:
+        """Returns the hash of the sources, which numba compares with that of the kept code."""
+        return self._folder.name
+
+    def get_disambiguator(self) -> str:
+        """Returns the function's first line, which tells functions of one name apart."""
+        return str(self._first_line)
+
+
+def cache_root() -> Path:
+    """Returns the folder of all compiled code: `NUMBA_CACHE_DIR` if set, else in the user's cache folder."""
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(chosen) if chosen else Path(platformdirs.user_cache_dir("seabed-twin", appauthor=False)) / "kernels"
+
+
+def source_hash(file: Path) -> str:
+    """Returns a hash of a source file, of all project files that it imports, of numba and of the processor."""
+    sources = (path.read_bytes() for path in sorted(_reachable(file)))
+    compiler = f"{numba.__version__} {llvmlite.__version__} {_processor()}".encode()
+    return sha256(b"\0".join((compiler, *sources))).hexdigest()[:16]
+
+
+@cache
+def _cache_folder(file: Path) -> Path | None:
+    """Returns the folder of one module's compiled code, or None where no folder can be written."""
+    module = cache_root() / _module_name(file)
+    folder = module / source_hash(file)
+    try:
+        is_new = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True)
+        os.utime(folder)
+    except OSError:
+        return None
+    if not os.access(folder, os.W_OK):
+        return None
+    if is_new:
+        _prune(module)
+    return folder
+
+
+def _module_name(file: Path) -> str:
+    """Returns the dotted name of a module of the project, or the file's name for one outside of it."""
+    inside = file.is_relative_to(_ROOT)
+    return ".".join(file.relative_to(_ROOT).with_suffix("").parts) if inside else file.stem
+
+
+def _prune(module: Path) -> None:
+    versions = sorted(module.iterdir(), key=_last_use, reverse=True)
+    for old in versions[_VERSIONS_KEPT:]:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+def _last_use(folder: Path) -> float:
+    try:
+        return folder.stat().st_mtime
+    except FileNotFoundError:  # another process has just removed it
+        return 0.0
+
+
+def _enable_caching(dispatcher: Any) -> None:
+    """Sets `KernelLocator` for this function alone; numba's setting is one for all packages of the process."""
+    before = numba.config.CACHE_LOCATOR_CLASSES  # pyright: ignore[reportAttributeAccessIssue]
+    numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        dispatcher.enable_caching()
+    finally:
+        numba.config.CACHE_LOCATOR_CLASSES = before  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _reachable(file: Path) -> set[Path]:
+    """Returns the file and all files of the project that it imports, directly or not."""
+    found, waiting = {file}, [file]
+    while waiting:
+        for imported in _imports(waiting.pop()) - found:
+            found.add(imported)
+            waiting.append(imported)
+    return found
+
+
+@cache
+def _imports(file: Path) -> frozenset[Path]:
+    """Returns the project's files that a file imports, packages by their `__init__.py`."""
+    names: set[str] = set()
+    for dots, module, imported in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        package = _package_of(file, len(dots)) + module
+        names |= {package, *(f"{package}.{name}".lstrip(".") for name in _NAME.findall(imported))}
+    return frozenset(path for name in names if (path := _file_of(name)) is not None)
+
+
+def _package_of(file: Path, level: int) -> str:
+    """Returns the package, with a final dot, that an import of this level starts from."""
+    return _module_name(file.parents[level - 1] / "__init__.py").removesuffix("__init__") if level else ""
+
+
+@cache
+def _file_of(name: str) -> Path | None:
+    """Returns the source file of a module of the project, None for any other name."""
+    path = _ROOT.joinpath(*name.split("."))
+    candidates = (path.with_name(path.name + ".py"), path / "__init__.py")
+    return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+@cache
+def _processor() -> str:
+    return f"{llvmlite.binding.get_host_cpu_name()} {llvmlite.binding.get_host_cpu_features().flatten()}"
