@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count, image_size
 from terrains.ground_cover import DEFAULT_COVERS
+from terrains.holes import check_no_undeclared_holes
 from terrains.terrain import Terrain, texture_shape
 from terrains.textures import TextureSource, generate_texture, texture_from_photo
 from terrains.vertical import Direction, VerticalAxis, upward_sign
@@ -107,9 +108,10 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
 
         grid = HeightGrid(*read_geotiff(file, height_spacing_m))
     elif suffix == ".png":
-        grid = HeightGrid(_read_png(file) * height_range_m, height_spacing_m, named)
+        grid = HeightGrid(_read_png(file) * height_range_m, height_spacing_m, named._replace(band_name="height"))
     elif suffix == ".npy":
         grid = HeightGrid(_read_npy(file), height_spacing_m, named)
+        check_no_undeclared_holes(grid.values, file, "NaN in place of {}")
     else:
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} is not a height file", HEIGHT_FORMATS)
     _check(grid.values, file)

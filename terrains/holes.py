@@ -1,0 +1,38 @@
+"""Cells of a height file without a height."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.file_header import HEIGHT_FIELD
+from twin.errors import TwinError
+
+#: Values that programs write in cells without a height.
+_NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 65535.0)
+#: A value marks holes if it is farther from all heights than this, and than their range times `_MOST_RANGES`.
+_LEAST_GAP, _MOST_RANGES = 100.0, 10.0
+
+
+def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> None:
+    """Raises TwinError if the least or the greatest value is so far from all others that it can only mark holes.
+
+    Args:
+        values: values as stored in the file, NaN or infinite in the holes that it declares.
+        file: the file, for the message.
+        remedy: how to declare the value, which replaces "{}".
+    """
+    finite = values[np.isfinite(values)]
+    for value in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
+        heights = finite[(finite != value) & ~np.isin(finite, _NODATA)]
+        if heights.size == 0:
+            continue
+        low, high = heights.min(), heights.max()
+        if max(low - value, value - high) > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
+            raise TwinError(
+                HEIGHT_FIELD, f"{file.name!r} has the value {value:g} in {np.count_nonzero(finite == value)} cells,"
+                f" far from all others ({low:g} to {high:g}), and does not declare it as nodata",
+                remedy.format(f"{value:g}"),
+            )  # fmt: skip
