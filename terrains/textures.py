@@ -158,7 +158,7 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     except (OSError, cv2.error):
         image = None
     if image is not None and image.dtype == np.uint16:
-        image = eight_bits(image, int(image.max()))
+        image = eight_bits(np.asarray(image, np.uint16), int(image.max()))
     if image is None or image.dtype != np.uint8:
         raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", "PNG, JPEG, TIFF or another image")
     return np.asarray(image, dtype=np.uint8)
