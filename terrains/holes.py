@@ -62,8 +62,8 @@ def known_nodes(given: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
         return None
     from scipy import ndimage
 
-    holes, n = ndimage.label(~given, np.ones((3, 3)))  # pyright: ignore
-    distance = np.asarray(ndimage.distance_transform_edt(~given))
+    labelled, n = ndimage.label(~given, np.ones((3, 3)))  # pyright: ignore
+    holes, distance = np.asarray(labelled, np.int64), np.asarray(ndimage.distance_transform_edt(~given))
     small = np.append(False, np.asarray(ndimage.maximum(distance, holes, np.arange(1, n + 1))) <= _SMALL)
     small[np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])] = False  # open at the border
     known = given | small[holes]

@@ -191,17 +191,18 @@ def _loaded(file: Path, field: str) -> Any:
         TwinError: a material or texture file that it names is missing, or a texture is not an image.
     """
     import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
-    from PIL import Image, UnidentifiedImageError
+    from PIL import Image
+    from trimesh.resolvers import FilePathResolver
 
     unread: list[str] = []  # trimesh goes on without the files that it cannot read
 
-    class Resolver(trimesh.resolvers.FilePathResolver):
+    class Resolver(FilePathResolver):
         def get(self, name: str) -> bytes:
             try:
                 data = super().get(name)
                 if not name.lower().endswith((".mtl", ".bin")):
                     Image.open(io.BytesIO(data)).close()
-            except (OSError, ValueError, UnidentifiedImageError):
+            except (OSError, ValueError):
                 unread.append(name.strip())
                 raise
             return data
