@@ -5,6 +5,9 @@ from __future__ import annotations
 import warnings
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from terrains.terrain import MAX_NODES, MAX_TEXELS
 from twin.errors import TwinError
 
@@ -24,6 +27,17 @@ def check_texel_count(cols: int, rows: int, file: Path, field: str = TEXTURE_FIE
     """Raises TwinError, naming the key `field`, if a texture image has more than MAX_TEXELS pixels."""
     if cols * rows > MAX_TEXELS:
         raise TwinError(field, f"{file.name!r} has {cols} x {rows} pixels", f"at most {MAX_TEXELS} pixels")
+
+
+def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
+    """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower 8, 10, 12 or 14 only.
+
+    Args:
+        values: the pixels.
+        brightest: greatest value of the whole image; white is the greatest value of the fewest bits that contain it.
+    """
+    white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
+    return np.clip(np.rint(values * (255.0 / white)), 0, 255).astype(np.uint8)
 
 
 def image_size(file: Path) -> tuple[int, int] | None:

@@ -12,9 +12,12 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
+from rasterio.enums import ColorInterp
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.warp import transform
 
 from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count
+from terrains.holes import check_no_undeclared_holes
 from terrains.vertical import VerticalAxis, cf_direction, unit_length_m
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
@@ -23,12 +26,15 @@ from twin.errors import TwinError
 _BAND_TAGS = ("long_name", "standard_name")
 #: Tags of a file that may name the quantity of its values.
 _FILE_TAGS = ("TIFFTAG_IMAGEDESCRIPTION", "TIFFTAG_DOCUMENTNAME", "title")
+#: Largest |ground scale - 1| of a grid whose distances are used as they are: 0.001 in a UTM zone.
+_MAX_SCALE_ERROR = 0.005
+_EQUATOR_M, _ECCENTRICITY2 = 6_378_137.0, 0.00669438  #: ellipsoid WGS 84
 
 
 def read_geotiff(
     file: Path, height_spacing_m: float
 ) -> tuple[NDArray[np.float64], float, VerticalAxis, Georeference | None]:
-    """Reads a GeoTIFF with one band of heights.
+    """Reads a GeoTIFF with one band of heights, and possibly an alpha band, which is 0 where there is no height.
 
     Args:
         file: the GeoTIFF.
@@ -53,24 +59,46 @@ def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -
     """Returns heights, grid spacing, vertical axis and georeference of an open raster, as `read_geotiff` does.
 
     Raises:
-        TwinError: the file is an image, has too many heights, or its grid or the unit of its heights is not supported.
+        TwinError: the file is an image, has too many heights or an undeclared value for holes, or its grid or the unit
+            of its heights is not supported.
     """
-    if source.count != 1 or source.dtypes[0] in ("uint8", "int8"):
+    if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
         bands = f"{source.count} band(s) of {source.dtypes[0]}"
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} is an image, not heights: {bands}", HEIGHT_FORMATS)
     check_height_count(source.width, source.height, file)
     horizontal, vertical = crs_parts(source.crs)
-    axis = _vertical_axis(source, vertical, file)
+    axis = _vertical_axis(source, horizontal, vertical, file)
     georeference, spacing_m = None, height_spacing_m
     if not source.transform.is_identity:
         _check_grid(source, file)
+        _check_ground_scale(source, file)
         factor = _axis_unit_m(horizontal)
         spacing_m = float(source.transform.a * factor)
         east, north = _centre(source)
         wkt = _output_crs(source.crs, horizontal, vertical)
         georeference = Georeference(east, north, 0.0, wkt, factor, axis.datum)
+    return _values(source, file), spacing_m, axis, georeference
+
+
+def _values(source: rasterio.DatasetReader, file: Path) -> NDArray[np.float64]:
+    """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes.
+
+    Raises:
+        TwinError: a second band is not a mask, holes have an undeclared value, or the scale is 0 or not finite.
+    """
+    scale, offset = source.scales[0], source.offsets[0]
+    if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} has the band scale {scale:g} and offset {offset:g}",
+                        "a finite scale other than 0, a finite offset")  # fmt: skip
     band = source.read(1, masked=True)
-    return np.ma.filled(band.astype(np.float64), np.nan), spacing_m, axis, georeference
+    values = np.ma.filled(band.astype(np.float64), np.nan)
+    if source.count == 2:
+        alpha = source.read(2)
+        if source.colorinterp[1] != ColorInterp.alpha and not np.isin(alpha, [0, alpha.max()]).all():
+            raise TwinError(HEIGHT_FIELD, f"{file.name!r} has a second band that is not a mask", HEIGHT_FORMATS)
+        values[~(alpha > 0)] = np.nan
+    check_no_undeclared_holes(values, file, "gdal_edit.py -a_nodata {} " + file.name)
+    return values * scale + offset
 
 
 def crs_parts(crs: CRS | None) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
@@ -90,24 +118,32 @@ def _axis_unit_m(crs: dict[str, Any] | None) -> float:
     return float(unit["conversion_factor"]) if isinstance(unit, dict) else 1.0
 
 
-def _vertical_axis(source: rasterio.DatasetReader, vertical: dict[str, Any] | None, file: Path) -> VerticalAxis:
+def _vertical_axis(
+    source: rasterio.DatasetReader, horizontal: dict[str, Any] | None, vertical: dict[str, Any] | None, file: Path
+) -> VerticalAxis:
     """Returns the vertical axis that the vertical CRS, the band's unit and the tags describe.
 
     The unit of the band takes precedence over that of the vertical CRS; without either, heights are in metres.
 
     Raises:
-        TwinError: the unit of the band is unknown.
+        TwinError: the unit of the band is unknown, or is not stated in a CRS that is not in metres.
     """
     tags, file_tags = source.tags(1), source.tags()
     names = [source.descriptions[0] or "", *(tags.get(key, "") for key in _BAND_TAGS)]
     direction = vertical["coordinate_system"]["axis"][0]["direction"] if vertical is not None else None
     unit = source.units[0] or tags.get("units", "")
+    if not unit and vertical is None and (unit_m := _axis_unit_m(horizontal)) != 1.0 and not _in_degrees(source):
+        raise TwinError(
+            HEIGHT_FIELD, f"{file.name!r} has a CRS in units of {unit_m:.7g} m, and no unit of its heights",
+            f"a unit of the band, e.g. by gdal_edit.py -units ft {file.name} or -units m",
+        )  # fmt: skip
     return VerticalAxis(
         direction if direction in ("up", "down") else cf_direction(tags),
         unit_length_m(unit, file) if unit else _axis_unit_m(vertical),
         next(filter(None, names), ""),
         (file.stem, *names, *(file_tags.get(key, "") for key in _FILE_TAGS)),
         "" if vertical is None else str(vertical["name"]),
+        source.crs is not None,
     )
 
 
@@ -130,16 +166,50 @@ def _output_crs(crs: CRS | None, horizontal: dict[str, Any] | None, vertical: di
 def _check_grid(source: rasterio.DatasetReader, file: Path) -> None:
     """Raises TwinError if the grid is in degrees, is not north up, or its cells are not square."""
     t = source.transform
-    if source.crs is not None and source.crs.is_geographic:
+    if _in_degrees(source):
         raise TwinError(
             HEIGHT_FIELD, f"{file.name!r} is in degrees", "a projected or local grid in metres, e.g. by "
             f"gdalwarp -t_srs EPSG:{_utm_epsg(*_centre(source))} -tr CELL_M CELL_M {file.name} projected.tif",
         )  # fmt: skip
-    if t.b != 0 or t.d != 0 or t.a <= 0 or t.e >= 0 or abs(t.a + t.e) > 1e-3 * t.a:
+    if max(abs(t.b), abs(t.d)) > 1e-6 * abs(t.a) or t.a <= 0 or t.e >= 0 or abs(t.a + t.e) > 1e-3 * t.a:
         raise TwinError(
             HEIGHT_FIELD, f"{file.name!r} is rotated, or its cells are not square",
             f"north up, square cells, e.g. by gdalwarp -tr CELL_M CELL_M {file.name} square.tif",
         )  # fmt: skip
+
+
+def _in_degrees(source: rasterio.DatasetReader) -> bool:
+    return source.crs is not None and source.crs.is_geographic
+
+
+def _check_ground_scale(source: rasterio.DatasetReader, file: Path) -> None:
+    """Raises TwinError if a metre of a projected CRS is not a metre on the ground, e.g. in Web Mercator (EPSG:3857)."""
+    if source.crs is None or not source.crs.is_projected:
+        return
+    scale, longitude, latitude = _ground_scale(source)
+    if np.abs(scale - 1).max() > _MAX_SCALE_ERROR:
+        raise TwinError(
+            HEIGHT_FIELD, f"{file.name!r} is in a CRS with the ground scale {np.sqrt(scale.prod()):.3f} (m on the"
+            " ground / m in the CRS) there", "a CRS with true distances, e.g. by "
+            f"gdalwarp -t_srs EPSG:{_utm_epsg(longitude, latitude)} -tr CELL_M CELL_M {file.name} projected.tif",
+        )  # fmt: skip
+
+
+def _ground_scale(source: rasterio.DatasetReader) -> tuple[NDArray[np.float64], float, float]:
+    """Returns distances on the ellipsoid / distances in the CRS at the centre, along easting and northing (2,).
+
+    They are 1 if the centre is outside the domain of the CRS. Also returns longitude and latitude of the centre [deg].
+    """
+    east, north = _centre(source)
+    step = 100.0 / _axis_unit_m(crs_parts(source.crs)[0])
+    xs, ys = [east, east + step, east], [north, north, north + step]
+    longitude, latitude = (np.array(part) for part in transform(source.crs, "OGC:CRS84", xs, ys)[:2])
+    if not np.isfinite([longitude, latitude]).all():
+        return np.ones(2), 0.0, 0.0
+    phi, root = math.radians(latitude[0]), math.sqrt(1 - _ECCENTRICITY2 * math.sin(math.radians(latitude[0])) ** 2)
+    east_m = np.radians(longitude[1:] - longitude[0]) * _EQUATOR_M / root * math.cos(phi)
+    north_m = np.radians(latitude[1:] - latitude[0]) * _EQUATOR_M * (1 - _ECCENTRICITY2) / root**3
+    return np.hypot(east_m, north_m) / 100.0, float(longitude[0]), float(latitude[0])
 
 
 def _centre(source: rasterio.DatasetReader) -> tuple[float, float]:

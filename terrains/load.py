@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count, image_size
 from terrains.ground_cover import DEFAULT_COVERS
+from terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
 from terrains.terrain import Terrain, texture_shape
 from terrains.textures import TextureSource, generate_texture, texture_from_photo
 from terrains.vertical import Direction, VerticalAxis, upward_sign
@@ -61,7 +62,8 @@ def load(
     """
     read = read_heights(Path(height_file), height_spacing_m, height_range_m)
     upward_m = upward_sign(read.values, read.axis, z, Path(height_file)) * read.axis.metres_per_unit
-    raw, n_filled = fill_holes(read.values[::-1] * upward_m)
+    values = read.values[::-1] * upward_m
+    (raw, n_filled), known = fill_holes(values), known_nodes(np.isfinite(values))
     lowest_m, spacing_m = raw.min(), read.spacing_m
     height_m = (raw - lowest_m).astype(np.float32)
     georeference = read.georeference and replace(read.georeference, elevation_m=float(lowest_m))
@@ -83,7 +85,7 @@ def load(
     walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
     share = None if covered is None else float(covered.mean())
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
-    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share, walls)
+    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share, walls, known)
 
 
 def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightGrid:
@@ -107,25 +109,14 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
 
         grid = HeightGrid(*read_geotiff(file, height_spacing_m))
     elif suffix == ".png":
-        grid = HeightGrid(_read_png(file) * height_range_m, height_spacing_m, named)
+        grid = HeightGrid(_read_png(file) * height_range_m, height_spacing_m, named._replace(band_name="height"))
     elif suffix == ".npy":
         grid = HeightGrid(_read_npy(file), height_spacing_m, named)
+        check_no_undeclared_holes(grid.values, file, "NaN in place of {}")
     else:
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} is not a height file", HEIGHT_FORMATS)
     _check(grid.values, file)
     return grid
-
-
-def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Replaces NaN and infinite values by the nearest height; returns the heights and the number of replaced values."""
-    holes = ~np.isfinite(height_m)
-    if not holes.any():
-        return height_m, 0
-    from scipy import ndimage  # imported here: it takes 0.1 s, and most terrains have no holes
-
-    nearest = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
-    assert nearest is not None
-    return height_m[tuple(nearest)], int(holes.sum())
 
 
 def _read_png(file: Path) -> NDArray[np.float64]:

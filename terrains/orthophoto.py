@@ -15,13 +15,14 @@ from rasterio.transform import Affine, array_bounds
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
-from terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count
+from terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count, eight_bits
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
 
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
 _NO_PALETTE = "a GeoTIFF with bands of colour: gdal_translate -expand rgb writes one"
 _COLOURS = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+_MOST_SAMPLED = 2048  #: rows and columns of an orthophoto from which its greatest value is found
 _MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than the texels along each axis, no more
 
 
@@ -101,9 +102,17 @@ def _read(
         values = warped.read(bands)
         covered = warped.dataset_mask() > 0
     if values.dtype == np.uint16:
-        values = np.rint(values / 257.0)
+        values = eight_bits(values, _brightest(source, bands))
     colour = np.moveaxis(values.astype(np.uint8), 0, 2)
     return np.ascontiguousarray(np.broadcast_to(colour, (*shape, 3))), covered
+
+
+def _brightest(source: rasterio.DatasetReader, bands: list[int]) -> int:
+    """Returns the greatest value of an orthophoto: that of the bits that the file states (NBITS), else of a sample."""
+    if bits := source.tags(bands[0], ns="IMAGE_STRUCTURE").get("NBITS"):
+        return 2 ** int(bits) - 1
+    shape = (len(bands), min(source.height, _MOST_SAMPLED), min(source.width, _MOST_SAMPLED))
+    return int(source.read(bands, out_shape=shape).max())
 
 
 def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:

@@ -27,10 +27,12 @@ class Terrain:
         west_m, south_m: position of node (0, 0).
         texture: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH.
         texture_px_m: side of a texel along x; along y, it may differ by rounding.
-        n_filled: number of nodes without a height in the source, filled with the nearest height.
+        n_filled: number of nodes without a height in the source, filled with the nearest height, for rendering.
         georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
         orthophoto_share: share of the texels that an orthophoto covers; None without an orthophoto.
         walls: texture of the steep parts; None: the texture is projected from above everywhere.
+        known: (ny, nx) bool, nodes with a height in the source or in a small hole of it (`holes.known_nodes`); only
+            over these is a survey planned and judged. None: all nodes.
     """
 
     height_m: NDArray[np.float32]
@@ -43,6 +45,7 @@ class Terrain:
     georeference: Georeference | None = None
     orthophoto_share: float | None = None
     walls: Walls | None = None
+    known: NDArray[np.bool_] | None = None
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -69,6 +72,30 @@ class Terrain:
     def highest_m(self) -> float:
         """Returns the greatest height [m]."""
         return float(self.height_m.max())
+
+    @property
+    def hole_notes(self) -> list[str]:
+        """Returns a sentence on the nodes without a height in the source, in a list; empty if there are none."""
+        n, n_unknown = self.height_m.size, 0 if self.known is None else int((~self.known).sum())
+        n_small = self.n_filled - n_unknown
+        unknown = f"{n_unknown} of {n} cells of the floor ({100 * n_unknown / n:.3g} %) have no height: they are"
+        small = f"{n_small} cells of the floor, in small holes, have the nearest height."
+        return [
+            *([f"{unknown} neither planned over nor judged, and drawn with the nearest height."] if n_unknown else []),
+            *([small] if n_small else []),
+        ]
+
+    def in_hole(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
+        """Returns whether each point (x, y) lies in a cell with an unknown node; false outside the terrain."""
+        x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        if self.known is None:
+            return np.zeros(x.shape, np.bool_)
+        col, row = (x - self.west_m) / self.spacing_m, (y - self.south_m) / self.spacing_m
+        ny, nx = self.known.shape
+        inside = (col >= 0) & (col <= nx - 1) & (row >= 0) & (row <= ny - 1)
+        c, r = (np.clip(np.nan_to_num(k), 0, n - 2).astype(np.int64) for k, n in ((col, nx), (row, ny)))
+        whole = self.known[1:, 1:] & self.known[1:, :-1] & self.known[:-1, 1:] & self.known[:-1, :-1]
+        return inside & ~whole[r, c]
 
     def height_at(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
         """Returns the height of the floor at points (x, y) [m]; NaN outside the terrain.

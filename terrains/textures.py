@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.file_header import TEXTURE_FIELD, check_texel_count, image_size
+from terrains.file_header import TEXTURE_FIELD, check_texel_count, eight_bits, image_size
 from terrains.ground_cover import COVERS, paint
 from terrains.noise import fractal_field, pink_noise
 from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
@@ -153,10 +153,13 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     if (size := image_size(file)) is not None:
         check_texel_count(*size, file)
     try:
-        image = None if size is None else cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_COLOR_RGB)
+        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
+        image = None if size is None else cv2.imdecode(np.fromfile(file, np.uint8), flags)
     except (OSError, cv2.error):
         image = None
-    if image is None:
+    if image is not None and image.dtype == np.uint16:
+        image = eight_bits(np.asarray(image, np.uint16), int(image.max()))
+    if image is None or image.dtype != np.uint8:
         raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", "PNG, JPEG, TIFF or another image")
     return np.asarray(image, dtype=np.uint8)
 

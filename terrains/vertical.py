@@ -26,6 +26,8 @@ UNITS_M = {
 _DEPTH_WORD = re.compile(r"depth|sounding", re.IGNORECASE)
 #: Band names that state depths. If the band has no negative value, its values increase downwards.
 _DEPTH_BAND = re.compile(r"^\s*(water |sea ?floor |bottom )?depths?\b", re.IGNORECASE)
+#: Band names that state heights.
+_HEIGHT_BAND = re.compile(r"elevation|height|altitude", re.IGNORECASE)
 #: Beginnings of standard names that the CF conventions define as positive downwards.
 _CF_DEPTHS = ("depth", "sea_floor_depth")
 
@@ -39,6 +41,7 @@ class VerticalAxis(NamedTuple):
         band_name: description, long name or standard name of the band, the first that is given; "" if none is.
         texts: file name, names and tags that may name the quantity of the values.
         datum: name of the vertical CRS; "" if there is none.
+        in_crs: whether the file names a CRS. There, a sea floor has no positive elevations.
     """
 
     direction: Direction | None = None
@@ -46,6 +49,7 @@ class VerticalAxis(NamedTuple):
     band_name: str = ""
     texts: tuple[str, ...] = ()
     datum: str = ""
+    in_crs: bool = False
 
 
 def unit_length_m(name: str, file: Path) -> float:
@@ -87,6 +91,8 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
     if axis.direction is not None:
         return 1.0 if axis.direction == "up" else -1.0
     named = [text for text in (axis.band_name, *axis.texts) if _DEPTH_WORD.search(text)]
+    if not named and low > (0 if axis.in_crs else high - low) and not _HEIGHT_BAND.search(axis.band_name):
+        raise _ambiguous(f"{shown}, all positive, does not state whether they are heights or depths")
     if not named or high <= 0:  # depths as negative numbers increase upwards
         return 1.0
     if low >= 0 and _DEPTH_BAND.search(axis.band_name):

@@ -9,6 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin.errors import ScenarioError, TwinError
+from twin.imaging.bands import NM
+from twin.imaging.water import read_spectrum
 from twin.scenario.file import dump_toml, load_scenario
 from twin.scenario.model import EstimateConfig, Scenario
 from twin.scenario.toml_lines import key_lines
@@ -236,6 +238,13 @@ def test_a_missing_scenario_is_reported_with_the_names_available():
     assert raised.value.lines == [
         f"quikstart: no such scenario (did you mean quickstart?) (allowed: a file, or one of {', '.join(SCENES)})"
     ]
+
+
+def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path):
+    (tmp_path / "marked.toml").write_text("[plan]\naltitude_m = 2.0", "utf-8-sig")
+    assert load_scenario(tmp_path / "marked.toml").plan.altitude_m == 2.0
+    (tmp_path / "water.csv").write_text("400, 0.1, 0.2\n700, 0.5, 0.1", "utf-8-sig")
+    assert read_spectrum(tmp_path / "water.csv")[0] == pytest.approx(0.1 + 0.4 * (NM - 400) / 300)
 
 
 def test_an_unreadable_file_is_reported(tmp_path):

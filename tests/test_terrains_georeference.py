@@ -1,5 +1,6 @@
 """CRS, vertical unit and direction of a measured DEM, and limits on its size, which are read from the header."""
 
+import re
 import resource
 import struct
 import zlib
@@ -82,7 +83,7 @@ def test_depths_that_a_file_declares_give_the_floor_of_their_negative(tmp_path, 
 @pytest.mark.parametrize(("z", "sign"), [("up", 1), ("down", -1)])
 def test_terrain_z_overrides_what_the_file_declares(tmp_path, z, sign):
     file = write(tmp_path / "dem.tif", -HEIGHTS, crs=DEPTH_CRS)
-    np.testing.assert_array_equal(load(file, z).height_m, load(write(tmp_path / "b.tif", -sign * HEIGHTS)).height_m)
+    np.testing.assert_array_equal(load(file, z).height_m, load(write(tmp_path / "b.tif", -sign * HEIGHTS - 5)).height_m)
 
 
 def test_a_numpy_file_with_depths_is_read_with_terrain_z(tmp_path):
@@ -148,6 +149,100 @@ def test_vertical_units_are_converted_to_metres(tmp_path, written, metre):
 def test_an_unknown_vertical_unit_is_an_error(tmp_path):
     with pytest.raises(TwinError, match="unknown unit 'cubit'"):
         load(write(tmp_path / "dem.tif", HEIGHTS, unit="cubit"))
+
+
+def test_heights_have_the_scale_and_the_offset_of_their_band(tmp_path):
+    up = load(write(tmp_path / "up.tif", HEIGHTS)).height_m
+    for scale, offset in ((0.5, 1.0), (-1.0, -3.0)):
+        file = write(tmp_path / f"{scale}.tif", ((HEIGHTS - offset) / scale).astype(np.int16 if scale > 0 else float))
+        with rasterio.open(file, "r+") as target:
+            target.scales, target.offsets = (scale,), (offset,)
+        scaled = load(file)
+        np.testing.assert_array_equal(scaled.height_m, up)
+        assert scaled.georeference.elevation_m == -4.0
+    with rasterio.open(file, "r+") as target:
+        target.scales = (0.0,)
+    with pytest.raises(TwinError, match="band scale 0 and offset -3"):
+        load(file)
+
+
+@pytest.mark.parametrize("marker", [-9999.0, 9999.0, -32768.0, 1e20, -3.4e38])
+def test_a_value_of_holes_that_is_not_declared_is_named_with_its_number_of_cells(tmp_path, marker):
+    values = np.tile(HEIGHTS, (3, 3))
+    values[2:4, 3:6] = marker
+    with pytest.raises(TwinError, match=re.escape(f"has the value {marker:g} in 6 cells")) as caught:
+        load(write(tmp_path / "dem.tif", values))
+    assert caught.value.allowed == f"gdal_edit.py -a_nodata {np.float32(marker):g} dem.tif"
+    np.save(tmp_path / "dem.npy", values)
+    with pytest.raises(TwinError, match=re.escape(f"has the value {marker:g} in 6 cells")):
+        load(tmp_path / "dem.npy")
+
+
+def test_two_undeclared_values_of_holes_do_not_hide_each_other(tmp_path):
+    values = np.tile(HEIGHTS, (2, 2))
+    values[0, 0], values[0, 1] = -32768.0, -9999.0
+    with pytest.raises(TwinError, match="the value -32768 in 1 cells"):
+        load(write(tmp_path / "dem.tif", values))
+
+
+def test_heights_near_a_usual_value_of_holes_and_two_levels_are_heights(tmp_path):
+    assert load(write(tmp_path / "trench.tif", HEIGHTS - 9997)).highest_m == 3.0
+    assert load(write(tmp_path / "step.tif", np.where(HEIGHTS < -2, -90, -1).astype(np.float32))).highest_m == 89.0
+
+
+@pytest.mark.parametrize(("values", "crs"), [(-HEIGHTS, UTM), (20 - HEIGHTS, None)])
+def test_positive_values_without_a_direction_ask_for_terrain_z(tmp_path, values, crs):
+    with pytest.raises(TwinError, match="all positive, does not state whether") as caught:
+        load(write(tmp_path / "dem.tif", values, crs=crs))
+    assert caught.value.field == "terrain.z"
+    named = write(tmp_path / "named.tif", values, crs=crs, description="elevation_m")
+    np.testing.assert_array_equal(load(named).height_m, load(named, "up").height_m)
+
+
+@pytest.mark.parametrize(
+    ("crs", "north", "scale"), [("EPSG:3857", -5_621_521.0, "0.707"), ("EPSG:3395", 1_900_000.0, "0.957")]
+)
+def test_a_grid_whose_metres_are_not_metres_on_the_ground_is_refused_with_its_scale(tmp_path, crs, north, scale):
+    file = write(tmp_path / "dem.tif", HEIGHTS, crs=crs)
+    with rasterio.open(file, "r+") as target:
+        target.transform = from_origin(16_000_000.0, north, 0.5, 0.5)
+    with pytest.raises(TwinError, match=f"with the ground scale {scale}") as caught:
+        load(file)
+    assert "gdalwarp -t_srs EPSG:32" in caught.value.allowed
+
+
+def test_a_rotation_below_a_millionth_of_a_cell_is_none(tmp_path):
+    file = write(tmp_path / "dem.tif", HEIGHTS)
+    for skew, read in ((1e-12, True), (1e-3, False)):
+        with rasterio.open(file, "r+") as target:
+            target.transform = rasterio.Affine(0.5, skew, 400_000.0, 0.0, -0.5, 8_200_000.0)
+        if read:
+            assert load(file).spacing_m == 0.5
+        else:
+            with pytest.raises(TwinError, match="is rotated"):
+                load(file)
+
+
+@pytest.mark.parametrize(("mask", "marked"), [(255, True), (1, False), (255, False)])
+def test_an_alpha_band_beside_the_heights_marks_holes(tmp_path, mask, marked):
+    alpha = np.full(HEIGHTS.shape, mask, np.float32)
+    alpha[0, 2] = 0
+    profile = {"driver": "GTiff", "count": 2, "height": 3, "width": 3, "dtype": "float32", "crs": UTM}
+    profile["transform"] = from_origin(400_000.0, 8_200_000.0, 0.5, 0.5)
+    with rasterio.open(tmp_path / "dem.tif", "w", **profile) as target:
+        target.write(np.stack([HEIGHTS, alpha]))
+        if marked:
+            target.colorinterp = [rasterio.enums.ColorInterp.gray, rasterio.enums.ColorInterp.alpha]
+    terrain = load(tmp_path / "dem.tif")
+    assert terrain.n_filled == 1 and terrain.highest_m == 2.0  # without the hole, -4 to -1
+
+
+def test_two_bands_of_heights_are_refused(tmp_path):
+    profile = {"driver": "GTiff", "count": 2, "height": 3, "width": 3, "dtype": "float32"}
+    with rasterio.open(tmp_path / "dem.tif", "w", **profile) as target:
+        target.write(np.stack([HEIGHTS, HEIGHTS]))
+    with pytest.raises(TwinError, match="second band that is not a mask"):
+        load(tmp_path / "dem.tif")
 
 
 def test_a_grid_in_degrees_names_the_projection_to_use(tmp_path):

@@ -75,8 +75,14 @@ def test_the_texture_image_is_tiled_from_the_north_west_corner(tmp_path: Path) -
 
 
 def test_feet_are_converted_to_metres(tmp_path: Path) -> None:
-    file = write_tiff(tmp_path / "dem.tif", HEIGHTS, crs="EPSG:2222", spacing=10.0)  # Arizona East, international feet
-    assert load(file).spacing_m == pytest.approx(3.048)
+    written = {"crs": "EPSG:2222", "spacing": 10.0}  # Arizona East, international feet
+    file = write_tiff(tmp_path / "dem.tif", HEIGHTS - 5, **written)
+    with pytest.raises(TwinError, match=r"a CRS in units of 0.3048 m, and no unit of its heights .*-units ft dem.tif"):
+        load(file)
+    with rasterio.open(file, "r+") as target:
+        target.units = ("ft",)
+    terrain = load(file)
+    assert (terrain.spacing_m, terrain.highest_m) == pytest.approx((3.048, 3 * 0.3048))
 
 
 BAD = [

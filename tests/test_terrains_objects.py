@@ -275,6 +275,21 @@ def test_objects_that_do_not_fit_are_errors(keys, field, problem):
     assert raised.value.field == field
 
 
+@pytest.mark.parametrize("missing", ["square.mtl", "reef.png", "square.ply"])
+def test_a_file_that_a_mesh_names_and_is_not_there_is_an_error_that_names_it(missing, tmp_path):
+    """The mesh would be grey; `square.ply` stands for a texture file that is no image."""
+    (tmp_path / "square.mtl").write_text("newmtl reef\nmap_Kd reef.png\n")
+    mesh = "mtllib square.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nusemtl reef\nf 1/1 2/2 3/3\n"
+    (tmp_path / "square.obj").write_text(mesh)
+    (tmp_path / "reef.png").write_bytes(b"no image")
+    named = "reef.png" if missing == "square.ply" else missing
+    if missing != "square.ply":
+        (tmp_path / missing).unlink()
+    for load in (read, lambda file: mesh_file.read_textured_mesh(file, FIELD)):
+        with pytest.raises(TwinError, match=f"'square.obj' needs the file '{named}'"):
+            load(tmp_path / "square.obj")
+
+
 def test_a_grey_texture_of_16_bits_keeps_its_brightness(tmp_path):
     """30000 of 65535 is 117 of 255; Pillow's conversion to RGB gives 255."""
     from PIL import Image

@@ -116,10 +116,12 @@ def test_the_texture_of_a_photo_is_the_same_for_every_seed(pebbles: np.ndarray, 
     assert np.array_equal(repeated.texture[:200, :200], repeated.texture[200:, 200:])
 
 
-def write(file: Path, bands: np.ndarray, west: float, north: float, pixel: float, crs: str | None) -> Path:
+def write(
+    file: Path, bands: np.ndarray, west: float, north: float, pixel: float, crs: str | None, **options: int
+) -> Path:
     with rasterio.open(
         file, "w", driver="GTiff", count=bands.shape[0], height=bands.shape[1], width=bands.shape[2],
-        dtype=bands.dtype, crs=crs, transform=Affine(pixel, 0.0, west, 0.0, -pixel, north),
+        dtype=bands.dtype, crs=crs, transform=Affine(pixel, 0.0, west, 0.0, -pixel, north), **options,
     ) as target:  # fmt: skip
         target.write(bands)
     return file
@@ -195,6 +197,23 @@ def test_alpha_order_of_the_bands_and_direction_of_the_rows_of_an_orthophoto_are
         assert found.orthophoto_share == pytest.approx(0.5, abs=0.02)
     else:
         assert np.array_equal(found.texture, expected.texture)
+
+
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_a_photo_of_fewer_bits_in_16_keeps_its_brightness(dem: Path, tmp_path: Path, bits: int) -> None:
+    eight = coloured_photo()
+    bands = np.rint(eight * ((2**bits - 1) / 255)).astype(np.uint16)
+    for name, option in (("plain", {}), ("stated", {"NBITS": bits})):
+        file = write(tmp_path / f"{name}.tif", bands, WEST, NORTH, 0.02, CRS, **option)
+        terrain = terrains.load(dem, terrains.TextureSource(0.02, orthophoto_file=file), 1.0, 1.0, 0)
+        plain = write(tmp_path / "8.tif", eight, WEST, NORTH, 0.02, CRS)
+        expected = terrains.load(dem, terrains.TextureSource(0.02, orthophoto_file=plain), 1.0, 1.0, 0)
+        np.testing.assert_allclose(terrain.texture, expected.texture, atol=1)
+    textures = []
+    for values in (bands, eight):
+        cv2.imwrite(str(tmp_path / "photo.png"), np.moveaxis(values, 0, 2))
+        textures.append(texture_from_photo(terrains.TextureSource(0.02, tmp_path / "photo.png"), (50, 60), (1.2, 1.0)))
+    np.testing.assert_array_equal(*textures)
 
 
 def test_an_orthophoto_with_a_palette_is_rejected(dem: Path, tmp_path: Path) -> None:

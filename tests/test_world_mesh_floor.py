@@ -276,6 +276,7 @@ def test_holes_have_the_height_of_the_nearest_node(tmp_path):
     hole = np.maximum(np.abs(x), np.abs(y)) < 0.15
     around = REEF.height_at(x, y)[np.maximum(np.abs(x), np.abs(y)) < 0.35]
     assert surface.height_m[hole].min() > around.min() - 0.1 and surface.height_m[hole].max() < around.max()
+    assert mission.terrain.in_hole(x, y)[hole].all() and not mission.asked(x, y)[hole].any()
 
 
 def bad_meshes(folder: Path) -> None:

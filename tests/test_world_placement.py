@@ -109,7 +109,7 @@ def test_a_generated_floor_has_no_coordinates():
 CORNERS = np.array([[-1.0, -0.5], [1.0, -0.5], [0.5, 0.8], [-1.0, -0.5]])
 
 
-@pytest.mark.parametrize("form", ["dem", "named", "degrees", "feature"])
+@pytest.mark.parametrize("form", ["dem", "named", "degrees", "feature", "byte order mark"])
 def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_path, form):
     points = CORNERS + CENTRE
     tree = {"type": "Polygon", "coordinates": [points.tolist()]}
@@ -120,7 +120,7 @@ def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_pat
         tree["crs"] = {"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::28355"}}
     if form == "feature":
         tree = {"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": tree}]}
-    (tmp_path / "area.geojson").write_text(json.dumps(tree))
+    (tmp_path / "area.geojson").write_text(json.dumps(tree), "utf-8-sig" if form == "byte order mark" else "utf-8")
     terrain = mission(dem).terrain
     np.testing.assert_allclose(read_geojson(tmp_path / "area.geojson", terrain), CORNERS, atol=1e-3)
     area = survey_area(PlanConfig(polygon=str(tmp_path / "area.geojson"), heading_deg=20), terrain)

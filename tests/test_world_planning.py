@@ -13,6 +13,7 @@ from twin.errors import ScenarioError, TwinError
 from twin.judge.overlap import overlap_metrics
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
+from twin.world.clearance import path_points
 from twin.world.coverage import true_heights
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread
 from twin.world.mission import prepare
@@ -183,6 +184,16 @@ def test_the_clearance_of_a_following_path_is_checked_where_it_flies(monkeypatch
     pillar = floor(lambda x, y: np.where(np.hypot(x - 0.5, y) < 0.15, 1.8, 0.0))
     with pytest.raises(ScenarioError, match=r"plan.altitude_m: 2: the cameras come within 0\.\d+ m of the floor"):
         over(pillar, monkeypatch, "plan.height=floor", "plan.overlap_reference=plane")
+
+
+@pytest.mark.parametrize("grade", [0.25, 0.45, -0.45])
+def test_a_path_over_a_slope_higher_than_the_altitude_follows_it(grade, monkeypatch):
+    """The level path at 1.2 m would lie below the upper part of the slope."""
+    slope = floor(lambda x, y: 1.0 + grade * x)
+    mission = over(slope, monkeypatch, "plan.height=floor", "plan.altitude_m=1.2", "plan.area_m=[5.0, 1.0]")
+    x, y, z = path_points(mission.plan).T
+    assert np.ptp(z) > 4.9 * abs(grade)
+    assert z - slope.height_at(x, y) == pytest.approx(1.2, abs=0.03)
 
 
 def test_a_kinematic_vehicle_cannot_follow_the_floor():

@@ -134,7 +134,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         start = self._world.reference
         self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
         grid = self._world.mission.grid
-        self._asked = self._world.mission.plan.inside_area(*np.meshgrid(*grid.centres()))
+        self._asked = self._world.mission.asked(*np.meshgrid(*grid.centres()))
         self._covered_m2 = self._seen_m2()
         self._ended = ""
         return self._observation(), self._info()

@@ -56,11 +56,9 @@ def run(
     mission = prepare(scenario)
     stopwatch, guard = Stopwatch(), StageGuard()
     with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
-        if mission.terrain.n_filled:
-            folder.log("terrain holes filled", cells=mission.terrain.n_filled)
         if (share := mission.terrain.orthophoto_share) is not None and share < 1.0:
             folder.log("orthophoto covers a part of the floor; the rest has the other texture", share=round(share, 4))
-        for warning in world.warnings:
+        for warning in (*mission.terrain.hole_notes, *world.warnings):
             folder.log("warning", text=warning)
         monitor = SurveyMonitor(mission, folder, progress, live)
         images = scenario.imaging.fidelity == "rendered" and outputs is not None

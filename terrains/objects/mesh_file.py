@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from terrains.file_header import eight_bits
 from terrains.objects.mesh import Mesh, joined, welded_faces
 from terrains.objects.mesh_header import FORMATS, face_count
 from twin.core.paths import is_file
@@ -129,14 +131,14 @@ def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> 
     """Returns the result of `convert` for the trimesh meshes of a file, whose size is checked first.
 
     Raises:
-        TwinError: the file is missing, unreadable or too large.
+        TwinError: the file is missing, unreadable or too large, or a material or texture file that it names is.
     """
     if not is_file(file):
         raise TwinError(field, f"no such file {str(file)!r}", FORMATS)
     _check_size(file, field)
     try:
-        return convert(_near_origin(_parts(_loaded(file))))
-    except MemoryError:
+        return convert(_near_origin(_parts(_loaded(file, field))))
+    except (MemoryError, TwinError):
         raise
     except Exception as error:  # trimesh raises any of many types for a damaged file
         reason = " ".join(str(error).split())[:200]
@@ -182,11 +184,34 @@ def _check_size(file: Path, field: str) -> None:
         raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
 
 
-def _loaded(file: Path) -> Any:
-    """Returns the trimesh scene or mesh of a file."""
-    import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
+def _loaded(file: Path, field: str) -> Any:
+    """Returns the trimesh scene or mesh of a file.
 
-    return trimesh.load(file, process=False)
+    Raises:
+        TwinError: a material or texture file that it names is missing, or a texture is not an image.
+    """
+    import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
+    from PIL import Image
+    from trimesh.resolvers import FilePathResolver
+
+    unread: list[str] = []  # trimesh goes on without the files that it cannot read
+
+    class Resolver(FilePathResolver):
+        def get(self, name: str) -> bytes:
+            try:
+                data = super().get(name)
+                if not name.lower().endswith((".mtl", ".bin")):
+                    Image.open(io.BytesIO(data)).close()
+            except (OSError, ValueError):
+                unread.append(name.strip())
+                raise
+            return data
+
+    loaded = trimesh.load(file, process=False, resolver=Resolver(str(file)))
+    if unread:
+        problem = f"{file.name!r} needs the file {unread[0]!r}, which is not beside it or cannot be read"
+        raise TwinError(field, problem, "a mesh with all its material and texture files, or one that names none")
+    return loaded
 
 
 def _parts(loaded: Any) -> list[Any]:
@@ -246,13 +271,14 @@ def _textured(part: Any, most_faces: int) -> Mesh | None:
 
 
 def _rgb(image: Any) -> NDArray[np.uint8]:
-    """Returns the colours (h, w, 3) of a PIL image; grey levels of 16 bits are divided by 257.
+    """Returns the colours (h, w, 3) of a PIL image; grey levels of 16 bits become 8 bits.
 
     Pillow gives grey images of 16 bits a mode of integers ("I;16", "I"), whose conversion to RGB clips at 255.
     """
     if not image.mode.startswith("I"):
         return np.asarray(image.convert("RGB"), np.uint8)
-    grey = np.rint(np.clip(np.asarray(image, np.float64), 0, 65535) / 257).astype(np.uint8)
+    values = np.clip(np.asarray(image), 0, 65535)
+    grey = eight_bits(values, int(values.max()))
     return np.repeat(grey[..., None], 3, axis=2)
 
 

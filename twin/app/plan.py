@@ -75,11 +75,12 @@ def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
     mission = summary.mission
     t, top = mission.terrain, summary.floor.surface
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
-    height, top_m = (surface.height_at(*np.meshgrid(x, y)) for surface in (t, top))
+    hole = t.in_hole(*np.meshgrid(x, y))
+    height, top_m = (np.where(hole, np.nan, surface.height_at(*np.meshgrid(x, y))) for surface in (t, top))
     steps = (x[1] - x[0], y[0] - y[1])
     shade = LightSource(315, 45).hillshade(top_m, vert_exag=1, dx=steps[0], dy=steps[1])
     axes.imshow(shade, cmap="gray", vmin=-0.5, vmax=1.1, extent=(t.west_m, t.east_m, t.south_m, t.north_m))
-    if np.ptp(height) > 0:
+    if np.nanmax(height, initial=-np.inf) > np.nanmin(height, initial=np.inf):
         contours = axes.contour(x, y, height, levels=6, cmap="viridis", linewidths=0.8)
         axes.clabel(contours, fmt="%.2f m", fontsize=7)
     if top is not t:

@@ -78,7 +78,8 @@ def summarise(mission: Mission) -> PlanSummary:
     predicted = _predicted_metrics(floor, error)
     limits = {name: limit for name, limit in mission.scenario.require.items() if _known(name, predicted)}
     require = judge_requirements(limits, predicted)
-    warnings = (*_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
+    expected = (*_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
+    warnings = (*(note.removesuffix(".") for note in mission.terrain.hole_notes), *expected)
     return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
 
 

@@ -147,7 +147,7 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # an empty file
-            table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2)
+            table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, encoding="utf-8-sig")
     except (OSError, ValueError) as error:
         raise TwinError(key, f"{file} cannot be read: {error}", wanted) from None
     if table.shape[1] != 3 or len(table) < 2:

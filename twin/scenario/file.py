@@ -178,7 +178,7 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
     """
     try:
-        with file.open(encoding="utf-8") as stream:
+        with file.open(encoding="utf-8-sig") as stream:
             text = stream.read(MAX_CHARACTERS + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None

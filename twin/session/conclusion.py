@@ -93,8 +93,8 @@ def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> 
     survey = EvaluationInput(
         result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
         [
-            *plugin_notes(scenario), *world.warnings, *calibration_notes(result, mission.rig),
-            *filter(None, [actions.sentence]),
+            *plugin_notes(scenario), *mission.terrain.hole_notes, *world.warnings,
+            *calibration_notes(result, mission.rig), *filter(None, [actions.sentence]),
         ],
         idealisations(scenario), actions, None if orthomosaic is None else orthomosaic.metrics,
     )  # fmt: skip

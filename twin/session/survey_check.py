@@ -72,7 +72,7 @@ def _area(mission: Mission, elevation: ElevationMap | None) -> list[Finding]:
 
     An area that is smaller than a cell may contain no cell centre; it is not checked.
     """
-    asked = mission.plan.inside_area(*np.meshgrid(*mission.grid.centres()))
+    asked = mission.asked(*np.meshgrid(*mission.grid.centres()))
     if not asked.any():
         return []
     mapped = 0.0 if elevation is None else float(np.isfinite(elevation.height_m[asked]).mean())

@@ -112,7 +112,7 @@ def forecast_over_floor(mission: Mission) -> FloorForecast:
         surface=surface,
         keyframes=keyframes,
         depth_m=depth,
-        altitude_m=z - surface.height_at(x, y),
+        altitude_m=np.where(mission.terrain.in_hole(x, y), np.nan, z - surface.height_at(x, y)),
         clearance_m=nearest,  # the optical axis is vertical
         footprint_m=median[:, None] * [rig.width_px / rig.fx_px, rig.height_px / rig.fy_px],
         gsd_m=median / rig.focal_px,
@@ -153,7 +153,7 @@ def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
         pair = cast_pixels(field, np.stack([left, left @ small.left_from_right]), small, pixels)
         coverage.add(left, *(depth.reshape(shape).astype(np.float32) for depth in pair))
     x, y = np.meshgrid(*grid.centres())
-    asked = mission.plan.inside_area(x, y)
+    asked = mission.asked(x, y)
     return float(coverage.seen[asked].mean()) if asked.any() else 0.0
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, minimum_filter
 
 import terrains
+from terrains.holes import known_nodes
 from terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
 from terrains.objects.mesh import Mesh, extent, median_edge_m
 from terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
@@ -85,8 +86,7 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     low = _lowest(upward, grid)
     under_m = np.asarray(minimum_filter(np.where(np.isfinite(low), low, top_m), 3) - MARGIN_M, np.float32)
     texture = _texture(drawn, grid, colours, scenario)
-    n_filled = int((~covered).sum())
-    return MeshFloor(_terrain(top_m, grid, texture, n_filled), _terrain(under_m, grid, colours, n_filled), tiles)
+    return MeshFloor(_terrain(top_m, grid, texture, covered), _terrain(under_m, grid, colours, covered), tiles)
 
 
 def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
@@ -240,14 +240,17 @@ def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) 
     return texture
 
 
-def _terrain(height_m: Layer, grid: MapGrid, texture: Image, n_filled: int) -> terrains.Terrain:
+def _terrain(height_m: Layer, grid: MapGrid, texture: Image, covered: NDArray[np.bool_]) -> terrains.Terrain:
     """Returns the terrain with a texture and the heights (rows, cols) of the nodes at the cell centres of a grid.
 
-    Row 0 of the heights is in the north. `n_filled` is the number of nodes that the mesh does not cover.
+    Row 0 of the heights is in the north. `covered` (rows, cols) marks the nodes that the mesh covers.
     """
     west_m, south_m = grid.west_m + grid.cell_m / 2, grid.north_m - (grid.rows - 0.5) * grid.cell_m
     heights, texel_m = (
         np.ascontiguousarray(height_m[::-1], np.float32),
         (grid.cols - 1) * grid.cell_m / texture.shape[1],
     )
-    return terrains.Terrain(heights, grid.cell_m, west_m, south_m, np.ascontiguousarray(texture), texel_m, n_filled)
+    return terrains.Terrain(
+        heights, grid.cell_m, west_m, south_m, np.ascontiguousarray(texture), texel_m, int((~covered).sum()),
+        known=known_nodes(covered[::-1]),
+    )  # fmt: skip

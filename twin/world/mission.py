@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 import terrains
 from controllers import segments
@@ -134,6 +135,10 @@ class Mission:
     def start_of_body(self) -> Array:
         """Returns world_from_body (4, 4) at the start of the survey."""
         return self.start @ geometry.inverse(self.rig.body_from_camera)
+
+    def asked(self, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
+        """Returns whether each point (x, y) [m] lies in the asked area, over floor with a height."""
+        return self.plan.inside_area(x_m, y_m) & ~self.terrain.in_hole(x_m, y_m)
 
     def planned_frames(self, track: int) -> FrameSequence:
         """Returns the planned frames of a track (numbered from 1), without the station keeping after it."""
@@ -465,9 +470,10 @@ def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: Survey
         turned = f" at a heading of {scenario.plan.heading_deg:g} deg" if scenario.plan.heading_deg else ""
         raise TwinError("plan.area_m", f"{shown} m{turned} is larger than the terrain", f"up to {extent}")
     clearance = planned_clearance(plan, terrain)
+    field = "plan.area_m" if scenario.plan.polygon is None else "plan.polygon"
     if not clearance.inside:
-        field = "plan.area_m" if scenario.plan.polygon is None else "plan.polygon"
         raise TwinError(field, "the path leaves the terrain", f"a path inside {extent}")
+    _check_over_heights(field, terrain, plan)
     if clearance.least_m < scenario.plan.clearance_m:
         needed = scenario.plan.altitude_m - clearance.least_m + scenario.plan.clearance_m
         raise TwinError(
@@ -476,6 +482,26 @@ def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: Survey
             f" at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
             f"at least {needed:.2f} for {scenario.plan.clearance_m:g} m of clearance",
         )
+
+
+def _check_over_heights(field: str, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
+    """Raises TwinError if the path leads over floor without a height, farther from the next height than an image shows.
+
+    There is nothing to plan a height or a clearance from. Smaller holes are flown over, but not judged.
+    """
+    if terrain.known is None:
+        return
+    x, y, _ = path_points(plan).T
+    cols, rows = (x - terrain.west_m) / terrain.spacing_m, (y - terrain.south_m) / terrain.spacing_m
+    away_m = np.asarray(distance_transform_edt(~terrain.known)) * terrain.spacing_m
+    away_m = away_m[np.rint(rows).astype(int), np.rint(cols).astype(int)]
+    k, limit_m = int(away_m.argmax()), min(plan.footprint_m) / 2
+    if away_m[k] > limit_m:
+        raise TwinError(
+            field, f"the path leads over floor without a height, up to {away_m[k]:.2f} m from the next height"
+            f" (at x {x[k]:.1f}, y {y[k]:.1f})",
+            f"a path within {limit_m:.2f} m of heights: another plan.centre_m, plan.area_m or plan.polygon",
+        )  # fmt: skip
 
 
 def _grid(scenario: Scenario, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:

@@ -104,7 +104,7 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
     try:
         if file.stat().st_size > _MAX_GEOJSON_BYTES:
             raise TwinError("plan.polygon", f"{file.name!r} is too large", f"at most {_MAX_GEOJSON_BYTES} bytes")
-        tree = json.loads(file.read_text(encoding="utf-8"))
+        tree = json.loads(file.read_text(encoding="utf-8-sig"))
         corners = np.array(_ring(tree, file), np.float64)[:, :2]
     except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
         raise TwinError("plan.polygon", f"{file.name!r} cannot be read: {error}", _ONE_POLYGON) from None

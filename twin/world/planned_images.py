@@ -16,8 +16,9 @@ from twin.judge.swaths import is_turning, leg_numbers, travel_direction
 
 
 def floor_of(terrain: Terrain) -> HeightField:
-    """Returns the height field of a terrain, for ray casting."""
-    return height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+    """Returns the height field of a terrain, for ray casting; there is no floor at its unknown nodes."""
+    height = terrain.height_m if terrain.known is None else np.where(terrain.known, terrain.height_m, np.nan)
+    return height_field(height, terrain.spacing_m, terrain.west_m, terrain.south_m)
 
 
 def level_floor(height_m: float, reach_m: float) -> HeightField:

@@ -34,7 +34,8 @@ def planned_surface(mission: Mission) -> Terrain:
     rows, cols = ((n - 1) * divisions + 1 for n in floor.height_m.shape)
     nodes = MapGrid(floor.west_m - spacing_m / 2, floor.north_m + spacing_m / 2, spacing_m, rows, cols)
     heights = top_surface(nodes, _heights_of_floor(floor, nodes), mission.objects).height_m
-    return replace(floor, height_m=np.ascontiguousarray(heights[::-1]), spacing_m=spacing_m)
+    known = None if floor.known is None else ~floor.in_hole(*np.meshgrid(*nodes.centres()))[::-1]
+    return replace(floor, height_m=np.ascontiguousarray(heights[::-1]), spacing_m=spacing_m, known=known)
 
 
 def _divisions(floor: Terrain) -> int:

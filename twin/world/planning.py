@@ -45,7 +45,7 @@ class NonOverlap(NamedTuple):
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """Returns the plan of a survey, with height and spacing adapted to the floor if the scenario requests it.
 
-    They are not adapted if the level path leaves the terrain or meets the floor, which `prepare` reports.
+    They are not adapted if the path leaves the terrain, nor the spacing if it meets the floor, which `prepare` reports.
 
     Args:
         scenario: description of the survey.
@@ -55,16 +55,17 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
         TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `limits.check_plan_size`.
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
-    level = _PATTERNS[pattern](request)
-    check_plan_size(scenario, level)
-    if terrain is None or not _lies_over(level, terrain):
-        return level  # `prepare` reports that the path leaves the terrain or has too little clearance
-    if scenario.plan.height == "floor":
-        request = request._replace(surface=_surface(scenario, request, terrain))
-    if scenario.plan.overlap_reference == "floor":
-        request = _keep_overlap(request, pattern, floor_of(terrain), scenario.believed_rig())
     plan = _PATTERNS[pattern](request)
     check_plan_size(scenario, plan)
+    if terrain is None or not _lies_over(plan, terrain):
+        return plan
+    if scenario.plan.height == "floor":
+        request = request._replace(surface=_surface(scenario, request, terrain))
+        plan = _PATTERNS[pattern](request)
+    if scenario.plan.overlap_reference == "floor" and _lies_above(plan, terrain):
+        request = _keep_overlap(request, pattern, floor_of(terrain), scenario.believed_rig())
+        plan = _PATTERNS[pattern](request)
+        check_plan_size(scenario, plan)
     return plan
 
 
@@ -89,10 +90,14 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
 
 
 def _lies_over(plan: SurveyPlan, terrain: Terrain) -> bool:
-    """Returns whether all waypoints of the path lie over the terrain and above the floor."""
+    """Returns whether all waypoints of the path lie over the terrain, at any height."""
+    return bool(np.isfinite(terrain.height_at(*plan.outline()[:, :2].T)).all())
+
+
+def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
+    """Returns whether all waypoints of the path lie above the floor."""
     x, y, z = plan.outline().T
-    height = terrain.height_at(x, y)
-    return bool((np.isfinite(height) & (height < z)).all())
+    return bool((terrain.height_at(x, y) < z).all())
 
 
 def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> CameraSurface:

@@ -166,9 +166,13 @@ class World(ABC):
     def truth(self) -> Truth:
         """Returns the ground truth of the survey so far."""
         n, sequences, surface = len(self), self._sequences, self.true_surface()
+        cells, in_hole = np.meshgrid(*self.mission.grid.centres()), self.mission.terrain.in_hole
+        unknown = in_hole(*cells)
 
         def albedo(grid: MapGrid) -> NDArray[np.float32]:
-            return without_objects(true_albedo(self.mission.terrain, grid), grid, surface.objects, self.mission.grid)
+            colours = without_objects(true_albedo(self.mission.terrain, grid), grid, surface.objects, self.mission.grid)
+            colours[in_hole(*np.meshgrid(*grid.centres()))] = np.nan
+            return colours
 
         lengths = np.array([len(sequence) for sequence, _ in sequences], np.int64)
         positions = [np.empty((0, 3)), *(sequence.reference.position for sequence, _ in sequences)]
@@ -178,12 +182,12 @@ class World(ABC):
             reference=np.concatenate(positions)[:n],
             holding=np.repeat(np.array([sequence.holding for sequence, _ in sequences], np.bool_), lengths)[:n],
             track=np.repeat(np.array([track for _, track in sequences], np.int64), lengths)[:n],
-            height_m=surface.height_m,
-            seen=self.seen(),
-            asked=self.mission.plan.inside_area(*np.meshgrid(*self.mission.grid.centres())),
+            height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
+            seen=self.seen() & ~unknown,
+            asked=self.mission.asked(*cells),
             reference_yaw=np.concatenate(yaws)[:n],
             albedo=albedo,
-            in_area=self.mission.plan.inside_area,
+            in_area=self.mission.asked,
             objects=surface.objects,
             overhung=surface.overhung,
         )

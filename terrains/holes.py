@@ -1,0 +1,70 @@
+"""Cells of a height file without a height."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrains.file_header import HEIGHT_FIELD
+from twin.errors import TwinError
+
+#: Values that programs write in cells without a height.
+_NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 65535.0)
+#: Holes are small if they are enclosed, and no node in them is farther from a height than this many grid spacings.
+_SMALL = 2.0
+#: A value marks holes if it is farther from all heights than this, and than their range times `_MOST_RANGES`.
+_LEAST_GAP, _MOST_RANGES = 100.0, 10.0
+
+
+def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> None:
+    """Raises TwinError if the least or the greatest value is so far from all others that it can only mark holes.
+
+    Args:
+        values: values as stored in the file, NaN or infinite in the holes that it declares.
+        file: the file, for the message.
+        remedy: how to declare the value, which replaces "{}".
+    """
+    finite = values[np.isfinite(values)]
+    for value in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
+        heights = finite[(finite != value) & ~np.isin(finite, _NODATA)]
+        if heights.size == 0:
+            continue
+        low, high = heights.min(), heights.max()
+        if max(low - value, value - high) > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
+            raise TwinError(
+                HEIGHT_FIELD, f"{file.name!r} has the value {value:g} in {np.count_nonzero(finite == value)} cells,"
+                f" far from all others ({low:g} to {high:g}), and does not declare it as nodata",
+                remedy.format(f"{value:g}"),
+            )  # fmt: skip
+
+
+def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
+    """Replaces NaN and infinite values by the nearest height; returns the heights and the number of replaced values."""
+    holes = ~np.isfinite(height_m)
+    if not holes.any():
+        return height_m, 0
+    from scipy import ndimage  # imported here: it takes 0.1 s, and most terrains have no holes
+
+    nearest = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
+    assert nearest is not None
+    return height_m[tuple(nearest)], int(holes.sum())
+
+
+def known_nodes(given: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
+    """Returns the nodes (ny, nx) with a height or in a small hole; None if these are all nodes.
+
+    Args:
+        given: (ny, nx) nodes with a height; at least one.
+    """
+    if given.all():
+        return None
+    from scipy import ndimage
+
+    labelled, n = ndimage.label(~given, np.ones((3, 3)))  # pyright: ignore
+    holes, distance = np.asarray(labelled, np.int64), np.asarray(ndimage.distance_transform_edt(~given))
+    small = np.append(False, np.asarray(ndimage.maximum(distance, holes, np.arange(1, n + 1))) <= _SMALL)
+    small[np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])] = False  # open at the border
+    known = given | small[holes]
+    return None if known.all() else known
