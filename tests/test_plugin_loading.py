@@ -5,7 +5,7 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from twin.errors import TwinError
+from twin.errors import TwinError, described
 from twin.plugin import loading
 
 
@@ -65,4 +65,4 @@ def test_a_registered_plugin_that_cannot_be_imported_is_refused_with_the_name_of
 
 
 def test_the_description_of_an_exception_is_one_line_without_control_characters():
-    assert loading.described(ValueError("first\n\x1b[31msecond")) == "ValueError: first ?[31msecond"
+    assert described(ValueError("first\n\x1b[31msecond")) == "ValueError: first ?[31msecond"

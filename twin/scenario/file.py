@@ -16,6 +16,7 @@ import tomlkit
 from pydantic import BaseModel, ValidationError
 
 from twin.core.paths import is_file, resolved
+from twin.core.user_files import read_text
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.model import Scenario, Source
 from twin.scenario.toml_lines import key_lines
@@ -178,10 +179,9 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
     """
     try:
-        with file.open(encoding="utf-8") as stream:
-            text = stream.read(MAX_CHARACTERS + 1)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
+        text = read_text(file, most_bytes=4 * MAX_CHARACTERS, encoding="utf-8")
+    except TwinError as error:
+        raise ScenarioError([f"{file}:1: {error.problem}"]) from None
     try:
         tree = parse_toml(text)
     except ValueError as error:
