@@ -220,6 +220,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics
 def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
     console.accept_any_text()
+    console.hide_log_failures()
     with sigterm_as_interrupt():
         try:
             app()
