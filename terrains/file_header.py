@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrains.terrain import MAX_NODES, MAX_TEXELS
+from twin.core.raster_files import IMAGE_DRIVERS, open_raster
 from twin.errors import TwinError
 
 HEIGHT_FIELD = "terrain.height_file"
@@ -40,15 +40,11 @@ def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
     return np.clip(np.rint(values * (255.0 / white)), 0, 255).astype(np.uint8)
 
 
-def image_size(file: Path) -> tuple[int, int] | None:
-    """Returns the number of columns and rows of an image file from its header; None if it is not a readable image."""
-    import rasterio  # imported here: it takes 20 MB of memory, and most terrains do not need it
-    from rasterio.errors import NotGeoreferencedWarning, RasterioError
+def image_size(file: Path, key: str, allowed: str) -> tuple[int, int]:
+    """Returns the number of columns and rows of an image file (PNG, JPEG, TIFF, BMP, WebP) from its header.
 
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(file) as source:
-                return source.width, source.height
-    except (RasterioError, OSError):
-        return None
+    Raises:
+        TwinError: the file is missing or not such an image; names the key.
+    """
+    with open_raster(file, key, allowed, IMAGE_DRIVERS) as source:
+        return source.width, source.height

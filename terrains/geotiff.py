@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +12,16 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
-from rasterio.errors import NotGeoreferencedWarning, RasterioError
 from rasterio.warp import transform
 
 from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count
 from terrains.holes import check_no_undeclared_holes
 from terrains.vertical import VerticalAxis, cf_direction, unit_length_m
 from twin.core.georeference import Georeference
+from twin.core.raster_files import open_raster
 from twin.errors import TwinError
 
+_LEAST_CELL, _MOST_CELL, _MOST_COORDINATE = 1e-4, 1e5, 1e9  # of a plausible grid, in units of its CRS
 #: Tags of a raster band that may name the quantity of its values, e.g. depth.
 _BAND_TAGS = ("long_name", "standard_name")
 #: Tags of a file that may name the quantity of its values.
@@ -46,13 +46,8 @@ def read_geotiff(
         TwinError: the file cannot be read, is an image or too large, or its grid or the unit of its heights is not
             supported.
     """
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(file) as source:
-                return _read(source, height_spacing_m, file)
-    except (RasterioError, OSError) as error:
-        raise TwinError(HEIGHT_FIELD, f"{file.name!r} cannot be read: {error}", HEIGHT_FORMATS) from error
+    with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS) as source:
+        return _read(source, height_spacing_m, file)
 
 
 def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> tuple[Any, ...]:
@@ -176,6 +171,10 @@ def _check_grid(source: rasterio.DatasetReader, file: Path) -> None:
             HEIGHT_FIELD, f"{file.name!r} is rotated, or its cells are not square",
             f"north up, square cells, e.g. by gdalwarp -tr CELL_M CELL_M {file.name} square.tif",
         )  # fmt: skip
+    if not _LEAST_CELL <= t.a <= _MOST_CELL or max(abs(c) for c in _centre(source)) > _MOST_COORDINATE:
+        problem = f"{file.name!r} has cells of {t.a:g} at {_centre(source)}"
+        allowed = f"cells of {_LEAST_CELL:g} to {_MOST_CELL:g} within {_MOST_COORDINATE:g} of the origin"
+        raise TwinError(HEIGHT_FIELD, problem, allowed)
 
 
 def _in_degrees(source: rasterio.DatasetReader) -> bool:

@@ -18,7 +18,10 @@ from terrains.textures import TextureSource, generate_texture, texture_from_phot
 from terrains.vertical import Direction, VerticalAxis, upward_sign
 from terrains.wall_texture import walls_of
 from twin.core.georeference import Georeference
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, reading
 from twin.errors import TwinError
+
+_MOST_HEIGHT_M = 20_000.0
 
 
 class HeightGrid(NamedTuple):
@@ -64,6 +67,7 @@ def load(
     upward_m = upward_sign(read.values, read.axis, z, Path(height_file)) * read.axis.metres_per_unit
     values = read.values[::-1] * upward_m
     (raw, n_filled), known = fill_holes(values), known_nodes(np.isfinite(values))
+    _check_plausible(raw, Path(height_file))
     lowest_m, spacing_m = raw.min(), read.spacing_m
     height_m = (raw - lowest_m).astype(np.float32)
     georeference = read.georeference and replace(read.georeference, elevation_m=float(lowest_m))
@@ -99,8 +103,6 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
         TwinError: the file is missing, cannot be read, contains no heights or no finite one, has a single row or
             column or more than MAX_NODES heights, or its grid or unit is not supported.
     """
-    if not file.is_file():
-        raise TwinError(HEIGHT_FIELD, f"no such file {str(file)!r}", HEIGHT_FORMATS)
     suffix = file.suffix.lower()
     named = VerticalAxis(texts=(file.stem,))
     if suffix in (".tif", ".tiff"):
@@ -119,16 +121,23 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
     return grid
 
 
+def _check_plausible(height_m: NDArray[np.float64], file: Path) -> None:
+    """Raises TwinError if a height is larger than any on Earth, with a margin."""
+    if (most_m := float(np.abs(height_m).max())) > _MOST_HEIGHT_M:
+        allowed = f"heights within {_MOST_HEIGHT_M:g} m of zero"
+        raise TwinError(HEIGHT_FIELD, f"{file.name!r} has a height of {most_m:g} m", allowed)
+
+
 def _read_png(file: Path) -> NDArray[np.float64]:
     """Reads the heights of a 16-bit PNG as fractions of the height range, 0 to 1.
 
     Raises:
         TwinError: the file is not a PNG with one band of 16 bits, or has too many pixels.
     """
-    size = image_size(file)
-    if size is not None:
-        check_height_count(*size, file)
-    image = cv2.imdecode(np.fromfile(file, np.uint8), cv2.IMREAD_UNCHANGED) if size is not None else None
+    check_height_count(*image_size(file, HEIGHT_FIELD, HEIGHT_FORMATS), file)
+    data = read_bytes(file, HEIGHT_FIELD, HEIGHT_FORMATS, MOST_IMAGE_BYTES)
+    with reading(file, HEIGHT_FIELD, HEIGHT_FORMATS):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} cannot be read as PNG", HEIGHT_FORMATS)
     if image.ndim != 2 or image.dtype != np.uint16:
@@ -144,10 +153,8 @@ def _read_npy(file: Path) -> NDArray[np.float64]:
         TwinError: the file cannot be read, is too large, or is not a two-dimensional array of real numbers other than
             uint8.
     """
-    try:
+    with reading(file, HEIGHT_FIELD, HEIGHT_FORMATS):
         array = np.load(file, mmap_mode="r", allow_pickle=False)  # only the header is read
-    except (ValueError, OSError, EOFError, OverflowError) as error:
-        raise TwinError(HEIGHT_FIELD, f"{file.name!r} cannot be read: {error}", HEIGHT_FORMATS) from error
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu" or array.dtype == np.uint8:
         shape = getattr(array, "shape", "no array")
         problem = f"{file.name!r} contains no heights: {shape} of {getattr(array, 'dtype', '?')}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +9,13 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
 from rasterio.enums import ColorInterp, Resampling
-from rasterio.errors import CRSError, NotGeoreferencedWarning, RasterioError
 from rasterio.transform import Affine, array_bounds
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
 from terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count, eight_bits
 from twin.core.georeference import Georeference
+from twin.core.raster_files import open_raster
 from twin.errors import TwinError
 
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
@@ -48,19 +47,12 @@ def lay_orthophoto(
     if georeference is None:
         raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be placed: the DEM has no coordinates",
                         "terrain.texture_file, or a GeoTIFF with coordinates as terrain.height_file")  # fmt: skip
-    if not file.is_file():
-        raise TwinError(ORTHOPHOTO_FIELD, f"no such file {str(file)!r}", _FORMATS)
     grid = _texel_grid(texture.shape[:2], extent_m, georeference)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", NotGeoreferencedWarning)
-            with rasterio.open(file) as source:
-                colour, covered = _read(source, file, grid, texture.shape[:2], georeference)
-    except NotGeoreferencedWarning as error:
-        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has no coordinates",
-                        "a GeoTIFF with coordinates; terrain.texture_file for a plain image") from error  # fmt: skip
-    except (RasterioError, OSError, CRSError) as error:
-        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be read: {error}", _FORMATS) from error
+    with open_raster(file, ORTHOPHOTO_FIELD, _FORMATS) as source:
+        if source.transform.is_identity:
+            raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has no coordinates",
+                            "a GeoTIFF with coordinates; terrain.texture_file for a plain image")  # fmt: skip
+        colour, covered = _read(source, file, grid, texture.shape[:2], georeference)
     texture[covered] = colour[covered]
     return covered
 

@@ -14,8 +14,10 @@ from terrains.file_header import TEXTURE_FIELD, check_texel_count, eight_bits, i
 from terrains.ground_cover import COVERS, paint
 from terrains.noise import fractal_field, pink_noise
 from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, reading
 from twin.errors import TwinError
 
+_PHOTOS = "a PNG, JPEG, TIFF, BMP or WebP image"
 COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`
 _STEEP = 1.5  # slope, rise over run, above which the material no longer depends on it
 _QUILT_SEED = 1  #: a texture from a photo is the same for every seed of a survey
@@ -148,19 +150,14 @@ def read_image(file: Path) -> NDArray[np.uint8]:
     Raises:
         TwinError: the file does not exist, is not an image, or has more than MAX_TEXELS pixels.
     """
-    if not file.is_file():
-        raise TwinError(TEXTURE_FIELD, f"no such file {str(file)!r}", "an image file")
-    if (size := image_size(file)) is not None:
-        check_texel_count(*size, file)
-    try:
-        flags = cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH
-        image = None if size is None else cv2.imdecode(np.fromfile(file, np.uint8), flags)
-    except (OSError, cv2.error):
-        image = None
+    check_texel_count(*image_size(file, TEXTURE_FIELD, _PHOTOS), file)
+    data = read_bytes(file, TEXTURE_FIELD, _PHOTOS, MOST_IMAGE_BYTES)
+    with reading(file, TEXTURE_FIELD, _PHOTOS):
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
     if image is not None and image.dtype == np.uint16:
         image = eight_bits(np.asarray(image, np.uint16), int(image.max()))
     if image is None or image.dtype != np.uint8:
-        raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", "PNG, JPEG, TIFF or another image")
+        raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", _PHOTOS)
     return np.asarray(image, dtype=np.uint8)
 
 

@@ -536,7 +536,7 @@ def test_folders_in_place_of_files_are_refused(euroc, tmp_path):
     folder = recorded.write_folder(tmp_path / "plain", recorded.frames(recorded.poses(1)))
     (folder / "times.txt").unlink()
     (folder / "times.txt").mkdir()
-    with pytest.raises(TwinError, match="times.txt: does not exist or is not a file"):
+    with pytest.raises(TwinError, match="times.txt: is not a regular file"):
         read_dataset(folder)
     copy = shutil.copytree(euroc, tmp_path / "copy")
     truth = copy / "mav0" / "state_groundtruth_estimate0" / "data.csv"

@@ -10,6 +10,7 @@ import trimesh
 from twin.core import geometry
 from twin.core.grid_triangles import grid_triangles, raster_triangles
 from twin.core.records import ElevationMap, MapGrid
+from twin.errors import TwinError
 from twin.exchange import geotiff, mesh
 from twin.report.run_folder import read_raster
 
@@ -52,7 +53,7 @@ def test_rotated_rasters_and_cells_that_are_not_square_are_rejected(steps, tmp_p
     shape = {"driver": "GTiff", "width": 3, "height": 3, "count": 1, "dtype": "float32"}
     with rasterio.open(tmp_path / "rotated.tif", "w", **shape, transform=rasterio.Affine(a, b, 0, d, e, 0)) as file:
         file.write(np.zeros((1, 3, 3), np.float32))
-    with pytest.raises(ValueError, match="rotated"):
+    with pytest.raises(TwinError, match="rotated"):
         read_raster(tmp_path / "rotated.tif")
 
 

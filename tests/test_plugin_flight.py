@@ -138,7 +138,7 @@ def _module(tmp_path_factory):
 
 
 def fly(out, *overrides):
-    return survey.run(twin.load_scenario("reef", [*TINY, *overrides]), out, outputs=())
+    return survey.run(twin.load_scenario("reef", [*TINY, *overrides], allow_plugins=True), out, outputs=())
 
 
 def test_a_controller_of_another_package_flies_a_survey(tmp_path):
@@ -196,7 +196,9 @@ def test_a_fault_of_an_estimator_ends_the_survey_with_its_name(tmp_path):
 
 
 def test_a_floor_of_another_package_has_its_heights_and_a_generated_texture():
-    scenario = twin.load_scenario("reef", [*TINY, *SURROGATE, "terrain.plugin=other_package:Dunes", "seed=7"])
+    scenario = twin.load_scenario(
+        "reef", [*TINY, *SURROGATE, "terrain.plugin=other_package:Dunes", "seed=7"], allow_plugins=True
+    )
     floor = load_terrain(scenario)
     for x, y in ((0.0, 0.0), (1.0, -1.4), (-2.2, 1.9)):
         # bilinear interpolation on a grid of 0.04 m: error up to 0.2 * 3^2 * 0.04^2 / 8
@@ -216,14 +218,14 @@ def test_a_floor_of_another_package_has_its_heights_and_a_generated_texture():
 )
 def test_a_plugin_that_cannot_be_used_is_refused_before_the_flight(override, message):
     with pytest.raises(ScenarioError) as refused:
-        prepare(twin.load_scenario("reef", [*TINY, *SURROGATE, override]))
+        prepare(twin.load_scenario("reef", [*TINY, *SURROGATE, override], allow_plugins=True))
     assert message in str(refused.value)
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a:b:c", r"a\nb:C", "/tmp/a.py"])
 def test_a_text_that_names_no_plugin_is_refused_by_the_scenario(name):
     with pytest.raises(ScenarioError, match="not allowed .allowed: module:Class, or the name of an entry point"):
-        twin.load_scenario("quickstart", [f'control.plugin="{name}"'])
+        twin.load_scenario("quickstart", [f'control.plugin="{name}"'], allow_plugins=True)
 
 
 def echo(value):

@@ -5,8 +5,12 @@ from importlib.metadata import EntryPoint
 
 import pytest
 
-from twin.errors import TwinError
+from twin import cli
+from twin.errors import ScenarioError, TwinError, described
 from twin.plugin import loading
+from twin.scenario.file import load_scenario
+from twin.study.study_file import load_study
+from twin.study.surveys import surveys
 
 
 @pytest.fixture
@@ -58,6 +62,44 @@ def test_a_plugin_that_cannot_be_loaded_is_refused_with_its_name(package, name, 
     assert len(str(refused.value).splitlines()) == 1
 
 
+@pytest.mark.parametrize("section", ["control", "estimate", "terrain"])
+def test_a_scenario_names_a_module_only_with_permission(section, tmp_path):
+    given = f'{section}.plugin="os:_exit"'
+    (tmp_path / "scene.toml").write_text(f'[{section}]\nplugin = "os:_exit"\n')
+    refused = f"{section}.plugin: 'os:_exit' runs code of any module (allowed: an installed entry point of twin."
+    for source, overrides, place in (
+        ("quickstart", [given], "--set: "),
+        (tmp_path / "scene.toml", [], "scene.toml:2: "),
+    ):
+        with pytest.raises(ScenarioError) as error:
+            load_scenario(source, overrides)
+        assert place + refused in str(error.value) and len(error.value.lines) == 1
+        assert getattr(load_scenario(source, overrides, allow_plugins=True), section).plugin == "os:_exit"
+    assert getattr(load_scenario("quickstart", [f"{section}.plugin=lqr"]), section).plugin == "lqr"
+
+
+@pytest.mark.parametrize("key", ["set", "vary", "base"])
+def test_a_study_names_a_module_only_with_permission(key, tmp_path):
+    (tmp_path / "scene.toml").write_text('[control]\nplugin = "os:_exit"\n' if key == "base" else "")
+    named = {
+        "set": '[set]\ncontrol.plugin = "os:_exit"',
+        "vary": 'vary.control.plugin = { choice = ["os:_exit", "x:Y"] }',
+    }
+    text = f'scenario = "scene.toml"\nsampling.samples = 2\n{named.get(key, "")}\n'
+    (tmp_path / "study.toml").write_text(
+        text + ("" if key == "vary" else "[vary]\nplan.tracks = { choice = [1, 2] }\n")
+    )
+    with pytest.raises(ScenarioError, match="runs code of any module"):
+        list(surveys(load_study(tmp_path / "study.toml"), tmp_path))
+    flown = next(surveys(load_study(tmp_path / "study.toml", allow_plugins=True), tmp_path))
+    assert ":" in (flown.scenario.control.plugin or "")
+
+
+def test_a_replay_names_a_module_only_with_permission(tmp_path):
+    with pytest.raises(TwinError, match="^--estimator: 'os:_exit' runs code of any module"):
+        cli.replay(tmp_path, estimator="os:_exit")
+
+
 def test_a_registered_plugin_that_cannot_be_imported_is_refused_with_the_name_of_its_entry_point(package):
     package("broken", "import absent", bad="Lqr")
     with pytest.raises(TwinError, match="^twin.controllers bad: broken:Lqr: ModuleNotFoundError"):
@@ -65,4 +107,4 @@ def test_a_registered_plugin_that_cannot_be_imported_is_refused_with_the_name_of
 
 
 def test_the_description_of_an_exception_is_one_line_without_control_characters():
-    assert loading.described(ValueError("first\n\x1b[31msecond")) == "ValueError: first ?[31msecond"
+    assert described(ValueError("first\n\x1b[31msecond")) == "ValueError: first ?[31msecond"

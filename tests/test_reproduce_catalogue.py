@@ -87,7 +87,7 @@ def test_the_chapter_shows_only_tables_that_the_experiments_have():
 @pytest.mark.parametrize(
     ("contents", "message"),
     [
-        (None, "cannot be read: No such file"),
+        (None, "does not exist"),
         ("{", "is not JSON"),
         ("[]", "has no list of exhibits"),
         ('{"exhibits": [1]}', "is not a result of `twin reproduce`"),

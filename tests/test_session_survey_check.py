@@ -49,7 +49,9 @@ def checks(result, heights, reference):
 
 
 def test_plugins_of_the_same_name_have_a_note_each():
-    scenario = load_scenario("reef", ["control.plugin=other:Package", "estimate.plugin=other:Package"])
+    scenario = load_scenario(
+        "reef", ["control.plugin=other:Package", "estimate.plugin=other:Package"], allow_plugins=True
+    )
     assert [note.split(" by ")[0].split(" of ")[0] for note in plugin_notes(scenario)] == [
         "The vehicle was steered", "The trajectories are those"
     ]  # fmt: skip

@@ -119,7 +119,9 @@ def test_an_invalid_height_file_is_rejected_with_a_one_line_message(tmp_path: Pa
     assert problem in caught.value.problem and "\n" not in str(caught.value) and caught.value.allowed
 
 
-@pytest.mark.parametrize(("name", "problem"), [("none.png", "no such file"), ("dem.npy", "is not an image")])
+@pytest.mark.parametrize(
+    ("name", "problem"), [("none.png", "no such file"), ("dem.npy", "is not a file of the format")]
+)
 def test_an_invalid_texture_file_is_rejected(tmp_path: Path, name: str, problem: str) -> None:
     file = write_npy(tmp_path / "dem.npy", HEIGHTS)
     with pytest.raises(TwinError, match=problem) as caught:

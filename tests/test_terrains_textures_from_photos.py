@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+import rasterio.shutil
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from rasterio.warp import transform
@@ -258,11 +259,14 @@ def test_an_orthophoto_without_coordinates_or_on_a_floor_without_them_is_rejecte
     plain = tmp_path / "plain.png"
     with rasterio.open(plain, "w", driver="PNG", count=3, height=9, width=9, dtype="uint8") as target:
         target.write(np.zeros((3, 9, 9), np.uint8))
+    unplaced = tmp_path / "plain.tif"
+    rasterio.shutil.copy(plain, unplaced, driver="GTiff")
     heights = tmp_path / "dem.npy"
     np.save(heights, np.zeros((9, 9)))
     missing = tmp_path / "none.tif"
     for floor, photo, problem in (
-        (dem, plain, "has no coordinates"),
+        (dem, plain, "is not a file of the format GTiff"),
+        (dem, unplaced, "has no coordinates"),
         (heights, plain, "the DEM has no coordinates"),
         (dem, missing, "no such file"),
     ):

@@ -79,7 +79,7 @@ def test_the_area_lies_at_its_coordinates_in_the_dem(dem):
         (["plan.polygon=[[0, 0], [1, 1], [1, 0], [0, 1]]"], "plan.polygon: edges 1 and 3 intersect"),
         (["plan.polygon=[[0, 0], [1, 0], [1, 1]]", "plan.centre_m=[1, 0]"], "plan.centre_m: (1.0, 0.0) has no effect"),
         (["plan.polygon=[[0, 0], [1, 0], [1, 1]]", "plan.pattern=loops"], "plan.pattern: 'loops' has no effect with"),
-        (["plan.polygon=none.geojson"], "plan.polygon: 'none.geojson' cannot be read"),
+        (["plan.polygon=none.geojson"], "plan.polygon: no such file"),
         (["plan.turns=bow_first", "vehicle.dynamics=kinematic"], "plan.turns: 'bow_first': a kinematic vehicle does"),
         (["terrain.z=up"], "plan.altitude_m: "),  # upside down: the asked side is flown, and the floor is another
     ],

@@ -33,12 +33,14 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module 'twin' has no attribute {name!r}")
 
 
-def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins: bool = False) -> Scenario:
     """Returns the validated scenario of a file.
 
     Args:
         path: a TOML file, or the name of a scenario in scenes/.
         overrides: strings `key=value` that replace values of the file, for example `plan.tracks=2`.
+        allow_plugins: whether the file and the overrides may name a plug-in as module:Class, which runs code of any
+            module that can be imported; the names of installed entry points are always allowed.
 
     Raises:
         ScenarioError: there is no such scenario, or a file or an override is invalid. The message lists the errors of
@@ -46,7 +48,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
     """
     from twin.scenario.file import load_scenario
 
-    return load_scenario(path, overrides)
+    return load_scenario(path, overrides, allow_plugins)
 
 
 def run(scenario: Scenario, out: str | Path) -> RunResult:

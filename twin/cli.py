@@ -189,6 +189,10 @@ PreviewOption = Annotated[
 ReplayOutOption = Annotated[
     Path | None, typer.Option("--out", help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")
 ]
+AllowPluginsOption = Annotated[
+    bool,
+    typer.Option("--allow-plugins", help="Load plug-ins named as module:Class, which run code of any module."),
+]
 KindArgument = Annotated[str, typer.Argument(metavar="KIND", help="controller, estimator, terrain or reader.")]
 PluginFolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="New folder; names the package.")]
 SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
@@ -216,6 +220,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics
 def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
     console.accept_any_text()
+    console.hide_log_failures()
     with sigterm_as_interrupt():
         try:
             app()
@@ -242,10 +247,11 @@ def run(
     live: LiveOption = False,
     as_json: JsonOption = False,
     extrapolate: ExtrapolateOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Run one survey and write its folder: map, trajectories, report, recording, metrics."""
     options = ([] if seed is None else [f"seed={seed}"]) + (["imaging.extrapolate=true"] if extrapolate else [])
-    result = _run_survey(scene, overrides + options, out, live)
+    result = _run_survey(scene, overrides + options, out, live, allow_plugins)
     if as_json:
         print(json.dumps(result.metrics, indent=1))
     else:
@@ -261,6 +267,7 @@ def plan(
     out: PictureOption = None,
     as_json: PlanJsonOption = False,
     strict: StrictOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Print the predicted properties of a survey plan over its floor and draw the plan, without simulation."""
     from twin.app import plan as drawing
@@ -268,7 +275,7 @@ def plan(
     from twin.scenario.file import load_scenario
     from twin.world.mission import prepare
 
-    scenario = load_scenario(scene, overrides)
+    scenario = load_scenario(scene, overrides, allow_plugins)
     file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-plan.png"))
     summary = plan_summary.summarise(prepare(scenario))
     with outputs.writing(file):
@@ -289,6 +296,7 @@ def look(
     twist: TwistOption = None,
     out: SheetOption = None,
     as_json: SummaryOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Render the stereo pair at one position, draw its light components on one sheet, and print the image quality."""
     from twin.app import look as viewing
@@ -298,7 +306,7 @@ def look(
 
     position_m = None if at is None else viewing.parse_position(at)
     twist_body = None if twist is None else viewing.parse_twist(twist)
-    scenario = load_scenario(scene, overrides)
+    scenario = load_scenario(scene, overrides, allow_plugins)
     file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-look.png"))
     mission = prepare(scenario)
     view = viewing.render_view(mission, position_m, twist_body)
@@ -459,13 +467,16 @@ def study(
     as_json: SummaryOption = False,
     verify: CheckOption = None,
     extrapolate: ExtrapolateOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Run the surveys of a study and estimate the probability that a survey meets the requirements."""
     from twin.app import study_command
 
     if not scheduler:
         _require_rendering()
-    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify, extrapolate)
+    options = study_command.StudyOptions(
+        out, jobs, scheduler, resume, live, as_json, verify, extrapolate, allow_plugins
+    )
     raise typer.Exit(study_command.run(file, options))
 
 
@@ -480,13 +491,16 @@ def tune(
     as_json: SummaryOption = False,
     verify: VerifyOption = None,
     extrapolate: ExtrapolateOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario."""
     from twin.app import study_command
 
     if not scheduler:
         _require_rendering()
-    options = study_command.StudyOptions(out, jobs, scheduler, resume, live, as_json, verify, extrapolate)
+    options = study_command.StudyOptions(
+        out, jobs, scheduler, resume, live, as_json, verify, extrapolate, allow_plugins
+    )
     raise typer.Exit(study_command.tune(file, options))
 
 
@@ -504,11 +518,15 @@ def replay(
     aiding: AidingOption = True,
     true_map: TrueMapOption = None,
     as_json: JsonOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
     from twin.datasets import preview as previewing
     from twin.datasets import replay as recorded
+    from twin.scenario.file import plugin_error
 
+    if estimator is not None and ":" in estimator and not allow_plugins:
+        raise plugin_error("--estimator", estimator, "estimators")
     alignment, pattern = recorded.alignment_name(align), recorded.bayer_pattern(bayer)
     pair = recorded.image_topics(topics)
     options = recorded.ReplayOptions(
@@ -595,6 +613,7 @@ def export(
     origin: OriginOption = None,
     jpeg: JpegOption = None,
     show_list: ListOption = False,
+    allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Write a run in the formats of other programs: data sets, camera models, truth, maps."""
     from twin.app import export_command
@@ -605,7 +624,7 @@ def export(
     if folder is None:
         raise TwinError("RUN", "is missing", "the folder of a run, or --list")
     target = folder / "export" if out is None else out
-    options = export_command.ExportOptions(crs, origin, jpeg)
+    options = export_command.ExportOptions(crs, origin, jpeg, allow_plugins)
     with console.replay_bar() as progress, outputs.writing(target):
         warnings: list[str] = []
         written = export_command.export(folder, to, target, options, progress, warnings.append)
@@ -645,11 +664,13 @@ def exit_status(result: RunResult | ReplayResult) -> int:
     return 1 if result.status != "complete" or missed else 0
 
 
-def _run_survey(scene: str, overrides: list[str], out: Path | None, live: bool) -> RunResult:
+def _run_survey(
+    scene: str, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False
+) -> RunResult:
     """Loads and runs one survey with a progress bar; returns its result."""
     from twin.scenario.file import load_scenario
 
-    scenario = load_scenario(scene, overrides)
+    scenario = load_scenario(scene, overrides, allow_plugins)
     folder = _new_folder(scenario, out)
     _require_rendering()
     from twin import survey  # imported here because it needs OpenGL

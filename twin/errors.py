@@ -34,3 +34,9 @@ class ScenarioError(TwinError):
 
 class SurveyAborted(Exception):  # noqa: N818 (an outcome of a survey, not an input error)
     """The survey cannot continue (physics diverged, vision lost, alignment failed); partial results are kept."""
+
+
+def described(error: BaseException) -> str:
+    """Returns the class and the message of an exception in one line of at most 300 characters."""
+    text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error).split()))
+    return (f"{type(error).__name__}: {text}" if text else type(error).__name__)[:300]

@@ -83,8 +83,9 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         action: Literal["velocity", "thrust"] = "velocity",
         reward: Literal["coverage", "track"] = "coverage",
         render_mode: str | None = None,
+        allow_plugins: bool = False,
     ):
-        given = load_scenario(scenario, overrides)
+        given = load_scenario(scenario, overrides, allow_plugins)
         if given.imaging.fidelity != "rendered":
             raise TwinError("imaging.fidelity", f"{given.imaging.fidelity!r} has no images", '"rendered"')
         if action not in ("velocity", "thrust") or (action == "thrust" and given.vehicle.dynamics != "rigid"):

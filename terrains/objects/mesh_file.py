@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from terrains.file_header import eight_bits
 from terrains.objects.mesh import Mesh, joined, welded_faces
 from terrains.objects.mesh_header import FORMATS, face_count
-from twin.core.paths import is_file
+from twin.core.user_files import IMAGE_FORMATS, reading
 from twin.errors import TwinError
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
@@ -133,16 +133,10 @@ def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> 
     Raises:
         TwinError: the file is missing, unreadable or too large, or a material or texture file that it names is.
     """
-    if not is_file(file):
-        raise TwinError(field, f"no such file {str(file)!r}", FORMATS)
-    _check_size(file, field)
-    try:
+    with reading(file, field, FORMATS, MAX_BYTES):
+        if (n_faces := face_count(file)) > MAX_FACES:
+            raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
         return convert(_near_origin(_parts(_loaded(file, field))))
-    except (MemoryError, TwinError):
-        raise
-    except Exception as error:  # trimesh raises any of many types for a damaged file
-        reason = " ".join(str(error).split())[:200]
-        raise TwinError(field, f"{file.name!r} cannot be read: {type(error).__name__}: {reason}", FORMATS) from error
 
 
 def _near_origin(parts: list[Any]) -> list[Any]:
@@ -169,19 +163,6 @@ def _upright(mesh: Mesh, y_up: bool) -> Mesh:
 
 
 _Z_FROM_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
-
-
-def _check_size(file: Path, field: str) -> None:
-    """Raises TwinError if the file is too large, declares too many triangles, or is not a readable mesh file."""
-    try:
-        n_bytes = file.stat().st_size
-        n_faces = 0 if n_bytes > MAX_BYTES else face_count(file)
-    except (OSError, ValueError) as error:
-        raise TwinError(field, f"{file.name!r} {error}", FORMATS) from error
-    if n_bytes > MAX_BYTES:
-        raise TwinError(field, f"{file.name!r} has {n_bytes} bytes", f"at most {MAX_BYTES} bytes")
-    if n_faces > MAX_FACES:
-        raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
 
 
 def _loaded(file: Path, field: str) -> Any:
@@ -292,10 +273,18 @@ def _base_colour(part: Any) -> tuple[int, ...] | None:
 
 
 def _texture_of(part: Any) -> tuple[Any, Any] | None:
-    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either."""
+    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either.
+
+    Raises:
+        ValueError: the image is of another format than IMAGE_FORMATS, or too large. Pillow decodes it later.
+    """
     material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
-    return None if image is None or uv is None or len(uv) != len(part.vertices) else (image, uv)
+    if image is None or uv is None or len(uv) != len(part.vertices):
+        return None
+    if image.format not in (None, *IMAGE_FORMATS) or image.width * image.height > MAX_TEXELS:  # None: of one colour
+        raise ValueError(f"a texture is a {image.format} of {image.width} x {image.height} pixels")
+    return image, uv
 
 
 def _sampled(image: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 FORMATS = "a PLY, OBJ or GLB file with triangles"
 _LONGEST_HEADER = 65_536  # largest number of bytes of a PLY header, and of a part of an OBJ line read at once
+_MOST_ELEMENTS = 20_000_000  # largest number of elements of an accessor of a GLB file
 _LONGEST_JSON = 16_777_216  # largest number of bytes of the description in a GLB file
 
 
@@ -68,6 +69,8 @@ def _glb_faces(file: Path) -> int:
         tree = json.loads(text)
         accessors = tree.get("accessors", [])
         instances = Counter(node.get("mesh") for node in tree.get("nodes", []))
+        if (most := max((int(accessor["count"]) for accessor in accessors), default=0)) > _MOST_ELEMENTS:
+            raise ValueError(f"{most} elements of an accessor")  # trimesh makes an array of one without data
         count = 0
         for number, mesh in enumerate(tree.get("meshes", [])):
             parts = [part.get("indices", part.get("attributes", {}).get("POSITION")) for part in mesh["primitives"]]

@@ -25,6 +25,17 @@ def print_error(text: str) -> None:
     print("".join(printable), file=sys.stderr)
 
 
+def hide_log_failures() -> None:
+    """Hides the traceback that rasterio prints if GDAL's message quotes bytes of a damaged file that are not UTF-8."""
+    default = sys.unraisablehook
+
+    def hook(failure: sys.UnraisableHookArgs) -> None:
+        if failure.object != "rasterio._env.log_error":
+            default(failure)
+
+    sys.unraisablehook = hook
+
+
 def accept_any_text() -> None:
     """Sets stdout to print a backslash escape for each character that its encoding cannot represent."""
     if isinstance(sys.stdout, io.TextIOWrapper):

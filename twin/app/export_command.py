@@ -22,7 +22,7 @@ from twin.core.records import ElevationMap, Image
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.formats import FORMATS, check_needs, chosen_formats
-from twin.exchange.run_contents import POSES, RecordedFrame, RunContents
+from twin.exchange.run_contents import POSES, RecordedFrame, RunContents, TrueLayers
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Raster, Run, load_run
 from twin.scenario.file import load_scenario
@@ -36,11 +36,13 @@ class ExportOptions(NamedTuple):
         crs: CRS of the exported coordinates, such as EPSG:32633; None: that of the run.
         origin: easting, northing and elevation of the scene origin as text, E,N or E,N,H; None: that of the run.
         jpeg_quality: quality of exported images as JPEG, 1 to 100; None: PNG.
+        allow_plugins: run plug-ins that the scenario of the run names as module:Class, for the true layers.
     """
 
     crs: str | None = None
     origin: str | None = None
     jpeg_quality: int | None = None
+    allow_plugins: bool = False
 
 
 def export(
@@ -131,7 +133,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
     """
     run = load_run(folder)
     rig = replayed_rig(run.scenario)
-    scenario = None if rig is not None else load_scenario(folder / SCENARIO_FILE)
+    scenario = None if rig is not None else load_scenario(folder / SCENARIO_FILE, allow_plugins=True)
     if scenario is not None:
         rig = scenario.believed_rig()
     assert rig is not None
@@ -154,7 +156,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         true_map=folder / "dem_truth.tif" if "dem_truth" in run.rasters else None,
         orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
         georeference=_georeference(folder, options),
-        true_layers=_true_layers(folder, scenario, frames),
+        true_layers=_true_layers(folder, scenario, frames, options.allow_plugins),
         jpeg_quality=_quality(options.jpeg_quality),
         notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
     )
@@ -173,13 +175,22 @@ def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
                 raise TwinError(file, "has times that do not increase", "an undamaged file, written by `twin run`")
 
 
-def _true_layers(folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...]):
-    """Returns the function that renders the true layers; None without a rendered world or recorded true poses."""
+def _true_layers(
+    folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...], allow_plugins: bool
+) -> Callable[[], TrueLayers] | None:
+    """Returns the function that renders the true layers; None without a rendered world or recorded true poses.
+
+    The function prepares the survey, which runs the plug-ins of the scenario.
+    """
     if scenario is None or scenario.imaging.fidelity != "rendered" or not (folder / "frames" / "truth.npz").is_file():
         return None
     from twin.app import true_layers
 
-    return partial(true_layers.true_layers, folder, scenario, frames)
+    def layers() -> TrueLayers:
+        given = load_scenario(folder / SCENARIO_FILE, allow_plugins=allow_plugins)
+        return true_layers.true_layers(folder, given, frames)
+
+    return layers
 
 
 def _quality(quality: int | None) -> int | None:

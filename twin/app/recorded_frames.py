@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from twin.core.records import Array, Exposure, ImuReadings, Readings
+from twin.core.user_files import read_text, reading
 from twin.errors import TwinError
 from twin.exchange.run_contents import ImuNoise, RecordedFrame, RecordedImu
 from twin.report.frame_recorder import EXPOSURE_COLUMNS, IMU_COLUMNS, READING_COLUMNS
@@ -53,14 +55,12 @@ def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
 
 def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
     """Returns index, time, exposure and readings of each line of frames.csv; raises TwinError if it is damaged."""
-    try:
-        with table.open(newline="", encoding="utf-8-sig") as lines:
-            rows = [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
+    with reading(table, "", "an undamaged file, written by `twin run`"):
+        lines = io.StringIO(read_text(table), newline="")
+        rows = [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
         _check_order("index", [row[0] for row in rows])
         _check_order("time_s", [row[1] for row in rows])
-    except (OSError, ValueError, TypeError, csv.Error) as error:
-        raise TwinError(str(table), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
-    return rows
+        return rows
 
 
 def _check_order(name: str, values: Sequence[float]) -> None:
@@ -162,7 +162,7 @@ def _imu_table(file: Path) -> Array:
         ValueError: the header is not that of imu.csv, a line has too few or too many cells, a cell is not a finite
             number, or the times do not increase.
     """
-    header, *lines = file.read_text(encoding="utf-8-sig").splitlines() or [""]
+    header, *lines = read_text(file).splitlines() or [""]
     if header != ",".join(IMU_COLUMNS):
         raise ValueError(f"its first line is {header[:60]!r}")
     rows = [line.split(",") for line in lines]

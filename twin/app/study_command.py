@@ -36,6 +36,7 @@ class StudyOptions(NamedTuple):
         verify: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune:
             number of rendered surveys of a plan before it is recommended; None: `tune.verify` of the study file.
         extrapolate: fly surrogate surveys outside the fitted range of the error model.
+        allow_plugins: fly plug-ins that study or scenario name as module:Class.
     """
 
     out: Path | None = None
@@ -46,6 +47,7 @@ class StudyOptions(NamedTuple):
     as_json: bool = False
     verify: int | None = None
     extrapolate: bool = False
+    allow_plugins: bool = False
 
     def engine(self) -> AbstractContextManager[Engine]:
         """Returns a context manager that yields the engine selected by these options; see `open_engine`."""
@@ -145,7 +147,7 @@ def load(file: str, options: StudyOptions) -> Study:
     Raises:
         TwinError: the study file is invalid.
     """
-    study = load_study(file)
+    study = load_study(file, options.allow_plugins)
     if not options.extrapolate:
         return study
     return study.model_copy(update={"set": study.set | {"imaging.extrapolate": True}})

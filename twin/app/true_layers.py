@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from zipfile import BadZipFile, is_zipfile
+from zipfile import is_zipfile
 
 import cv2
 import numpy as np
@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.records import Array, Image, StereoRig
 from twin.core.timing import Stopwatch
+from twin.core.user_files import MOST_TEXT_BYTES, reading
 from twin.errors import TwinError
 from twin.exchange.run_contents import FrameTruth, RecordedFrame, TrueLayers
 from twin.imaging.camera import DecomposedImage, StereoCamera
 from twin.imaging.facets import Heights
 from twin.imaging.image_formation import ImageFormation
+from twin.report.images import read_rgb
 from twin.scenario.model import Scenario, SnowConfig, WaterConfig
 from twin.world.mission import Mission, prepare
 from twin.world.rendered_world import RenderedWorld
@@ -55,10 +57,12 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
     Raises:
         TwinError: the file is damaged or lacks the frame with the number `last`.
     """
-    try:
+    with reading(file, "", "an undamaged file, written by `twin run`"):
         if not is_zipfile(file):
             raise ValueError("not an archive of NumPy")
         with np.load(file, allow_pickle=False) as arrays:
+            if sum(info.file_size for info in arrays.zip.infolist()) > MOST_TEXT_BYTES:
+                raise ValueError("its arrays are too large")
             poses, twists = np.asarray(arrays["world_from_camera"]), np.asarray(arrays["twist_body"])
         n = len(poses)
         if poses.shape != (n, 4, 4) or twists.shape != (n, 6) or n <= last:
@@ -66,8 +70,6 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
         if not (np.isfinite(poses).all() and np.isfinite(twists).all()):
             raise ValueError("a pose or a velocity is not finite")
         return poses, twists
-    except (OSError, EOFError, ValueError, KeyError, BadZipFile) as error:
-        raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
 
 
 def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, twists: Array) -> Iterator[FrameTruth]:
@@ -246,7 +248,7 @@ def _uint8(image: Image) -> Image:
 
 def _read(file: Path) -> Image:
     """Returns an image file as RGB (H, W, 3); raises TwinError if it cannot be read."""
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
+    image = read_rgb(file)
     if image is None:
         raise TwinError(str(file), "cannot be read", "a PNG, written by `twin run`")
-    return np.asarray(image, np.uint8)
+    return image

@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from twin.core.paths import is_file
 from twin.core.records import Image
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
 from twin.errors import TwinError
 
 Bayer = Literal["RGGB", "GRBG", "GBRG", "BGGR"]
 BAYER: tuple[Bayer, ...] = ("RGGB", "GRBG", "GBRG", "BGGR")
-_MOST_BYTES = 512 * 2**20  # largest image file
 _MOST_PIXELS = 2**28
 #: Bytes with which a complete file of a format ends (before padding with zeros).
 _ENDS = {"PNG": b"IEND\xaeB`\x82", "JPEG": b"\xff\xd9"}
@@ -148,14 +149,12 @@ def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer:
 
 def _contents(file: Path) -> bytes:
     """Returns the bytes of a file; raises UnreadableImage if it is missing, too large or unreadable."""
+    if not is_file(file):
+        raise UnreadableImage("missing")
     try:
-        if not file.is_file():
-            raise UnreadableImage("missing")
-        if file.stat().st_size > _MOST_BYTES:
-            raise UnreadableImage("too large")
-        return file.read_bytes()
-    except OSError:
-        raise UnreadableImage("unreadable") from None
+        return read_bytes(file, most_bytes=MOST_IMAGE_BYTES)
+    except TwinError as error:
+        raise UnreadableImage("too large" if error.problem.startswith("is too large") else "unreadable") from None
 
 
 def _header(data: bytes) -> tuple[int, int, str]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
-from twin.core.paths import is_file
+from twin.core.paths import is_file, resolved
 from twin.core.records import ElevationMap, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import Stopwatch, timing_summary
@@ -323,7 +323,7 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
         raise TwinError(str(folder), problem, "a rectified pair that fits the calibration; see `--preview`")
     aiding = _aiding(dataset, frames) if options.aiding else None
     true_map = _true_map(dataset, truth, options)
-    return OpenedDataset(folder.resolve().name, reader, dataset, frames, truth, pair, plane, aiding, true_map)
+    return OpenedDataset(resolved(folder).name, reader, dataset, frames, truth, pair, plane, aiding, true_map)
 
 
 def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:

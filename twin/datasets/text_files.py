@@ -13,9 +13,10 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from twin.core import user_files
 from twin.core.geometry import Array
-from twin.core.paths import is_file, resolved
-from twin.errors import TwinError
+from twin.core.paths import resolved
+from twin.errors import TwinError, described
 
 _MOST_BYTES = 256 * 2**20  # largest list of images or poses
 _MOST_YAML_BYTES = 2**20
@@ -54,7 +55,8 @@ def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     Raises:
         YAMLError: the matrix is empty or has more than 64 values, or their number is not rows times columns.
     """
-    assert isinstance(node, yaml.MappingNode)
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.YAMLError("a matrix without rows, cols and data")
     matrix = loader.construct_mapping(node, deep=True)
     data, rows, cols = matrix["data"], int(matrix["rows"]), int(matrix["cols"])
     if not 0 < rows * cols <= _MOST_ELEMENTS or len(data) != rows * cols:
@@ -68,7 +70,8 @@ def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
     Raises:
         YAMLError: the array is empty or has more than 64 values.
     """
-    assert isinstance(node, yaml.MappingNode)
+    if not isinstance(node, yaml.MappingNode):
+        raise yaml.YAMLError("an array without sizes and data")
     array = loader.construct_mapping(node, deep=True)
     if not 0 < len(array["data"]) <= _MOST_ELEMENTS:
         raise yaml.YAMLError(f"an array has {len(array['data'])} numbers")
@@ -86,14 +89,7 @@ def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
     Raises:
         TwinError: the file is missing, is larger than `most_bytes`, or is not text.
     """
-    if not is_file(file):
-        raise TwinError(str(file), "does not exist or is not a file")
-    try:
-        if file.stat().st_size > most_bytes:
-            raise TwinError(str(file), "is too large", f"up to {most_bytes / 2**20:g} MiB")
-        return file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise TwinError(str(file), f"cannot be read: {error}", "a text file") from None
+    return user_files.read_text(file, "", "a text file", most_bytes)
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
@@ -105,8 +101,8 @@ def read_yaml(file: Path) -> dict[str, Any]:
     text = re.sub(r"\A%YAML[: ][^\n]*\n", "", read_text(file, _MOST_YAML_BYTES))
     try:
         tree = yaml.load(text, Loader=_CalibrationLoader)  # a SafeLoader: it builds plain values only
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, RecursionError) as error:
-        raise TwinError(str(file), f"is not valid YAML: {' '.join(str(error).split())[:200]}") from None
+    except Exception as error:  # constructors of values raise any of many types
+        raise TwinError(str(file), f"is not valid YAML: {described(error)[:200]}") from None
     if not isinstance(tree, dict):
         raise TwinError(str(file), "is not a YAML table")
     return tree

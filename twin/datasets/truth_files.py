@@ -5,10 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import rasterio
 
 from twin.core import geometry
-from twin.core.paths import is_file
+from twin.core.raster_files import open_raster
 from twin.core.records import Trajectory
 from twin.datasets.dataset import Dataset
 from twin.datasets.euroc import camera_truth
@@ -16,10 +15,9 @@ from twin.datasets.kitti import camera_poses
 from twin.datasets.text_files import read_table, text_rows
 from twin.errors import TwinError
 from twin.judge.true_map import TrueMap
-from twin.report.run_folder import read_raster
+from twin.report.run_folder import MOST_CELLS, read_raster
 
 _ALLOWED = "TUM (8 columns), KITTI (12 columns) or EuRoC (timestamp in ns and 7 or more columns, by commas)"
-_MOST_CELLS = 100_000_000  # of a true map
 _HEIGHT_GRID = "a GeoTIFF of one band with heights [m], north up, in the frame of the true poses"
 
 
@@ -29,17 +27,12 @@ def read_true_map(file: Path) -> TrueMap:
     Raises:
         TwinError: the file cannot be read, has several bands or too many cells, or knows no height.
     """
-    if not is_file(file):
-        raise TwinError(str(file), "does not exist or is not a file", _HEIGHT_GRID)
-    try:
-        with rasterio.open(file) as source:
-            size = source.width * source.height
-            if source.count != 1 or size > _MOST_CELLS or (source.crs is not None and source.crs.is_geographic):
-                problem = f"has {source.count} bands and {size} cells, CRS {str(source.crs)[:60]}"
-                raise TwinError(str(file), problem, f"{_HEIGHT_GRID}, up to {_MOST_CELLS} cells")
+    with open_raster(file, "", _HEIGHT_GRID) as source:
+        size = source.width * source.height
+        if source.count != 1 or size > MOST_CELLS or (source.crs is not None and source.crs.is_geographic):
+            problem = f"has {source.count} bands and {size} cells, CRS {str(source.crs)[:60]}"
+            raise TwinError(str(file), problem, f"{_HEIGHT_GRID}, up to {MOST_CELLS} cells")
         grid, height_m = read_raster(file)
-    except (OSError, ValueError) as error:  # errors of rasterio are OSError
-        raise TwinError(str(file), f"cannot be read: {error}", _HEIGHT_GRID) from None
     if not np.isfinite(height_m).any():
         raise TwinError(str(file), "has no heights", _HEIGHT_GRID)
     return TrueMap(grid, height_m)

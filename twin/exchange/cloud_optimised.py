@@ -13,6 +13,7 @@ import rasterio
 import rasterio.shutil
 
 from twin.core.georeference import Georeference
+from twin.core.raster_files import open_raster
 from twin.core.records import MapGrid
 from twin.exchange import geotiff
 from twin.exchange.geotiff import Layer
@@ -85,8 +86,9 @@ def write_orthomosaic(path: Path, source: Path, georeference: Georeference | Non
         return _optimise(source, path)
     with TemporaryDirectory(dir=path.parent) as temporary:
         copy = Path(temporary) / "orthomosaic.tif"
-        rasterio.shutil.copy(source, copy, driver="GTiff", bigtiff="IF_SAFER")
-        with rasterio.open(copy, "r+") as file:
+        with open_raster(source) as original:
+            rasterio.shutil.copy(original, copy, driver="GTiff", bigtiff="IF_SAFER")
+        with rasterio.open(copy, "r+", driver="GTiff") as file:
             grid, _ = geotiff.scene_placement(file)
             placed = geotiff.profile(grid, file.count, file.dtypes[0], georeference)
             file.transform, file.crs = placed["transform"], placed["crs"]
@@ -96,4 +98,5 @@ def write_orthomosaic(path: Path, source: Path, georeference: Georeference | Non
 
 def _optimise(source: Path, path: Path, **options: str) -> None:
     """Copies a GeoTIFF as a cloud-optimised one with GDAL's COG driver; `options` are further options of the driver."""
-    rasterio.shutil.copy(source, path, driver="COG", **_OPTIONS, **options)
+    with open_raster(source) as original:
+        rasterio.shutil.copy(original, path, driver="COG", **_OPTIONS, **options)

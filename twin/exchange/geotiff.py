@@ -20,6 +20,7 @@ from rasterio.warp import transform
 
 from twin.core.georeference import Georeference
 from twin.core.orthomosaic import OrthoTile
+from twin.core.raster_files import open_raster
 from twin.core.records import ElevationMap, Image, MapGrid
 from twin.errors import TwinError
 
@@ -165,15 +166,12 @@ def read_georeference(path: Path) -> Georeference | None:
     Raises:
         TwinError: the file cannot be read, or its tags are damaged.
     """
-    try:
-        with rasterio.open(path) as source:
-            tags, crs = source.tags(), source.crs
+    with open_raster(path, "", "a map file, written by `twin run`") as source:
+        tags, crs = source.tags(), source.crs
         if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
             return None
         easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
         unit_m, datum = float(tags[_UNIT_TAG]), tags.get("VERTICAL_DATUM", _UNKNOWN_DATUM)
-    except (OSError, ValueError) as error:
-        raise TwinError(str(path), f"cannot be read: {error}", "a map file, written by `twin run`") from None
     datum = "" if datum == _UNKNOWN_DATUM else datum
     return Georeference(easting, northing, elevation_m, None if crs is None else crs.to_wkt(), unit_m, datum)
 

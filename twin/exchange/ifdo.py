@@ -14,6 +14,7 @@ import numpy as np
 
 from twin.core.georeference import Georeference
 from twin.core.records import Array
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
 from twin.exchange.attitude import yaw_pitch_roll_deg
 from twin.exchange.image_copy import copy_images
 from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RunContents
@@ -129,7 +130,7 @@ def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:
 
 def _item(contents: RunContents, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
     """Returns the fields of one image, given its frame, its file and the pose (4, 4) of its camera in the world."""
-    digest = hashlib.sha256(image.read_bytes()).hexdigest()
+    digest = hashlib.sha256(read_bytes(image, most_bytes=MOST_IMAGE_BYTES)).hexdigest()
     time = _START + timedelta(seconds=frame.time_s)
     yaw, pitch, roll = yaw_pitch_roll_deg(pose)
     return {

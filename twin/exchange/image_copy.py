@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 
 from twin.core.records import Array
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
 from twin.errors import TwinError
 from twin.exchange.run_contents import RecordedFrame, RunContents
 
+_PNG_START = b"\x89PNG"
 _PNG_END = b"IEND\xaeB`\x82"  # last bytes of a complete PNG file
 
 
@@ -86,9 +88,9 @@ def encoded_image(source: Path, jpeg_quality: int | None = None) -> tuple[str, b
         TwinError: the file is truncated or not a PNG image.
         OSError: the file cannot be read.
     """
-    data = source.read_bytes()
-    image = None if jpeg_quality is None else cv2.imread(str(source), cv2.IMREAD_COLOR)
-    if not data.endswith(_PNG_END) or (image is None and jpeg_quality is not None):
+    data = read_bytes(source, most_bytes=MOST_IMAGE_BYTES)
+    image = None if jpeg_quality is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    if not data.startswith(_PNG_START) or not data.endswith(_PNG_END) or (image is None and jpeg_quality is not None):
         raise TwinError(str(source), "is truncated or not a PNG image", "an undamaged image of the run")
     if image is None:
         return "png", data

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.core.paths import is_file
+from twin.core.user_files import read_bytes
 from twin.errors import TwinError
 
 #: Maximum size of a file [bytes].
@@ -81,17 +81,11 @@ def _text(file: Path) -> str:
     """Returns the text of a file. Raises TwinError if it is not a file of UTF-8 text of at most `MAX_BYTES` bytes."""
     allowed = f"a g2o or TORO file of up to {MAX_BYTES} bytes in UTF-8"
     try:
-        if file.exists() and not is_file(file):
-            raise TwinError(str(file), "is not a regular file", allowed)
-        if file.stat().st_size > MAX_BYTES:
-            raise TwinError(str(file), f"has {file.stat().st_size} bytes", allowed)
-        return file.read_bytes().decode("utf-8-sig")
+        return read_bytes(file, "", allowed, MAX_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         kind = "is UTF-16" if error.object[:2] in (b"\xff\xfe", b"\xfe\xff") else f"is not UTF-8: {error.reason}"
         line = error.object.count(b"\n", 0, error.start) + 1
         raise TwinError(f"{file}:{line}", kind, allowed) from None
-    except (OSError, ValueError) as error:
-        raise TwinError(str(file), f"cannot be read: {error}", allowed) from None
 
 
 def _rows(file: Path, tag: str, layout: Layout, lines: list[int], rows: list[list[str]]) -> Rows:

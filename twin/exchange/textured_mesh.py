@@ -11,7 +11,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import rasterio
 import trimesh
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
@@ -23,6 +22,7 @@ from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from twin.core.georeference import Georeference
 from twin.core.grid_triangles import raster_triangles
+from twin.core.raster_files import open_raster
 from twin.core.records import ElevationMap, MapGrid
 from twin.exchange import geotiff
 from twin.exchange.mesh import GLB_FROM_WORLD, MAX_VERTICES
@@ -104,7 +104,7 @@ def _uv(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 
 def _texture(file: Path) -> tuple[NDArray[np.uint8], MapGrid]:
     """Returns the orthomosaic (H, W, 3), averaged to at most `_MOST_TEXTURE_PX` pixels per side, and its grid."""
-    with rasterio.open(file) as source:
+    with open_raster(file) as source:
         grid, _ = geotiff.scene_placement(source)
         step = int(np.ceil(max(source.width, source.height) / _MOST_TEXTURE_PX))
         rows, cols = max(1, source.height // step), max(1, source.width // step)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.paths import is_file
+from twin.core.user_files import reading
 from twin.errors import TwinError
 from twin.imaging.bands import CENTRE_NM, NM, band_weights, effective_per_m
 from twin.imaging.light_spectra import Light, spectrum_of
@@ -141,15 +141,9 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
     """
     key = "water.spectrum_file"
     wanted = "rows of wavelength [nm], absorption, scattering [1/m]"
-    if file.exists() and not (is_file(file) and file.stat().st_size <= MAX_SPECTRUM_BYTES):
-        problem = "it is not a regular file" if not is_file(file) else f"it has {file.stat().st_size} bytes"
-        raise TwinError(key, f"{file} cannot be read: {problem}", f"up to {MAX_SPECTRUM_BYTES} bytes, {wanted}")
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # an empty file
-            table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise TwinError(key, f"{file} cannot be read: {error}", wanted) from None
+    with reading(file, key, wanted, MAX_SPECTRUM_BYTES), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # an empty file
+        table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, encoding="utf-8-sig")
     if table.shape[1] != 3 or len(table) < 2:
         raise TwinError(key, f"{file} has {table.shape[1]} columns and {len(table)} rows", "3 columns, 2 rows or more")
     nm = table[:, 0]

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.errors import SurveyAborted, TwinError
+from twin.errors import SurveyAborted, TwinError, described
 from twin.plugin import loading
 
 #: Largest difference of R'R from the identity, and of det R from 1, for a rotation R of a pose.
@@ -117,7 +117,7 @@ class GuardedPlugin:
         try:
             return function(*copy.deepcopy(arguments))
         except (Exception, SystemExit) as error:  # a plug-in may raise any exception
-            raise PluginFailed(f"{self.label}: {what} raised {loading.described(error)}") from None
+            raise PluginFailed(f"{self.label}: {what} raised {described(error)}") from None
 
 
 def check_loadable(key: str, group: str, name: str | None) -> None:

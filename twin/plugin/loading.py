@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib.metadata import entry_points
 from typing import Any, NamedTuple, TypeVar
 
-from twin.errors import TwinError
+from twin.errors import TwinError, described
 
 #: Groups of entry points under which other packages register plug-ins.
 CONTROLLERS, ESTIMATORS, TERRAINS, READERS = "twin.controllers", "twin.estimators", "twin.terrains", "twin.readers"
@@ -82,12 +82,6 @@ def attempt(key: str, name: str, function: Callable[[], T]) -> T:
         return function()
     except (Exception, SystemExit) as error:  # a plug-in may raise any exception
         raise TwinError(key, f"{name}: {described(error)}", "a plug-in that can be loaded") from None
-
-
-def described(error: BaseException) -> str:
-    """Returns the class and the message of an exception in one line of at most 300 characters."""
-    text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error).split()))
-    return (f"{type(error).__name__}: {text}" if text else type(error).__name__)[:300]
 
 
 def _attribute(module: Any, dotted: str) -> Callable[..., Any]:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from twin.core.paths import resolved
 from twin.errors import TwinError
 from twin.report import wording
 from twin.report.comparison_figures import draw_comparison, run_colours
@@ -91,7 +92,7 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
     """
     if not 2 <= len(folders) <= MOST_RUNS:
         raise TwinError("RUN", f"{len(folders)} runs", f"2 to {MOST_RUNS}")
-    if len({folder.resolve() for folder in folders}) < len(folders):
+    if len({resolved(folder) for folder in folders}) < len(folders):
         raise TwinError("RUN", "the same folder is given twice", "different folders")
     runs = [load_run(folder) for folder in folders]
     for run in runs:
@@ -105,7 +106,7 @@ def names_of(runs: Sequence[Run]) -> list[str]:
 
     All names have the same number of parts, the smallest that makes them distinct.
     """
-    paths = [run.folder.resolve() for run in runs]
+    paths = [resolved(run.folder) for run in runs]
     for n in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-n:]) for path in paths]
         if len(set(names)) == len(names):

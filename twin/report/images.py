@@ -8,8 +8,11 @@ import cv2
 import numpy as np
 
 from twin.core.records import Image
+from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
+from twin.errors import TwinError
 
 JPEG_QUALITY = 78
+_SIGNATURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")
 
 
 def jpeg_bytes(image: Image, longest_px: int) -> bytes:
@@ -21,6 +24,12 @@ def jpeg_bytes(image: Image, longest_px: int) -> bytes:
 
 
 def read_rgb(file: Path) -> Image | None:
-    """Returns an image file as RGB; None if it is missing or not an image."""
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
+    """Returns a PNG or JPEG file as RGB; None if it is missing or not such an image."""
+    try:
+        data = read_bytes(file, most_bytes=MOST_IMAGE_BYTES)
+    except TwinError:
+        return None
+    if not data.startswith(_SIGNATURES):
+        return None
+    image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR_RGB)
     return None if image is None else np.asarray(image, np.uint8)

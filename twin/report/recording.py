@@ -44,7 +44,7 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
-    rig = replayed_rig(run.scenario) or scenario_file.load_scenario(run.folder / SCENARIO_FILE).believed_rig()
+    rig = replayed_rig(run.scenario) or _believed_rig(run.folder / SCENARIO_FILE)
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
     recording.save(file, default_blueprint=blueprint(_overview(run)))
     log_scene(recording, run)
@@ -55,6 +55,11 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     recording.flush()
     recording.disconnect()
     return file
+
+
+def _believed_rig(scenario: Path):
+    """Returns the believed rig of a scenario; no plug-in is loaded for it."""
+    return scenario_file.load_scenario(scenario, allow_plugins=True).believed_rig()
 
 
 def open_viewer(folder: Path) -> int:

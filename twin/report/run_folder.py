@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +11,19 @@ import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
-from rasterio.errors import RasterioError
 
 from twin.core.paths import is_file, path_problem
+from twin.core.raster_files import open_raster
 from twin.core.records import Array, MapGrid, Trajectory
+from twin.core.user_files import read_json, read_text, reading
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.report.run_files import checked_environment, checked_index, checked_metrics, checked_scenario
 from twin.scenario.toml_text import parse_toml
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
+MOST_CELLS = 100_000_000  #: of a map that is read as a whole
+_LEAST_CELLS = 10_000_000  # of a map that may be larger than its file
 SCENARIO_FILE = "scenario.resolved.toml"
 _OBSERVATION_KEYS = ("row", "n_points", "contrast")  # columns of `Keyframes.stereo_observations`
 RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error")
@@ -117,7 +119,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, written by `twin run`")
     return Run(
         folder,
-        _read(folder / SCENARIO_FILE, lambda f: checked_scenario(parse_toml(f.read_text(encoding="utf-8")))),
+        _read(folder / SCENARIO_FILE, lambda f: checked_scenario(parse_toml(read_text(f)))),
         _read_json(folder / "env.json", checked_environment) or {},
         metrics or _read_json(folder / "metrics.json", checked_metrics),
         _read_existing({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
@@ -135,15 +137,23 @@ def read_raster(file: Path) -> Raster:
     scene.
 
     Raises:
-        ValueError: the raster is rotated, its cells are not square, or its tags are damaged.
-        RasterioError: the file is not a readable raster.
+        TwinError: the file is not a readable GeoTIFF or has more than MOST_CELLS cells, the raster is rotated, its
+            cells are not square, or its tags are damaged.
     """
-    with rasterio.open(file) as source:
+    with open_raster(file) as source:
+        _check_size(source, file.stat().st_size)
         grid, elevation_m = geotiff.scene_placement(source)
         bands = source.read(masked=source.count == 1)
     if len(bands) == 1:
         return Raster(grid, bands[0].astype(float).filled(np.nan) - elevation_m)
     return Raster(grid, np.moveaxis(bands[:3], 0, 2))
+
+
+def _check_size(source: rasterio.DatasetReader, n_bytes: int) -> None:
+    """Raises ValueError if a raster has more cells than fit into memory, or than a file of its size can contain."""
+    n_cells = source.width * source.height
+    if n_cells > min(MOST_CELLS, _LEAST_CELLS + 1000 * n_bytes):  # DEFLATE compresses to a thousandth at most
+        raise ValueError(f"{source.width} x {source.height} cells in {n_bytes} bytes, at most {MOST_CELLS}")
 
 
 def read_mosaic(file: Path) -> Raster:
@@ -152,9 +162,9 @@ def read_mosaic(file: Path) -> Raster:
     Rows and columns at the south and east edges that do not fill a reduced pixel are left out.
 
     Raises:
-        ValueError, RasterioError: see `read_raster`.
+        TwinError: see `read_raster`.
     """
-    with rasterio.open(file) as source:
+    with open_raster(file) as source:
         grid, _ = geotiff.scene_placement(source)
         step = int(np.ceil(np.sqrt(source.width * source.height / MAX_MOSAIC_PX)))
         rows, cols = source.height // step, source.width // step
@@ -171,7 +181,7 @@ def read_network(file: Path) -> Network:
         KeyError: an edge names a node that the file does not contain.
         ValueError: a number or an edge is damaged.
     """
-    lines = [line.split() for line in file.read_text(encoding="utf-8").splitlines()]
+    lines = [line.split() for line in read_text(file).splitlines()]
     nodes = [line for line in lines if line and line[0] == "VERTEX_SE3:QUAT"]
     pairs = [line[1:3] for line in lines if line and line[0] == "EDGE_SE3:QUAT"]
     row = {node[1]: k for k, node in enumerate(nodes)}
@@ -202,7 +212,7 @@ def _read_keyframes(file: Path) -> Keyframes:
 
 def _read_json(file: Path, checked: Callable[[Any], dict[str, Any]]) -> dict[str, Any] | None:
     """Returns the contents of a JSON file, passed through `checked`; None if the file does not exist."""
-    return _read(file, lambda f: checked(json.loads(f.read_text(encoding="utf-8")))) if file.is_file() else None
+    return _read(file, lambda f: checked(read_json(f))) if file.is_file() else None
 
 
 def _read_existing(files: dict[str, Path], reader: Any) -> dict[str, Any]:
@@ -212,9 +222,5 @@ def _read_existing(files: dict[str, Path], reader: Any) -> dict[str, Any]:
 
 def _read(file: Path, reader: Any) -> Any:
     """Returns `reader(file)`; raises TwinError if the file cannot be read."""
-    try:
+    with reading(file, "", "an undamaged file, written by `twin run`"):
         return reader(file)
-    except RecursionError:
-        raise TwinError(str(file), "cannot be read: nested too deeply", "a file written by `twin run`") from None
-    except (OSError, ValueError, KeyError, IndexError, RasterioError) as error:
-        raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.user_files import read_text
 from twin.judge.budget import stage_times
 from twin.report import wording
 from twin.report.figures import draw_all
@@ -69,7 +70,7 @@ def context(run: Run) -> dict[str, Any]:
         "surface": surface_image(run),
         "samples": sample_images(run),
         "alignment": wording.REPLAY_ALIGNMENTS[run_alignment(run) or "first"],
-        "scenario": (run.folder / SCENARIO_FILE).read_text(encoding="utf-8"),
+        "scenario": read_text(run.folder / SCENARIO_FILE),
         "environment": {key: _text(value) for key, value in run.environment.items()},
         "colours": COLOURS,
     }

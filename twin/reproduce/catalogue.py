@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from twin.core.user_files import read_json
 from twin.errors import TwinError
 from twin.reproduce import index_page
 from twin.reproduce.exhibit import SCHEMA, Exhibit, Figure, exhibit_of, make_table
@@ -120,14 +121,7 @@ def read_all(file: Path) -> tuple[list[Exhibit], bool]:
     Raises:
         TwinError: the file cannot be read or is not a results.json.
     """
-    try:
-        contents = json.loads(file.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise TwinError(
-            str(file), f"cannot be read: {error.strerror}", "results.json of `twin reproduce all`"
-        ) from None
-    except ValueError as error:
-        raise TwinError(str(file), f"is not JSON: {error}", "results.json of `twin reproduce all`") from None
+    contents = read_json(file, "", "results.json of `twin reproduce all`")
     if not isinstance(contents, dict) or not isinstance(contents.get("exhibits"), list):
         raise TwinError(str(file), "has no list of exhibits", "results.json of `twin reproduce all`")
     return [exhibit_of(entry, file) for entry in contents["exhibits"]], bool(contents.get("quick"))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from twin.core.user_files import read_text
 from twin.errors import TwinError
 from twin.reproduce.exhibit import Exhibit, Table
 
@@ -74,8 +75,5 @@ def update(readme: Path, exhibits: Sequence[Exhibit], quick: bool) -> None:
         TwinError: the file cannot be read, or does not contain each marker exactly once.
         OSError: the file cannot be written.
     """
-    try:
-        text = readme.read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise TwinError(str(readme), f"cannot be read: {error}", "a Markdown file") from None
+    text = read_text(readme, "", "a Markdown file")
     readme.write_text(with_chapter(text, chapter(exhibits, quick), str(readme)), encoding="utf-8")

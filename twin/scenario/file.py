@@ -7,7 +7,7 @@ import difflib
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -16,6 +16,7 @@ import tomlkit
 from pydantic import BaseModel, ValidationError
 
 from twin.core.paths import is_file, resolved
+from twin.core.user_files import read_text
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.model import Scenario, Source
 from twin.scenario.toml_lines import key_lines
@@ -34,25 +35,30 @@ _RENAMED_KEYS = {
 }
 #: Key `mesh_file` of an item of `[[objects]]`.
 _OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
+#: Sections with a key `plugin`, and the group of its entry points.
+_PLUGIN_SECTIONS = {"control": "controllers", "estimate": "estimators", "terrain": "terrains"}
+_IN_PYTHON = "in Python: allow_plugins=True"
 _ABSENT = object()
 #: Largest number of errors that are listed.
 _MAX_ERRORS = 20
 
 
-def load_scenario(path: str | Path, overrides: Sequence[str] = ()) -> Scenario:
+def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins: bool = False) -> Scenario:
     """Returns the validated scenario of a file, merged over the files that it extends, with overrides applied.
 
     Args:
         path: path of a scenario file, or name of a scenario in scenes/.
         overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is taken as a
             string.
+        allow_plugins: whether the file and the overrides may name a plug-in as module:Class, which runs code of any
+            module that can be imported; the names of installed entry points are always allowed.
 
     Raises:
         ScenarioError: there is no such scenario, or a file or an override is invalid; lists the errors of files as
             `FILE:LINE: key: problem (allowed: ...)`, and those of overrides in lines that begin with `--set`.
     """
     tree, source, errors = _read_with_base(find_scene(path), including_files=())
-    source = source.model_copy(update={"overrides": tuple(overrides)})
+    source = source.model_copy(update={"overrides": tuple(overrides), "allow_plugins": allow_plugins})
     for override in overrides:
         try:
             _apply_override(tree, override)
@@ -116,6 +122,8 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
     """Returns the model of a tree of keys and values.
 
+    A plug-in that is named as module:Class is an error unless the source allows it.
+
     Args:
         tree: keys and values.
         model: class of the model.
@@ -124,6 +132,8 @@ def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Mo
     Raises:
         ScenarioError: a key or a value is invalid; lists up to `_MAX_ERRORS` errors and the number of the others.
     """
+    if refused := [] if source.allow_plugins else [source.describe(error) for error in _plugin_errors(tree)]:
+        raise ScenarioError(refused)
     try:
         return model.model_validate(tree)
     except ValidationError as error:
@@ -131,6 +141,21 @@ def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Mo
         lines = [source.describe(_as_twin_error(item, model)) for item in items[:_MAX_ERRORS]]
         more = [f"... and {len(items) - _MAX_ERRORS} more"] if len(items) > _MAX_ERRORS else []
         raise ScenarioError(lines + more) from None
+
+
+def _plugin_errors(tree: Mapping[str, Any]) -> Iterator[TwinError]:
+    """Yields an error for each key that names a plug-in as module:Class: it would run code of any module."""
+    for section, kind in _PLUGIN_SECTIONS.items():
+        keys = tree.get(section)
+        name = keys.get("plugin") if isinstance(keys, dict) else None
+        if isinstance(name, str) and ":" in name:
+            yield plugin_error(f"{section}.plugin", name, kind)
+
+
+def plugin_error(key: str, name: str, kind: str) -> TwinError:
+    """Returns the error of a plug-in that is named as module:Class without permission."""
+    problem = f"{shown(repr(name))} runs code of any module"
+    return TwinError(key, problem, f"an installed entry point of twin.{kind}; any with --allow-plugins ({_IN_PYTHON})")
 
 
 def find_scene(path: str | Path) -> Path:
@@ -178,10 +203,9 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
         ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
     """
     try:
-        with file.open(encoding="utf-8-sig") as stream:
-            text = stream.read(MAX_CHARACTERS + 1)
-    except (OSError, UnicodeDecodeError) as error:
-        raise ScenarioError([f"{file}:1: cannot be read: {error}"]) from None
+        text = read_text(file, most_bytes=4 * MAX_CHARACTERS, encoding="utf-8-sig")
+    except TwinError as error:
+        raise ScenarioError([f"{file}:1: {error.problem}"]) from None
     try:
         tree = parse_toml(text)
     except ValueError as error:

@@ -874,9 +874,11 @@ class Source(BaseModel):
         lines: line number of each dotted key of that file.
         base: source of the file that this file extends; None if it extends none.
         overrides: overrides from the command line, each `key=value`.
+        allow_plugins: whether keys may name a plug-in as module:Class, which runs code of any module.
     """
 
     path: Path
+    allow_plugins: bool = False
     lines: dict[str, int] = {}
     base: Source | None = None
     overrides: tuple[str, ...] = ()

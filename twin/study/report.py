@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from twin.core.user_files import read_text
 from twin.report.html import render_page
 from twin.study import agreement, agreement_report, wording
 from twin.study.analysis import StudyAnalysis
@@ -38,6 +39,6 @@ def context(study: Study, analysis: StudyAnalysis) -> dict[str, Any]:
         "figures": draw_all(analysis),
         "refused_samples": analysis.refused_samples[:MAX_REFUSED],
         "resamples": RESAMPLES,
-        "text": study.source.path.read_text(encoding="utf-8"),
+        "text": read_text(study.source.path),
         "version": version("seabed-twin"),
     }

@@ -174,11 +174,12 @@ class Study(Section):
         return find_scene(relative if is_file(relative) else self.scenario)
 
 
-def load_study(path: str | Path) -> Study:
+def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     """Reads and validates a study file and the scenario file that it names.
 
     Args:
         path: a file, or a name in scenes/studies/.
+        allow_plugins: whether study and scenario may name a plug-in as module:Class.
 
     Raises:
         ScenarioError: a file does not exist or is not valid; lists the errors of the study file or, if it has none,
@@ -186,7 +187,7 @@ def load_study(path: str | Path) -> Study:
     """
     file = find_study(path)
     tree, lines = read_toml(file)
-    source = Source(path=file, lines=lines)
+    source = Source(path=file, lines=lines, allow_plugins=allow_plugins)
     for node, section in ((tree, "vary"), (tree, "set"), (tree.get("tune"), "search")):
         if isinstance(node, dict) and isinstance(node.get(section), dict):
             node[section] = dict(flatten_keys(node[section]))
@@ -197,7 +198,9 @@ def load_study(path: str | Path) -> Study:
     errors = [source.describe(error) for error in _errors(study)]
     if errors:
         raise ScenarioError(errors)
-    load_scenario(study.scenario_file)  # reports the errors of the scenario itself with its own line numbers
+    load_scenario(
+        study.scenario_file, allow_plugins=allow_plugins
+    )  # reports the errors of the scenario itself with its own line numbers
     return study
 
 

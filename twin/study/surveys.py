@@ -107,7 +107,7 @@ def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) ->
         ScenarioError: lists every error of the scenario, each with a line of the study file.
     """
     given = {key: study_key for study_key, key in named_keys(study)}
-    source = SampleSource(path=study.source.path, lines=study.source.lines, sample=sample.number, given=given)
+    source = SampleSource(**dict(study.source), sample=sample.number, given=given)
     tree = dict(base) | ({"require": study.limits} if study.limits else {})
     return with_values(tree, study.set | sample.values, source)
 

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from twin.core.user_files import read_text
 from twin.report.figures import log_axis, to_data_uri
 from twin.report.html import render_page
 from twin.report.style import COLOURS, FIGURE_STYLE
@@ -52,7 +53,7 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
         "warnings": warnings(result),
         "figures": figures,
         "recommended": recommended_toml(study, config, result),
-        "text": study.source.path.read_text(encoding="utf-8"),
+        "text": read_text(study.source.path),
         "version": version("seabed-twin"),
     }
     (folder / "tuning.html").write_text(render_page("twin.study", "tuning.html.j2", page), encoding="utf-8")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from twin.core.paths import is_file
+from twin.core.user_files import read_text, reading
 from twin.errors import TwinError
 from twin.scenario.toml_text import MAX_CHARACTERS, parse_toml, value_errors
 from twin.surrogate.coverage import QUANTITIES, QuantityOutsideFit, Range, quantities_outside_fit
@@ -22,6 +22,7 @@ from twin.surrogate.error_model import (
     SigmaLaw,
 )
 
+_KEY, _ALLOWED = "imaging.error_model", "a file written by `twin fit-surrogate`"
 DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
 _LAWS = (SigmaLaw, FractionLaw, DepthLaw, ScatterLaw, BinnedDepthLaw, BorderLaw, BorderErrorLaw)
 #: Current name of each renamed key, by its former name.
@@ -98,18 +99,14 @@ def load(path: str | Path | None = None) -> FittedErrorModel:
         TwinError: the file does not exist, is not an error model, or contains the former name of a renamed key.
     """
     path = DEFAULT_FILE if path is None else Path(path)
-    try:
-        if path.exists() and not is_file(path):
-            raise _invalid(path, "it is not a regular file")
-        with path.open(encoding="utf-8") as stream:
-            tree = parse_toml(stream.read(MAX_CHARACTERS + 1))
+    text = read_text(path, _KEY, _ALLOWED, 4 * MAX_CHARACTERS, "utf-8")
+    with reading(path, _KEY, _ALLOWED):
+        tree = parse_toml(text)
         for error in value_errors(tree):
             raise _invalid(path, str(error))
         _check_names(path, tree)
         model = ErrorModel(**{name: _value(name, tree["model"][name]) for name in ErrorModel._fields})
         return FittedErrorModel(model, int(tree["n_surveys"]), dict(tree["misfit"]), _ranges(path, tree))
-    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _invalid(path, repr(error)) from None
 
 
 def save(fitted: FittedErrorModel, path: Path) -> None:
@@ -167,7 +164,7 @@ def _keys(tree: Mapping[str, Any]) -> list[str]:
 
 def _invalid(path: Path, problem: str) -> TwinError:
     """Returns the error for a file that is not an error model."""
-    return TwinError("imaging.error_model", f"{path}: {problem}", "a file written by `twin fit-surrogate`")
+    return TwinError(_KEY, f"{path}: {problem}", _ALLOWED)
 
 
 def _value(name: str, given: Any) -> Any:

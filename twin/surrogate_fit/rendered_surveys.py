@@ -13,6 +13,7 @@ import numpy as np
 
 from twin import survey
 from twin.core.timing import Stopwatch
+from twin.core.user_files import read_json
 from twin.errors import SurveyAborted, TwinError
 from twin.scenario.model import Scenario
 from twin.session.assembly import image_vision, navigator_with
@@ -145,8 +146,8 @@ def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) ->
 def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics | None:
     """Returns the statistics saved in a folder; None if there are none for this scenario and error model."""
     try:
-        saved = json.loads((folder / _FILE).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        saved = read_json(folder / _FILE)
+    except TwinError:
         return None
     same = saved["scenario_hash"] == scenario.fingerprint() and saved["model"] == repr(compared)
     return saved["statistics"] if same else None

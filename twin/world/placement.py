@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from controllers.survey_area import Corner, SurveyArea, polygon_area
 from terrains import Terrain
 from twin.core.georeference import Georeference
 from twin.core.records import Array
+from twin.core.user_files import read_json, reading
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig
 
@@ -101,13 +101,9 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
         TwinError: the file cannot be read or does not contain exactly one polygon without holes, its coordinates cannot
             be transformed, or the terrain has no coordinates.
     """
-    try:
-        if file.stat().st_size > _MAX_GEOJSON_BYTES:
-            raise TwinError("plan.polygon", f"{file.name!r} is too large", f"at most {_MAX_GEOJSON_BYTES} bytes")
-        tree = json.loads(file.read_text(encoding="utf-8-sig"))
+    tree = read_json(file, "plan.polygon", _ONE_POLYGON, _MAX_GEOJSON_BYTES)
+    with reading(file, "plan.polygon", _ONE_POLYGON):
         corners = np.array(_ring(tree, file), np.float64)[:, :2]
-    except (OSError, ValueError, TypeError, LookupError, RecursionError) as error:
-        raise TwinError("plan.polygon", f"{file.name!r} cannot be read: {error}", _ONE_POLYGON) from None
     if not np.isfinite(corners).all():
         raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _ONE_POLYGON)
     origin = _georeference("plan.polygon", terrain)
@@ -167,6 +163,6 @@ def _projected(corners: Array, crs: str, origin: Georeference) -> Array:
     try:
         target = CRS.from_wkt(origin.crs_wkt or "")
         return np.column_stack(transform(CRS.from_user_input(crs), target, *corners.T.tolist())[:2])
-    except (RasterioError, ValueError) as error:
-        problem = f"{crs!r} cannot be transformed to the CRS of the DEM: {error}"
+    except (RasterioError, ValueError, OverflowError) as error:
+        problem = f"{crs[:100]!r} cannot be transformed to the CRS of the DEM: {error}"
         raise TwinError("plan.polygon", problem, "coordinates in the CRS of the DEM") from None

@@ -1,0 +1,300 @@
+"""Files of strangers: only named formats are read, alone and within limits; a damaged file gives one TwinError."""
+
+import http.server
+import json
+import os
+import re
+import resource
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import rasterio.shutil
+import trimesh
+from rasterio.transform import from_origin
+
+import terrains
+from terrains.objects.mesh_file import read_mesh
+from twin.core.user_files import read_bytes, read_json, read_text
+from twin.datasets.text_files import read_yaml
+from twin.errors import TwinError
+from twin.report.comparison import load_runs
+from twin.report.run_folder import read_raster
+from twin.scenario.file import load_scenario
+from twin.world.placement import read_geojson
+
+ROOT = Path(__file__).parent.parent
+PLACED = from_origin(500000.0, 8000000.0, 0.5, 0.5)
+HEIGHTS = np.linspace(-8, -7, 35 * 40).reshape(35, 40)
+
+
+def write_tif(file, values=HEIGHTS, transform=PLACED, tags=None, **profile):
+    bands = np.atleast_3d(values) if np.ndim(values) == 2 else values
+    layout = {"driver": "GTiff", "height": bands.shape[0], "width": bands.shape[1], "count": bands.shape[2]}
+    with rasterio.open(file, "w", **layout, dtype=bands.dtype, transform=transform, **profile) as target:
+        target.write(np.moveaxis(bands, 2, 0))
+        target.update_tags(**(tags or {}))
+    return file
+
+
+def load(file, **texture):
+    return terrains.load(file, terrains.TextureSource(0.5, **texture), 0.5, 1.0, 0, "up")
+
+
+@pytest.fixture
+def server():
+    """Yields the address of a server, and the list of requests that it got."""
+    requests = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):  # noqa: N802 (name of the base class)
+            requests.append(self.path)
+            self.send_error(404)
+
+        do_HEAD = do_GET  # noqa: N815 (name of the base class)
+
+        def log_message(self, format, *args):  # noqa: A002 (name of the base class)
+            pass
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as opened:
+        threading.Thread(target=opened.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{opened.server_port}", requests
+        opened.shutdown()
+
+
+def vrt(source):
+    return (
+        '<VRTDataset rasterXSize="40" rasterYSize="35"><GeoTransform>0,0.5,0,0,0,-0.5</GeoTransform>'
+        f'<VRTRasterBand dataType="Float64" band="1"><SimpleSource><SourceFilename>{source}</SourceFilename>'
+        "</SimpleSource></VRTRasterBand></VRTDataset>"
+    )
+
+
+def wms(address):
+    return (
+        f'<GDAL_WMS><Service name="TMS"><ServerUrl>{address}/${{z}}</ServerUrl></Service><DataWindow>'
+        "<UpperLeftX>0</UpperLeftX><UpperLeftY>0</UpperLeftY><LowerRightX>20</LowerRightX><LowerRightY>-20</LowerRightY>"
+        "<SizeX>40</SizeX><SizeY>40</SizeY></DataWindow><BandsCount>1</BandsCount><DataType>Float32</DataType></GDAL_WMS>"
+    )
+
+
+def test_descriptions_that_name_other_files_or_servers_are_refused_without_a_request(server, tmp_path):
+    address, requests = server
+    other = write_tif(tmp_path / "other.tif")
+    floor = write_tif(tmp_path / "floor.tif")
+    for number, text in enumerate((vrt(other), vrt(f"/vsicurl/{address}/x.tif"), wms(address))):
+        (tmp_path / f"{number}.tif").write_text(text)
+        named = tmp_path / f"{number}.tif"
+        uses = ({"file": named}, {"file": floor, "photo_file": named}, {"file": floor, "orthophoto_file": named})
+        for use in uses:
+            with pytest.raises(TwinError, match="is not a file of the format"):
+                load(**use)
+        with pytest.raises(TwinError, match="is not a file of the format"):
+            read_raster(named)
+    assert not requests
+
+
+def test_overviews_and_masks_outside_a_file_are_never_opened(server, tmp_path):
+    address, requests = server
+    floor = write_tif(tmp_path / "floor.tif")
+    colour = write_tif(tmp_path / "colour.tif", np.full((350, 400, 3), 80, np.uint8), from_origin(5e5, 8e6, 0.05, 0.05))
+    for suffix in (".ovr", ".msk"):
+        Path(f"{colour}{suffix}").write_text(vrt(f"/vsicurl/{address}/x.tif"))
+    assert load(floor, orthophoto_file=colour).orthophoto_share == 1
+    with rasterio.open(colour, "r+") as target:
+        target.update_tags(ns="OVERVIEWS", OVERVIEW_FILE=f"/vsicurl/{address}/x.tif")
+    requests.clear()  # of the line before, which opens the file with GDAL's defaults
+    with pytest.raises(TwinError, match="names another file, of overviews"):
+        load(floor, orthophoto_file=colour)
+    assert not requests
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("dem.tfw", "0.5\n0\n0\n-0.5\n0\n0\n"), ("dem.tif.aux.xml", "<PAMDataset><SRS>x</SRS></PAMDataset>")],
+)
+def test_coordinates_in_a_file_beside_the_dem_are_refused_not_lost(tmp_path, name, text):
+    file = write_tif(tmp_path / "dem.tif", transform=from_origin(0, 0, 1, 1) if name != "dem.tfw" else None)
+    load(file)
+    (tmp_path / name).write_text(text)
+    with pytest.raises(TwinError, match=f"{name}' has coordinates or values of 'dem.tif'"):
+        load(file)
+
+
+def test_every_raster_is_opened_by_a_named_driver_and_every_image_from_checked_bytes():
+    for file in [*ROOT.glob("twin/**/*.py"), *ROOT.glob("terrains/**/*.py")]:
+        text = file.read_text()
+        for call in re.findall(r"rasterio\.open\(.*", text):
+            assert "driver=" in call or '"w"' in call, f"{file.name}: {call}"
+        assert "cv2.imread(" not in text, file.name
+
+
+NPY = b"\x93NUMPY\x01\x00v\x00"
+BROKEN_NPY = {
+    "zip": b"PK\x03\x04" + bytes(500),
+    "header": NPY + b"{'descr': '<f8', 'fortran_order': False, 'shape': (3, (".ljust(117) + b"\n" + bytes(72),
+    "empty": b"",
+    "sizes": NPY + b"{'descr': '<f8', 'fortran_order': False, 'shape': (10000000000, 10000000000)}".ljust(117) + b"\n",
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN_NPY)
+def test_a_broken_npy_header_is_one_error(tmp_path, kind):
+    (tmp_path / "dem.npy").write_bytes(BROKEN_NPY[kind])
+    with pytest.raises(TwinError, match=r"^terrain.height_file: 'dem.npy' cannot be read: [^\n]*$"):
+        load(tmp_path / "dem.npy")
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"values": np.where(HEIGHTS > -7.1, 1e30, HEIGHTS)}, "has the value 1e\\+30"),
+        ({"values": np.full((35, 40), 2**32 - 9, np.uint32)}, "has a height of 4.29497e\\+09 m"),
+        ({"transform": from_origin(0, 0, 1e-300, 1e-300)}, "has cells of 1e-300"),
+        ({"transform": from_origin(np.nan, 0, 1, 1)}, "coordinates are not finite"),
+        ({"transform": from_origin(1e300, 0, 1, 1)}, "has cells of 1 at"),
+        ({"tiled": True, "blockxsize": 2**13, "blockysize": 2**12, "SPARSE_OK": True}, "larger than the raster"),
+    ],
+)
+def test_implausible_grids_are_refused_before_an_array_is_made(tmp_path, change, problem):
+    with pytest.raises(TwinError, match=problem):
+        load(write_tif(tmp_path / "dem.tif", **change))
+
+
+def test_a_map_with_more_cells_than_its_file_can_contain_is_refused(tmp_path):
+    layout = {"driver": "GTiff", "width": 9000, "height": 9000, "count": 1, "dtype": "float64", "SPARSE_OK": True}
+    with rasterio.open(tmp_path / "dem.tif", "w", **layout, tiled=True, transform=PLACED):
+        pass
+    with pytest.raises(TwinError, match="9000 x 9000 cells"):
+        read_raster(tmp_path / "dem.tif")
+
+
+@pytest.mark.parametrize(
+    "name", ["/dev/zero", "/dev/stdin", "/", "/proc/self/mem", "none", "fifo", "loop", "a\0b", "n" * 999]
+)
+def test_what_is_no_regular_file_is_refused_by_every_reader(tmp_path, name):
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "loop").symlink_to("loop")
+    for reader in (read_bytes, read_text, read_json, read_yaml, read_raster, load):
+        with pytest.raises(TwinError) as error:
+            reader(tmp_path / name)
+        assert "\n" not in str(error.value)
+
+
+def test_a_file_is_not_read_beyond_its_limit(tmp_path):
+    with (tmp_path / "large").open("wb") as stream:
+        stream.truncate(2**40)
+    with pytest.raises(TwinError, match="is too large: 1099511627776 bytes"):
+        read_bytes(tmp_path / "large")
+
+
+@pytest.mark.parametrize(
+    "ring", ["[[1%s, 0], [1, 0], [1, 1], [1, 0]]" % ("0" * 500), "[" * 9000, "[1, 2, 3, 4]", '{"a": 1}']
+)
+def test_an_impossible_polygon_is_one_error(tmp_path, ring):
+    (tmp_path / "area.json").write_text(f'{{"type": "Polygon", "coordinates": [{ring}]}}')
+    floor = load(write_tif(tmp_path / "dem.tif"))
+    with pytest.raises(TwinError, match=r"^plan.polygon: [^\n]*$"):
+        read_geojson(tmp_path / "area.json", floor)
+
+
+def test_a_scalar_matrix_of_opencv_is_one_error(tmp_path):
+    for tag in ("matrix", "nd-matrix"):
+        (tmp_path / "rig.yaml").write_text(f"%YAML:1.0\n---\nM1: !!opencv-{tag} 5\n")
+        with pytest.raises(TwinError, match="is not valid YAML"):
+            read_yaml(tmp_path / "rig.yaml")
+
+
+def test_a_loop_of_links_among_compared_runs_is_one_error(tmp_path):
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(TwinError, match="Too many levels of symbolic links"):
+        load_runs([tmp_path / "a", tmp_path / "b"])
+
+
+def test_an_accessor_without_data_is_refused_by_its_size(tmp_path):
+    file = tmp_path / "mesh.glb"
+    data = trimesh.creation.box().export(file_type="glb")
+    tree = json.loads(data[20 : 20 + int.from_bytes(data[12:16], "little")])
+    tree["accessors"][0]["count"], tree["accessors"][1]["count"] = 36, 10**9
+    text = json.dumps(tree).encode()
+    file.write_bytes(data[:12] + len(text).to_bytes(4, "little") + data[16:20] + text)
+    with pytest.raises(TwinError, match="1000000000 elements of an accessor"):
+        read_mesh(file, "terrain.mesh_file", (0.5, 0.5, 0.5))
+
+
+def samples(folder):
+    """Returns a valid file of each kind with its reader."""
+    rng = np.random.default_rng(1)
+    dem = write_tif(folder / "dem.tif", compress="deflate", tags={"title": "floor"})
+    floor = load(dem)
+    np.save(folder / "dem.npy", HEIGHTS)
+    photo = write_tif(
+        folder / "photo.tif", rng.integers(0, 255, (70, 80, 3), np.uint8), from_origin(5e5, 8e6, 0.25, 0.25)
+    )
+    rasterio.shutil.copy(photo, folder / "photo.png", driver="PNG")
+    corners = [[500002.0, 7999998.0], [500008.0, 7999998.0], [500008.0, 7999990.0], [500002.0, 7999998.0]]
+    (folder / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
+    (folder / "rig.yaml").write_text(
+        "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 1\n   cols: 2\n   dt: d\n   data: [1., 2.]\nT: &a {x: 1}\n"
+    )
+    (folder / "scene.toml").write_text('extends = "reef"\nseed = 7\n[plan]\ntracks = 2\narea_m = [2.0, 1.0]\n')
+    box = trimesh.creation.icosphere(1)
+    for suffix in ("ply", "obj", "glb"):
+        box.export(folder / f"mesh.{suffix}")
+    mesh = lambda file: read_mesh(file, "terrain.mesh_file", (0.5, 0.5, 0.5))  # noqa: E731
+    return {
+        dem: load, folder / "dem.npy": load, photo: lambda file: load(dem, orthophoto_file=file),
+        folder / "photo.png": lambda file: load(dem, photo_file=file),
+        folder / "area.json": lambda file: read_geojson(file, floor),
+        folder / "rig.yaml": read_yaml, folder / "scene.toml": load_scenario,
+        **{folder / f"mesh.{suffix}": mesh for suffix in ("ply", "obj", "glb")},
+    }  # fmt: skip
+
+
+def damaged(data, rng):
+    """Returns bytes with some of them changed, cut out, repeated or cut off."""
+    data = bytearray(data)
+    for _ in range(rng.integers(1, 6)):
+        at, n = int(rng.integers(0, len(data) + 1)), int(rng.integers(1, 9))
+        kind = rng.integers(0, 5)
+        new = rng.integers(0, 256, n, np.uint8).tobytes() if kind else data[at : at + 50 * n] * 2
+        data[at : at + (n if kind > 1 else 0)] = new if kind != 2 else b""
+    return bytes(data[: rng.integers(0, len(data) + 1)] if rng.random() < 0.1 else data)
+
+
+def fuzz(folder, n, seed):
+    """Reads `n` damaged copies of each sample; only TwinError may come out."""
+    rng = np.random.default_rng(seed)
+    for file, reader in samples(folder).items():
+        data = file.read_bytes()
+        for _ in range(n):
+            file.write_bytes(damaged(data, rng))
+            try:
+                reader(file)
+            except TwinError as error:
+                assert str(error)
+            except BaseException as error:
+                Path(f"{file}.failed").write_bytes(file.read_bytes())
+                raise AssertionError(f"{file}.failed: {error!r}") from error
+        file.write_bytes(data)
+
+
+@pytest.mark.long
+def test_only_twin_errors_come_out_of_damaged_files(tmp_path):
+    # in a process of its own, which measures its memory; a sample takes up to 20 ms
+    code = f"import test_user_files as t, pathlib; t.fuzz(pathlib.Path({str(tmp_path)!r}), 40, 3); t.report_memory()"
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert int(done.stdout.splitlines()[-1]) < 1_000_000  # kB
+
+
+def report_memory():
+    """Prints the largest memory of this process [kB]."""
+    print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
