@@ -97,6 +97,7 @@ class Matchability:
         clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
     """
 
+    @np.errstate(invalid="raise")
     def __init__(
         self,
         scenario: Scenario,
