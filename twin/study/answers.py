@@ -15,7 +15,7 @@ from twin.study.statistics import LEVEL, Array, Interval, clustered_proportion, 
 Verdict = Literal["passes", "fails", "undecided"]
 _BIN_SURVEYS = 12  # smallest number of surveys in a bin of a continuous key
 _MAX_BINS = 20
-_DIVIDING_DEVIANCE = 10.0  # of a bin with one pass probability, exceeded at any of 23 values in about 1 % of cases
+_DIVIDING_DEVIANCE = 15.0  # exceeded in less than 1 % of samples with one pass probability
 
 
 class Answer(NamedTuple):
@@ -173,19 +173,16 @@ def value_bins(x: Array) -> NDArray[np.int64]:
 def pass_bins(x: Array, outcomes: ArrayLike) -> NDArray[np.int64]:
     """Returns the bin of each survey (n,), numbered in ascending order of its value: `value_bins`, divided further.
 
-    A bin is divided where the fractions of the outcomes change within it, so that it does not mix two probabilities.
+    Bins are also divided where the fractions of the outcomes change, so that no bin mixes two pass probabilities.
 
     Args:
         x: (n,) value of the key in each survey.
         outcomes: (n,) outcome of each survey: 0, 1 or 2.
     """
     order, bins = np.argsort(x, kind="stable"), value_bins(x)
-    is_outcome = np.asarray(outcomes)[order, None] == np.arange(3)
-    starts: list[float] = []
-    for k in range(int(bins.max()) + 1):
-        inside = bins[order] == k
-        starts += [float(x[order][inside][0]), *_changes(x[order][inside], is_outcome[inside])]
-    return np.searchsorted(starts, x, side="right") - 1
+    changes = _changes(x[order], np.asarray(outcomes)[order, None] == np.arange(3))
+    starts = [float(x[bins == k].min()) for k in range(int(bins.max()) + 1)]
+    return np.searchsorted(np.unique([*starts, *changes]), x, side="right") - 1
 
 
 def _changes(x: Array, is_outcome: NDArray[np.bool_]) -> list[float]:
