@@ -130,12 +130,12 @@ def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
 def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     """Returns the answers for a continuous key, as ranges in ascending order.
 
-    The surveys are sorted by the key and divided into bins, see `pass_bins`. A decided range is a run of consecutive bins that is
-    decided as a whole, begins and ends with bins whose observed fraction agrees with the verdict, and contains no run
-    with the opposite verdict. The pass probability need not be monotonic in the key. Runs with the most surveys are
-    chosen first; the bins between them form undecided ranges. The confidence levels allow for this search, see
-    `PassRecord.for_ranges`. A range extends from the smallest to the largest value of the key in its surveys; no claim
-    is made beyond them.
+    The surveys are sorted by the key and divided into bins, see `pass_bins`. A decided range is a run of consecutive
+    bins that is decided as a whole, begins and ends with bins whose observed fraction agrees with the verdict, and
+    contains no run with the opposite verdict. The pass probability need not be monotonic in the key. Runs with the most
+    surveys are chosen first; the bins between them form undecided ranges. The confidence levels allow for this search,
+    see `PassRecord.for_ranges`. A range extends from the smallest to the largest value of the key in its surveys; no
+    claim is made beyond them.
 
     Args:
         x: (n,) value of the key in each survey.
@@ -191,8 +191,8 @@ def _changes(x: Array, is_outcome: NDArray[np.bool_]) -> list[float]:
     The surveys are divided where this reduces the binomial deviance most, if by `_DIVIDING_DEVIANCE` or more, and both
     parts likewise, as in a classification tree (Breiman et al. 1984).
     """
-    before = np.cumsum(is_outcome, axis=0)[:-1]
-    total = is_outcome.sum(axis=0)
+    counts = np.cumsum(is_outcome, axis=0)
+    before, total = counts[:-1], counts[-1]
     gain = _deviance(total) - _deviance(before) - _deviance(total - before)
     gain[np.diff(x) == 0] = 0.0  # equal values stay together
     if gain.max(initial=0.0) < _DIVIDING_DEVIANCE:
