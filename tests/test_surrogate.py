@@ -51,9 +51,9 @@ from twin.surrogate.map_model import (
 from twin.surrogate.matchability import (
     NO_DEPENDENCE,
     Matchability,
-    bounds_px,
     lamp_share,
     position_dependence,
+    precision,
     unevenness_px,
 )
 from twin.surrogate.snow_noise import snow_effect
@@ -111,7 +111,7 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
 def test_the_matching_bound_grows_with_turbidity_depth_and_noise():
     def bound(depth_m, *sets):
         m = mission(*sets)
-        return bounds_px(m.scenario, m.illumination, m.terrain, np.array([depth_m]))[0]
+        return precision(m.scenario, m.illumination, m.terrain, np.array([depth_m]))[0][0]
 
     base = bound(2.0)
     assert bound(2.0, 'water.jerlov="3C"') > 2 * base
@@ -125,7 +125,7 @@ def test_the_matching_bound_grows_without_limit_as_the_floor_disappears():
 
     def bound(turbidity):
         m = mission('water.jerlov="III"', f"water.turbidity={turbidity}")
-        return bounds_px(m.scenario, m.illumination, m.terrain, np.array([2.0]))[0]
+        return precision(m.scenario, m.illumination, m.terrain, np.array([2.0]))[0][0]
 
     assert bound(15.0) > 100 > 1 > bound(2.0) > 2 * bound(1.2)
 
@@ -140,7 +140,9 @@ def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels
         found.append((matchability.binning, matchability.medium_bound_px))
         depths = matchability.depths_m
         unbinned.append(
-            np.interp(np.sqrt(depths[0] * depths[-1]), depths, bounds_px(m.scenario, m.illumination, m.terrain, depths))
+            np.interp(
+                np.sqrt(depths[0] * depths[-1]), depths, precision(m.scenario, m.illumination, m.terrain, depths)[0]
+            )
         )
     assert [binning for binning, _ in found] == [1, 2, 4]
     assert found[0][1] == pytest.approx(unbinned[0])

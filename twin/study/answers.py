@@ -191,7 +191,7 @@ def _changes(x: Array, is_outcome: NDArray[np.bool_]) -> list[float]:
     The surveys are divided where this reduces the binomial deviance most, if by `_DIVIDING_DEVIANCE` or more, and both
     parts likewise, as in a classification tree (Breiman et al. 1984).
     """
-    counts = np.cumsum(is_outcome, axis=0)
+    counts = np.cumsum(is_outcome, axis=0, dtype=np.int64)
     before, total = counts[:-1], counts[-1]
     gain = _deviance(total) - _deviance(before) - _deviance(total - before)
     gain[np.diff(x) == 0] = 0.0  # equal values stay together

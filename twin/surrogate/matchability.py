@@ -164,11 +164,6 @@ class Matchability:
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
-def bounds_px(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array) -> Array:
-    """Returns the Cramér-Rao bound (n,) [px] at depths (n,) [m], without binning; see `precision`."""
-    return precision(scenario, illumination, terrain, depths_m)[0]
-
-
 def precision(
     scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array, binning: int = 1
 ) -> tuple[Array, Array]:
