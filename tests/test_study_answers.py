@@ -3,11 +3,17 @@
 import numpy as np
 import pytest
 
-from twin.study.answers import PassRecord, answers_of_ranges, answers_of_values, value_bins
+from twin.study.answers import PassRecord, answers_of_ranges, answers_of_values, pass_bins, value_bins
+from twin.study.statistics import wilson_interval
 
 
 def answers(x, passed, required=0.9):
     return answers_of_ranges(np.asarray(x, float), PassRecord(np.asarray(passed, bool), np.arange(len(x)), required))
+
+
+def with_unknown(passed, unknown, x=None, required=0.9):
+    x = np.arange(float(len(passed))) if x is None else x
+    return answers_of_ranges(x, PassRecord(passed, np.arange(len(x)), required, unknown=unknown))
 
 
 def of_verdict(found, verdict):
@@ -41,6 +47,48 @@ def test_at_a_constant_pass_probability_a_wrong_range_is_rare(fraction, verdict)
         x = rng.random(100)
         wrong += bool(of_verdict(answers(x, rng.random(100) < fraction), verdict))
     assert wrong <= 4  # 2.5 % per study: four or fewer of 40 in 99.7 % of cases
+
+
+@pytest.mark.parametrize("isolated", [[], [0.9]])
+def test_passes_next_to_a_range_that_fails_are_not_said_to_fail(isolated):
+    """The bin that takes the remaining surveys would mix 11 that pass with 12 that fail."""
+    x = np.concatenate([np.linspace(0.1, 0.8, 12), np.linspace(0.84, 1.89, 11), np.linspace(1.95, 7.5, 12)])
+    passed = (x < 1.9) & ~np.isin(x, isolated)
+    found = answers(x, passed)
+    assert [answer.verdict for answer in found] == ["undecided", "fails"]
+    assert (found[0].surveys, found[1].surveys, found[1].low) == (23, 12, 1.95)
+    assert [answer.verdict for answer in answers(x, x < 1.9, required=0.8)] == ["passes", "fails"]
+
+
+def test_failures_next_to_a_range_that_passes_are_not_said_to_pass():
+    x = np.arange(46.0)
+    (passes,) = of_verdict(answers(x, x < 29, required=0.5), "passes")  # the second bin of 12 has 5 failures
+    assert passes.high == 28
+
+
+def test_surveys_of_equal_probability_are_not_divided():
+    rng, n_bins = np.random.default_rng(1), []
+    for fraction in (0.3, 0.7, 0.95):
+        for _ in range(20):
+            x = np.sort(rng.random(120))
+            n_bins.append(pass_bins(x, rng.random(120) < fraction).max() + 1)
+    assert np.mean(n_bins) < 10.3  # ten bins of twelve
+
+
+def test_unknown_results_widen_the_interval_to_both_sides():
+    (found,) = with_unknown(np.arange(60) < 40, np.arange(60) >= 50, x=np.ones(60))
+    assert (found.surveys, found.unknown, found.probability.value) == (60, 10, 0.8)
+    assert found.probability.low == wilson_interval(40, 60).low
+    assert found.probability.high == wilson_interval(50, 60).high
+
+
+def test_a_range_of_unknown_results_is_neither_said_to_pass_nor_to_fail():
+    x = np.arange(120)
+    found = with_unknown(x < 60, x >= 60)
+    assert [(a.verdict, a.surveys, a.unknown) for a in found] == [("passes", 60, 0), ("undecided", 60, 60)]
+    assert found[1].more_surveys == np.inf
+    found = with_unknown(np.zeros(120, bool), x >= 60)
+    assert [(a.verdict, a.surveys) for a in found] == [("fails", 60), ("undecided", 60)]
 
 
 def test_one_survey_decides_nothing_and_states_how_many_would():

@@ -1,14 +1,21 @@
 """The report begins with its result, and its statistics include the right surveys."""
 
+import pickle
+from unittest.mock import Mock
+
 import numpy as np
 import pyarrow as pa
 import pytest
 from study_surveys import LOST, STUDY, fail, fly, study_of
 
-from twin.study import wording
+from twin import survey as survey_module
+from twin.errors import ScenarioError, UnmodelledError
+from twin.study import flight, wording
 from twin.study.analysis import StudyAnalysis, mask_numbers
+from twin.study.flight import row_of
 from twin.study.report import write_report
 from twin.study.results_log import ResultsLog
+from twin.study.statistics import wilson_interval
 from twin.study.summary import summary as summary_of
 from twin.study.surveys import survey_keys, surveys
 
@@ -56,6 +63,39 @@ def test_failed_surveys_are_not_counted(tmp_path):
     assert half.pass_probability.value == half.passed[half.evaluated].mean()
     failed = "6 more surveys failed because of the computer or the program and are not counted"
     assert failed in wording.headline(study, half)
+
+
+def refused_by_the_surrogate(survey):
+    """Flies a survey; at a turbidity above 8, the surrogate refuses it."""
+    if survey.values["water.turbidity"] <= 8:
+        return fly(survey)
+    return row_of(survey, "refused", "study.toml:5: imaging.fidelity: too turbid") | {"unmodelled": True}
+
+
+def test_surveys_that_only_the_surrogate_refuses_are_unknown_in_the_pass_probability(study, tmp_path):
+    found = analyse(study, tmp_path, refused_by_the_surrogate)
+    n_unknown = int((found.numbers("vary.water.turbidity") > 8).sum())
+    n_known = 64 - n_unknown
+    assert found.unmodelled.sum() == n_unknown > 20
+    assert found.pass_probability == wilson_interval(n_known, n_known, unknown=n_unknown)
+    assert found.requirement_missed
+    text = wording.headline(study, found)
+    assert f"samples ({n_unknown} surveys) are unknown, because the surrogate cannot simulate them" in text
+    assert "The required 80 % is not decided" in text and "cannot be flown" not in text
+    assert summary_of(found, {})["unmodelled"] == n_unknown
+    (last,) = [answer for answer in found.answers["water.turbidity"] if answer.unknown]
+    assert (last.verdict, last.unknown, last.surveys) == ("undecided", n_unknown, n_unknown)
+    assert f"{n_unknown} of them unknown" in wording.answer_lines(found)[0]
+    write_report(study, found, tmp_path / "study.html")
+    assert f"{n_unknown} unknown" in (tmp_path / "study.html").read_text()
+
+
+def test_the_row_of_a_survey_states_that_only_the_surrogate_refuses_it(study, tmp_path, monkeypatch):
+    for error, unmodelled in ((UnmodelledError(["too rough"]), True), (ScenarioError(["too small"]), None)):
+        monkeypatch.setattr(survey_module, "run", Mock(side_effect=error))
+        row = flight.fly(next(surveys(study, tmp_path)))
+        assert (row["status"], row.get("unmodelled")) == ("refused", unmodelled)
+        assert type(pickle.loads(pickle.dumps(error))) is type(error)
 
 
 def test_a_single_failed_survey_is_singular(tmp_path):

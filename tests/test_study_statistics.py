@@ -27,6 +27,21 @@ def test_identical_surveys_of_a_cluster_count_as_one():
     np.testing.assert_allclose(estimate, statistics.wilson_interval(5, 8), rtol=0.1)
 
 
+def test_the_effective_number_is_that_of_the_unbiased_variance_of_the_means_of_clusters():
+    fractions = np.array([0.8, 0.6, 0.4, 0.2])
+    passed = np.concatenate([np.arange(25) < 25 * fraction for fraction in fractions])
+    expected = 0.5 * 0.5 / (fractions.var(ddof=1) / 4)
+    assert statistics.effective_number(passed, np.repeat(np.arange(4), 25)) == pytest.approx(expected)
+
+
+def test_trials_of_unknown_outcome_count_as_failures_at_the_lower_and_as_successes_at_the_upper_bound():
+    found = statistics.clustered_proportion([1, 1, 1, 0, 0, 0], np.arange(6), unknown=[0, 0, 0, 0, 1, 1])
+    assert found.value == 0.75
+    assert found[1:] == (statistics.wilson_interval(3, 6).low, statistics.wilson_interval(5, 6).high)
+    assert statistics.wilson_interval(3, 4, unknown=2) == found
+    assert statistics.wilson_interval(0, 0, unknown=3)[1:] == (0.0, 1.0)
+
+
 def test_uncorrelated_surveys_of_a_cluster_count_individually():
     rng = np.random.default_rng(3)
     passed, clusters = rng.random(2000) < 0.7, np.repeat(np.arange(200), 10)

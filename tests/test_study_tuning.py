@@ -160,6 +160,15 @@ def test_a_plan_is_confirmed_with_a_multiple_of_the_surveys_of_the_search(method
     assert len(surveys) == factor * n_search
 
 
+def test_a_survey_that_only_the_surrogate_refuses_may_pass_at_the_upper_bound(evaluate):
+    refused = {"status": "refused", "map.le90_m": None, "require.map.le90_m.passed": None}
+    known, _ = evaluate({}, {}, refused, {}, {})
+    assert known.pass_probability == wilson_interval(4, 5)
+    unknown, _ = evaluate({}, {}, refused | {"unmodelled": True}, {}, {})
+    assert unknown.pass_probability == (0.8, wilson_interval(4, 5).low, 1.0)
+    assert unknown.shortfall == known.shortfall
+
+
 def test_failed_surveys_are_not_counted_and_flown_again(evaluate):
     failed = {"status": "failed", "map.le90_m": 1.0, "require.map.le90_m.passed": False}
     candidate, again = evaluate({}, failed, {}, {}, {})

@@ -7,10 +7,12 @@ import time
 from collections import defaultdict
 from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import scenes
 from terrains import Terrain
 from twin import survey
 from twin.core import geometry
@@ -49,11 +51,12 @@ from twin.surrogate.map_model import (
 from twin.surrogate.matchability import (
     NO_DEPENDENCE,
     Matchability,
-    bounds_px,
     lamp_share,
     position_dependence,
+    precision,
     unevenness_px,
 )
+from twin.surrogate.snow_noise import snow_effect
 from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
 from twin.surrogate.vision import corner_count, match_sigma_px, overlap_inflation
 from twin.surrogate.window_texture import EVEN_TEXTURE, window_texture
@@ -63,6 +66,7 @@ from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model
 from twin.world.mission import prepare
 from twin.world.pilot import make_pilot
 
+SCENES = sorted(file.stem for file in Path(scenes.__file__).parent.glob("*.toml"))
 SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=2", "plan.area_m=[2.4,1.2]", "control.hold_s=1.0"]
 
 
@@ -107,7 +111,7 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
 def test_the_matching_bound_grows_with_turbidity_depth_and_noise():
     def bound(depth_m, *sets):
         m = mission(*sets)
-        return bounds_px(m.scenario, m.illumination, m.terrain, np.array([depth_m]))[0]
+        return precision(m.scenario, m.illumination, m.terrain, np.array([depth_m]))[0][0]
 
     base = bound(2.0)
     assert bound(2.0, 'water.jerlov="3C"') > 2 * base
@@ -121,7 +125,7 @@ def test_the_matching_bound_grows_without_limit_as_the_floor_disappears():
 
     def bound(turbidity):
         m = mission('water.jerlov="III"', f"water.turbidity={turbidity}")
-        return bounds_px(m.scenario, m.illumination, m.terrain, np.array([2.0]))[0]
+        return precision(m.scenario, m.illumination, m.terrain, np.array([2.0]))[0][0]
 
     assert bound(15.0) > 100 > 1 > bound(2.0) > 2 * bound(1.2)
 
@@ -136,7 +140,9 @@ def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels
         found.append((matchability.binning, matchability.medium_bound_px))
         depths = matchability.depths_m
         unbinned.append(
-            np.interp(np.sqrt(depths[0] * depths[-1]), depths, bounds_px(m.scenario, m.illumination, m.terrain, depths))
+            np.interp(
+                np.sqrt(depths[0] * depths[-1]), depths, precision(m.scenario, m.illumination, m.terrain, depths)[0]
+            )
         )
     assert [binning for binning, _ in found] == [1, 2, 4]
     assert found[0][1] == pytest.approx(unbinned[0])
@@ -902,6 +908,48 @@ def test_the_bound_of_a_window_is_inversely_proportional_to_its_gradient():
     assert window_texture(5 * contrast * np.tile([0.0, 1.0], (60, 1000))) == pytest.approx(texture)
 
 
+def test_windows_without_texture_have_the_largest_bound_that_is_counted():
+    """The running sums of the blur leave values just below zero after the end of a texture."""
+    signal = np.zeros((60, 400))
+    signal[:24] = np.random.default_rng(0).normal(0, 5, (24, 400))
+    texture = window_texture(signal)
+    assert texture.median_ratio == pytest.approx(20)  # 1 / 0.05, in 32 of 56 rows of windows
+    assert texture.scatter == pytest.approx(np.log(20 * np.sqrt(60 / 24)) * np.sqrt(24 * 32) / 56, rel=0.1)
+
+
+def test_at_an_infinite_bound_noise_causes_all_errors_and_no_cell_has_a_height(vision, no_errors):
+    law, bounds = DepthLaw(0.05, 2.0, 1.0, 0.01, 4.0, 1.5), np.array([0.1, 1e9, np.inf])
+    assert law.noise_share(bounds)[2] == 1 == law.noise_share(bounds)[1]
+    assert ScatterLaw(2.0, 0.03)(bounds, 0.5)[2] == 1.0
+    errors = no_errors._replace(depth_error_px=np.array([0.0, np.inf]))
+    assert np.isnan(patch_of(vision.scene.map_model, errors, tilted(0.1, 0.2, 2.0)).height_m).all()
+
+
+def test_a_height_that_is_not_a_number_is_an_error_and_not_a_hole(vision, no_errors):
+    for unknown in ({"cell_scatter": np.full(2, np.nan)}, {"completeness": np.full(2, np.nan)}):
+        with pytest.raises(FloatingPointError, match="height"):
+            patch_of(vision.scene.map_model, no_errors._replace(**unknown), tilted(0.1, 0.2, 2.0))
+    broken = vision.model._replace(depth_error=DepthLaw(0.0, 0.0, np.inf, 0.01, 3.0, 1.0))
+    with pytest.raises(FloatingPointError):
+        vision._cell_errors(broken, (4, 4))
+
+
+def test_below_the_floor_nothing_is_matched(reef):
+    vision = surrogate_vision(reef, ErrorModel(), lambda: tilted(0, 0, -1.0), Stopwatch())
+    with np.errstate(divide="raise"):
+        assert vision.observe_stereo(None, 0) is None
+
+
+def test_without_image_noise_snow_between_the_patches_leaves_exact_matches():
+    clean = [np.random.default_rng(0).normal(100, 10, (80, 80)).astype(np.float32)] * 3
+    snowy = [image.copy() for image in clean]
+    for k, image in enumerate(snowy):
+        image[30 + k : 33 + k, 40] += 5
+    effect = snow_effect(clean, snowy, 0.0, 9)
+    assert effect.matched_share == 1.0
+    assert 0 <= effect.variance_px2 < 1e-9
+
+
 def test_dense_matching_has_the_bound_of_the_median_window_and_the_scatter_of_the_windows(vision):
     matching, law = vision.scene.matchability, ScatterLaw(2.0, 0.03)
     model = vision.model._replace(depth_error=DepthLaw(0.0, 1.0, 0.0, 0.01, 3.0, 1.0), depth_texture_scatter=law)
@@ -1006,6 +1054,17 @@ def test_the_statistics_of_surveys_come_in_their_order(jobs, monkeypatch):
     monkeypatch.setattr(rendered_surveys, "survey_statistics", statistics)
     found = list(all_statistics([(k, f"run{k}") for k in range(6)], "model", jobs))
     assert found == [{"value": [k], "folder": [f"run{k}"], "compared": ["model"]} for k in range(6)]
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_surrogate_maps_every_shipped_scene(scene, tmp_path, outside_data, monkeypatch):
+    if scene.startswith("horseshoe"):
+        monkeypatch.setenv("TWIN_DATA", str(outside_data("horseshoe_reef_dem.tif").parent))
+    short = ["seed=41", "plan.tracks=1", "plan.area_m=[1.5,1.5]"]
+    sets = [*short, 'imaging.fidelity="surrogate"', "imaging.extrapolate=true"]
+    metrics = survey.run(load_scenario(scene, sets), tmp_path / "run", outputs=None).metrics
+    assert metrics["status"] == "complete"
+    assert metrics["map"]["completeness"] > 0.95
 
 
 def test_a_survey_in_water_without_matches_is_not_flown(tmp_path):

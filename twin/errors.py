@@ -32,6 +32,10 @@ class ScenarioError(TwinError):
         return type(self), (self.lines,)
 
 
+class UnmodelledError(ScenarioError):
+    """The surrogate cannot simulate a valid scenario; with rendered images it can be flown."""
+
+
 class SurveyAborted(Exception):  # noqa: N818 (an outcome of a survey, not an input error)
     """The survey cannot continue (physics diverged, vision lost, alignment failed); partial results are kept."""
 

@@ -83,8 +83,9 @@ class RefusedSample(NamedTuple):
 class StudyAnalysis:
     """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
 
-    Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Surveys
-    of the same scenario with the same seed are identical and count once, except in `sobol`.
+    Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Those
+    that only the surrogate refuses (`unmodelled`) also count in pass probabilities, as unknown results. Surveys of the
+    same scenario with the same seed are identical and count once, except in `sobol`.
 
     Args:
         rows: results table.
@@ -97,8 +98,11 @@ class StudyAnalysis:
         self.not_flown = max(0, (planned or 0) - rows.num_rows)
         self.status, self.reason, self.warning = (self._texts(name) for name in ("status", "reason", "warning"))
         self.refused, self.failed = self.status == "refused", self.status == "failed"
-        self.duplicate = self._duplicates()
+        unmodelled = self.refused & (self.numbers("unmodelled") == 1)
+        self.duplicate = self._duplicates(~self.failed & (unmodelled | ~self.refused))
+        self.unmodelled = unmodelled & ~self.duplicate
         self.evaluated = ~(self.refused | self.failed | self.duplicate)
+        self.counted = self.evaluated | self.unmodelled  # in pass probabilities
         self.complete = self.evaluated & (self.status == "complete")
         self.keys = [key for key in study.varied_keys if f"vary.{key}" in rows.column_names]
         self.limits = self._limits()
@@ -111,12 +115,12 @@ class StudyAnalysis:
         column = self.rows[name].to_pylist() if name in self.rows.column_names else [None] * self.rows.num_rows
         return np.array(["" if value is None else str(value) for value in column], dtype=object)
 
-    def _duplicates(self) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the surveys with the scenario and seed of an earlier survey that has a result."""
+    def _duplicates(self, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the surveys in `counted` (n,) with the scenario and seed of an earlier one in it."""
         hashes, seeds = self._texts("scenario_hash"), self.numbers("seed")
         seen: set[tuple[str, float]] = set()
         duplicate = np.zeros(self.rows.num_rows, np.bool_)
-        for k in np.flatnonzero(~(self.refused | self.failed)):
+        for k in np.flatnonzero(counted):
             identity = hashes[k], float(seeds[k])
             duplicate[k] = bool(hashes[k]) and identity in seen
             seen.add(identity)
@@ -171,17 +175,30 @@ class StudyAnalysis:
 
     @cached_property
     def pass_probability(self) -> Interval:
-        """Returns the fraction of the evaluated surveys that passed, with its confidence interval."""
-        return statistics.clustered_proportion(self.passed[self.evaluated], self.clusters[self.evaluated])
+        """Returns the fraction of the evaluated surveys that passed, with its confidence interval.
+
+        The interval allows for the unknown results of the `unmodelled` surveys, see `statistics.wilson_interval`.
+        """
+        return self.proportion(self.counted)
+
+    def proportion(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Interval:
+        """Returns the pass probability of the chosen surveys (a mask or row numbers), which are all in `counted`."""
+        return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unmodelled[chosen])
+
+    @property
+    def possible_fractions(self) -> tuple[float, float]:
+        """Returns the fraction of the surveys that passed if none, and if all, of the unknown results are passes."""
+        n, passed = max(int(self.counted.sum()), 1), int(self.passed.sum())
+        return passed / n, (passed + int(self.unmodelled.sum())) / n
 
     @property
     def requirement_missed(self) -> bool:
-        """Returns whether the pass probability over all samples is below the required value, or is not known.
+        """Returns whether the fraction of surveys that passed is below the required value, or is not known.
 
-        False if no pass probability is required.
+        Unknown results count as not passed. False if no pass probability is required.
         """
         required = self.required_probability
-        return required is not None and not self.pass_probability.value >= required
+        return required is not None and not (self.evaluated.any() and self.possible_fractions[0] >= required)
 
     def key_numbers(self, key: str) -> Array | None:
         """Returns the value of a key in each survey (n,), or None if the values are not numbers."""
@@ -271,15 +288,16 @@ class StudyAnalysis:
 
         A key with a continuous distribution has one answer per range. A key with listed values has one answer per
         value, or per range if it has more than 12 different numbers. The other keys vary as the study specifies. The
-        result is empty without a required pass probability, or if no survey was evaluated.
+        result is empty without a required pass probability, or if no survey was evaluated. The `unmodelled` surveys
+        count as unknown.
         """
         if self.required_probability is None or not self.evaluated.any():
             return {}
         return {key: self._answers(key, self.required_probability) for key in self.keys}
 
     def _answers(self, key: str, required: float) -> list[Answer]:
-        chosen = self.evaluated
-        record = PassRecord(self.passed[chosen], self.clusters[chosen], required)
+        chosen = self.counted
+        record = PassRecord(self.passed[chosen], self.clusters[chosen], required, unknown=self.unmodelled[chosen])
         x, distribution = self.key_numbers(key), self.study.vary.get(key)
         if x is None:
             return answers_of_values(self._texts(f"vary.{key}")[chosen].astype(str), record)

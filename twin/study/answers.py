@@ -8,13 +8,14 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
+from scipy.special import ndtri, xlogy
 
-from twin.study.statistics import LEVEL, Array, Interval, effective_number, surveys_to_decide, wilson_interval
+from twin.study.statistics import LEVEL, Array, Interval, clustered_proportion, effective_number, surveys_to_decide
 
 Verdict = Literal["passes", "fails", "undecided"]
 _BIN_SURVEYS = 12  # smallest number of surveys in a bin of a continuous key
 _MAX_BINS = 20
+_DIVIDING_DEVIANCE = 15.0  # exceeded in less than 1 % of samples with one pass probability
 
 
 class Answer(NamedTuple):
@@ -28,8 +29,10 @@ class Answer(NamedTuple):
         high: largest value in the range; NaN for text.
         surveys: number of surveys in the range.
         probability: pass probability in the range, with its 95 % confidence interval.
-        more_surveys: number of further surveys that would decide the verdict if the observed fraction stays the same; 0
-            if it is decided, infinite if the observed fraction equals the required one or the required one is 1.
+        more_surveys: number of further surveys that would decide the verdict if the observed fractions stay the same; 0
+            if it is decided, infinite if the observed fraction equals the required one or the required one is 1, or if
+            the verdict depends on the unknown results.
+        unknown: number of these surveys whose result is unknown; see `PassRecord`.
     """
 
     verdict: Verdict
@@ -39,6 +42,7 @@ class Answer(NamedTuple):
     surveys: int
     probability: Interval
     more_surveys: float
+    unknown: int = 0
 
 
 class PassRecord(NamedTuple):
@@ -50,6 +54,8 @@ class PassRecord(NamedTuple):
         required: required pass probability.
         pass_level: confidence level of the lower bound for the verdict "passes".
         fail_level: confidence level of the upper bound for the verdict "fails".
+        unknown: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at
+            the lower bound of the pass probability, and as one that passed at the upper bound. None: all are known.
     """
 
     passed: NDArray[np.bool_]
@@ -57,22 +63,40 @@ class PassRecord(NamedTuple):
     required: float
     pass_level: float = LEVEL
     fail_level: float = LEVEL
+    unknown: NDArray[np.bool_] | None = None
+
+    @property
+    def outcomes(self) -> NDArray[np.int64]:
+        """Returns the outcome of each survey (n,): 0 did not pass, 1 passed, 2 unknown."""
+        return np.where(self._unknown, 2, self.passed)
+
+    @property
+    def _unknown(self) -> NDArray[np.bool_]:
+        return np.zeros(len(self.passed), np.bool_) if self.unknown is None else self.unknown
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
         """Returns the answer for the surveys that the mask `chosen` (n,) selects, of which there is at least one.
 
         `label`, `low` and `high` are the fields of the answer.
         """
-        passed, clusters = self.passed[chosen], self.clusters[chosen]
-        n, k = effective_number(passed, clusters), float(passed.mean())
+        clusters, unknown = self.clusters[chosen], self._unknown[chosen]
+        passed = self.passed[chosen] & ~unknown
         verdict: Verdict = "undecided"
-        if wilson_interval(k * n, n, self.pass_level).low >= self.required:
+        if clustered_proportion(passed, clusters, unknown, self.pass_level).low >= self.required:
             verdict = "passes"
-        elif wilson_interval(k * n, n, self.fail_level).high < self.required:
+        elif clustered_proportion(passed, clusters, unknown, self.fail_level).high < self.required:
             verdict = "fails"
-        level = self.pass_level if k >= self.required else self.fail_level
-        more = 0.0 if verdict != "undecided" else surveys_to_decide(passed, clusters, self.required, level)
-        return Answer(verdict, label, low, high, len(passed), wilson_interval(k * n, n), more)
+        more = 0.0 if verdict != "undecided" else self._more_surveys(passed, clusters, unknown)
+        probability = clustered_proportion(passed, clusters, unknown)
+        return Answer(verdict, label, low, high, len(passed), probability, more, int(unknown.sum()))
+
+    def _more_surveys(self, passed: NDArray[np.bool_], clusters: Array, unknown: NDArray[np.bool_]) -> float:
+        """Returns `Answer.more_surveys` of surveys (n,) that do not decide the verdict."""
+        if passed.mean() >= self.required:  # even if no unknown result is a pass
+            return surveys_to_decide(passed, clusters, self.required, self.pass_level)
+        if (passed | unknown).mean() < self.required:
+            return surveys_to_decide(passed | unknown, clusters, self.required, self.fail_level)
+        return math.inf
 
     def for_ranges(self, n_bins: int) -> PassRecord:
         """Returns the record with the confidence levels for ranges that are searched among `n_bins` bins.
@@ -106,12 +130,12 @@ def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
 def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     """Returns the answers for a continuous key, as ranges in ascending order.
 
-    The surveys are sorted by the key and divided into bins. A decided range is a run of consecutive bins that is
-    decided as a whole, begins and ends with bins whose observed fraction agrees with the verdict, and contains no run
-    with the opposite verdict. The pass probability need not be monotonic in the key. Runs with the most surveys are
-    chosen first; the bins between them form undecided ranges. The confidence levels allow for this search, see
-    `PassRecord.for_ranges`. A range extends from the smallest to the largest value of the key in its surveys; no claim
-    is made beyond them.
+    The surveys are sorted by the key and divided into bins, see `pass_bins`. A decided range is a run of consecutive
+    bins that is decided as a whole, begins and ends with bins whose observed fraction agrees with the verdict, and
+    contains no run with the opposite verdict. The pass probability need not be monotonic in the key. Runs with the most
+    surveys are chosen first; the bins between them form undecided ranges. The confidence levels allow for this search,
+    see `PassRecord.for_ranges`. A range extends from the smallest to the largest value of the key in its surveys; no
+    claim is made beyond them.
 
     Args:
         x: (n,) value of the key in each survey.
@@ -119,7 +143,7 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     """
     if len(x) == 0:
         return []
-    bins = value_bins(x)
+    bins = pass_bins(x, record.outcomes)
     n_bins = int(bins.max()) + 1
     searched = record.for_ranges(n_bins)
 
@@ -144,6 +168,43 @@ def value_bins(x: Array) -> NDArray[np.int64]:
             filled = 0
         filled += counts[k]
     return of_value[np.searchsorted(values, x)]
+
+
+def pass_bins(x: Array, outcomes: ArrayLike) -> NDArray[np.int64]:
+    """Returns the bin of each survey (n,), numbered in ascending order of its value: `value_bins`, divided further.
+
+    Bins are also divided where the fractions of the outcomes change, so that no bin mixes two pass probabilities.
+
+    Args:
+        x: (n,) value of the key in each survey.
+        outcomes: (n,) outcome of each survey: 0, 1 or 2.
+    """
+    order, bins = np.argsort(x, kind="stable"), value_bins(x)
+    changes = _changes(x[order], np.asarray(outcomes)[order, None] == np.arange(3))
+    starts = [float(x[bins == k].min()) for k in range(int(bins.max()) + 1)]
+    return np.searchsorted(np.unique([*starts, *changes]), x, side="right") - 1
+
+
+def _changes(x: Array, is_outcome: NDArray[np.bool_]) -> list[float]:
+    """Returns the values in x (n,), ascending, at which the fractions of the outcomes (n, 3) change.
+
+    The surveys are divided where this reduces the binomial deviance most, if by `_DIVIDING_DEVIANCE` or more, and both
+    parts likewise, as in a classification tree (Breiman et al. 1984).
+    """
+    counts = np.cumsum(is_outcome, axis=0, dtype=np.int64)
+    before, total = counts[:-1], counts[-1]
+    gain = _deviance(total) - _deviance(before) - _deviance(total - before)
+    gain[np.diff(x) == 0] = 0.0  # equal values stay together
+    if gain.max(initial=0.0) < _DIVIDING_DEVIANCE:
+        return []
+    first = int(np.argmax(gain)) + 1
+    return [*_changes(x[:first], is_outcome[:first]), float(x[first]), *_changes(x[first:], is_outcome[first:])]
+
+
+def _deviance(counts: NDArray[np.int64]) -> Array:
+    """Returns -2 ln L (...) of the counts (..., 3) of outcomes, with the largest likelihood L of their fractions."""
+    n = counts.sum(axis=-1)
+    return 2 * (xlogy(n, n) - xlogy(counts, counts).sum(axis=-1))
 
 
 def _decided_runs(
@@ -173,8 +234,8 @@ def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], re
     if verdict == "undecided":
         return False
     first, last = run
-    passes = verdict == "passes"
-    if any((runs[end, end].probability.value >= required) != passes for end in run):
+    ends = [runs[end, end].probability.value for end in run]
+    if not all(end >= required if verdict == "passes" else end < required for end in ends):  # none is NaN
         return False
-    opposite = "fails" if passes else "passes"
+    opposite = "fails" if verdict == "passes" else "passes"
     return all(runs[i, j].verdict != opposite for i in range(first, last + 1) for j in range(i, last + 1))

@@ -37,7 +37,7 @@ class SurveyScore(NamedTuple):
     """Part of a survey's result that the search uses.
 
     `metrics` are the objectives and the metrics with a limit, with their completeness metrics, by name. `reason` states
-    why the survey was refused; it is empty for other surveys.
+    why the survey was refused; it is empty for other surveys. `unmodelled` is whether only the surrogate refuses it.
     """
 
     status: str
@@ -46,6 +46,7 @@ class SurveyScore(NamedTuple):
     warning: str = ""
     scenario_hash: str = ""
     reason: str = ""
+    unmodelled: bool = False
 
 
 class Candidate(NamedTuple):
@@ -176,8 +177,8 @@ class CandidateSurveys:
         """Adds the result of a survey, which replaces an earlier result with the same sample and seed."""
         metrics = {name: row.get(name) for name in self.metrics}
         reason = row["reason"] if row["status"] == "refused" else ""
-        warning, identity = row.get("warning") or "", row["scenario_hash"]
-        score = SurveyScore(row["status"], has_passed(row), metrics, warning, identity, reason)
+        warning, identity, unmodelled = row.get("warning") or "", row["scenario_hash"], bool(row.get("unmodelled"))
+        score = SurveyScore(row["status"], has_passed(row), metrics, warning, identity, reason, unmodelled)
         self._scores[row["sample"], row["seed"]] = score
 
     def _is_done(self, survey: Survey) -> bool:
@@ -270,7 +271,8 @@ class CandidateSurveys:
     def evaluate(self, number: int, values: dict[str, Any], correction: PlanCorrection = NO_CORRECTION) -> Candidate:
         """Returns a candidate with its objectives and pass probability.
 
-        A refused survey counts as one that does not pass; a failed survey is not counted.
+        A refused survey counts as one that does not pass; if only the surrogate refuses it, the upper bound of the pass
+        probability counts it as one that passes. A failed survey is not counted.
 
         Args:
             number: trial number of the candidate.
@@ -280,7 +282,9 @@ class CandidateSurveys:
         """
         scores = self.scores(number, values)
         n_passed = sum(self._passes(score, correction) for score in scores)
-        passing = wilson_interval(correction.pass_factor * n_passed, len(scores))
+        passed, n_unknown = correction.pass_factor * n_passed, sum(score.unmodelled for score in scores)
+        best = wilson_interval(min(passed + n_unknown, len(scores)), len(scores))
+        passing = wilson_interval(passed, len(scores))._replace(high=best.high)
         shortfall = required_probability(self.study) - passing.value if scores else 1.0
         objectives = tuple(
             1.0 - passing.value if name == "risk" and scores else self._objective(name, scores, correction)

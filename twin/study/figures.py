@@ -55,13 +55,11 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
     if not analysis.keys or not analysis.evaluated.any():
         return None
     figure, panels = make_panels(len(analysis.keys))
-    passed, clusters = analysis.passed[analysis.evaluated], analysis.clusters[analysis.evaluated]
+    rows = np.flatnonzero(analysis.counted)
     for key, axes in zip(analysis.keys, panels, strict=True):
-        groups, names = analysis.key_groups(key, analysis.evaluated)
-        proportions = [
-            statistics.clustered_proportion(passed[groups == k], clusters[groups == k]) for k in np.unique(groups)
-        ]
-        x = _key_axis(axes, analysis.key_numbers(key), analysis.evaluated, groups, names)
+        groups, names = analysis.key_groups(key, analysis.counted)
+        proportions = [analysis.proportion(rows[groups == k]) for k in np.unique(groups)]
+        x = _key_axis(axes, analysis.key_numbers(key), analysis.counted, groups, names)
         _error_bars(axes, x, proportions, COLOURS["online"])
         axes.axhline(analysis.pass_probability.value, color=COLOURS["reference"], linestyle="--", linewidth=1)
         _shade_answers(axes, analysis, key)

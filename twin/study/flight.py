@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from twin.errors import ScenarioError, TwinError
+from twin.errors import ScenarioError, TwinError, UnmodelledError
 from twin.study.design import Sample
 from twin.study.surveys import Survey
 
@@ -25,8 +25,8 @@ def fly(survey: Survey) -> Row:
     """Flies a survey, writes the files of its run folder that are kept, and returns its row of results.
 
     The row has the status "refused" if a ScenarioError was raised, and "failed" if another TwinError or an OSError was
-    raised. The survey writes to a hidden folder that is renamed at the end, so a folder with the final name is
-    complete.
+    raised; if only the surrogate refuses the scenario, `unmodelled` is true. The survey writes to a hidden folder that
+    is renamed at the end, so a folder with the final name is complete.
     """
     import cv2
 
@@ -41,7 +41,8 @@ def fly(survey: Survey) -> Row:
         metrics = single_survey.run(survey.scenario, scratch, outputs=OUTPUTS[survey.keep]).metrics
         _move_kept_files(scratch, survey)
     except ScenarioError as error:
-        return row_of(survey, "refused", "; ".join(error.lines))
+        unmodelled = {"unmodelled": True} if isinstance(error, UnmodelledError) else {}
+        return row_of(survey, "refused", "; ".join(error.lines)) | unmodelled
     except (TwinError, OSError) as error:
         return row_of(survey, "failed", str(error))
     finally:

@@ -25,7 +25,7 @@ class StudyProgress:
     """
 
     def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
-        self.total = self.done = self.passed = self.failed = self.refused = 0
+        self.total = self.done = self.passed = self.failed = self.refused = self.unmodelled = 0
         self.bar, self.print_surveys = bar, print_surveys
         self._task: Any = bar.add_task("", total=None, note="starting workers") if bar else None
 
@@ -47,6 +47,7 @@ class StudyProgress:
         self.passed += has_passed(row)
         self.failed += row["status"] == "failed"
         self.refused += row["status"] == "refused"
+        self.unmodelled += bool(row.get("unmodelled"))
         if self.print_surveys and self.bar:
             self.bar.console.print(survey_line(row), markup=False, highlight=False)
         elif self.print_surveys:
@@ -63,7 +64,7 @@ class StudyProgress:
         failures = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
         if not evaluated:
             return failures
-        estimate = wilson_interval(self.passed, evaluated)
+        estimate = wilson_interval(self.passed, evaluated, unknown=self.unmodelled)
         passing = f"{100 * estimate.value:.0f} % pass ({100 * estimate.low:.0f} to {100 * estimate.high:.0f} %)"
         return f"{passing}, {failures}" if failures else passing
 

@@ -120,7 +120,7 @@ def _sorted_columns(names: Iterable[str]) -> list[str]:
 
     The identity has a fixed order; the names of each other section are sorted alphabetically.
     """
-    identity = ("sample", "seed", "status", "reason", "warning", "fidelity", "scenario_hash")
+    identity = ("sample", "seed", "status", "reason", "unmodelled", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 
     def sort_key(name: str) -> tuple[int, int, str]:

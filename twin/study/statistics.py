@@ -26,7 +26,7 @@ class Interval(NamedTuple):
     high: float
 
 
-def wilson_interval(successes: float, n: float, level: float = LEVEL) -> Interval:
+def wilson_interval(successes: float, n: float, level: float = LEVEL, unknown: int = 0) -> Interval:
     """Returns the proportion of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
     The bounds are (p + z^2 / (2 n) +- z sqrt(p (1 - p) / n + z^2 / (4 n^2))) / (1 + z^2 / n), with the proportion p
@@ -36,7 +36,12 @@ def wilson_interval(successes: float, n: float, level: float = LEVEL) -> Interva
         successes: number of successes.
         n: number of trials, or effective number of trials.
         level: confidence level, 0 to 1.
+        unknown: number of further trials whose outcome is unknown: they count as failures at the lower bound and as
+            successes at the upper bound.
     """
+    if unknown:
+        worst, best = (wilson_interval(successes + k, n + unknown, level) for k in (0, unknown))
+        return Interval(successes / n if n > 0 else np.nan, worst.low, best.high)
     if n <= 0:
         return Interval(np.nan, 0.0, 1.0)
     z, p = float(ndtri(0.5 + level / 2)), successes / n
@@ -46,7 +51,9 @@ def wilson_interval(successes: float, n: float, level: float = LEVEL) -> Interva
     return Interval(p, low if p > 0 else 0.0, high if p < 1 else 1.0)  # exact bounds at 0 and 1
 
 
-def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
+def clustered_proportion(
+    passed: ArrayLike, clusters: ArrayLike, unknown: ArrayLike | None = None, level: float = LEVEL
+) -> Interval:
     """Returns the proportion of successes with Wilson's interval, corrected for correlation within clusters.
 
     Wilson's interval is computed for the effective number of surveys: their number divided by the design effect (Kish
@@ -57,12 +64,18 @@ def clustered_proportion(passed: ArrayLike, clusters: ArrayLike) -> Interval:
     Args:
         passed: (n,) whether each survey passed.
         clusters: (n,) cluster label of each survey: the number of its sample, or its seed.
+        unknown: (n,) whether the result of each survey is unknown; see `wilson_interval`.
+        level: confidence level, 0 to 1.
     """
     success = np.asarray(passed, dtype=float)
     if len(success) == 0:
         return wilson_interval(0, 0)
+    if unknown is not None and np.any(unknown):
+        known = ~np.asarray(unknown, dtype=bool)
+        worst, best = (clustered_proportion(np.where(known, success, k), clusters, level=level) for k in (0, 1))
+        return Interval(float(success[known].mean()) if known.any() else np.nan, worst.low, best.high)
     effective = effective_number(success, clusters)
-    return wilson_interval(float(success.mean()) * effective, effective)
+    return wilson_interval(float(success.mean()) * effective, effective, level)
 
 
 def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:

@@ -34,6 +34,7 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
     return dict(identity) | {
         "surveys": len(analysis.status),
         **{name: int((analysis.status == name).sum()) for name in _STATUSES},
+        "unmodelled": int(analysis.unmodelled.sum()),
         "duplicates": int(analysis.duplicate.sum()),
         "not_flown": analysis.not_flown,
         "passed": int(analysis.passed.sum()),

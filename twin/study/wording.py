@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.judge.require import more_is_better
 from twin.report.wording import DASH, length, percent, plain
-from twin.study.analysis import KeyComparison, StudyAnalysis
+from twin.study.analysis import KeyComparison, StudyAnalysis, count_similar
 from twin.study.answers import Answer
 from twin.study.statistics import LEVEL, Interval
 from twin.study.study_file import Study
@@ -132,7 +133,9 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     if undecided:
         n = sum(answer.surveys for answer in undecided)
         verb = "is" if len(undecided) == 1 else "are"
-        parts.append(f"{_labels(undecided)} {verb} not decided with {_count(n)} ({_more(undecided)})")
+        unknown = sum(answer.unknown for answer in undecided)
+        of_them = f", {unknown} of them unknown" if unknown else ""
+        parts.append(f"{_labels(undecided)} {verb} not decided with {_count(n)}{of_them} ({_more(undecided)})")
     text = "; ".join(parts) + "."
     return constant + text[:1].upper() + text[1:]
 
@@ -153,6 +156,8 @@ def _more(undecided: list[Answer]) -> str:
     """
     total = sum(answer.more_surveys for answer in undecided)
     if np.isinf(total):
+        if any(answer.unknown for answer in undecided):
+            return "no number of surveys by the surrogate is expected to decide it: some of the results are unknown"
         return "no finite number of surveys is expected to decide it: the observed fraction equals the required one"
     digit = 10 ** max(0, len(f"{total:.0f}") - 2)
     return f"about {int(np.ceil(total / digit)) * digit} more needed there"
@@ -211,11 +216,19 @@ def _requirement(analysis: StudyAnalysis) -> str:
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None:
         return ""
-    verdict = "not met" if analysis.requirement_missed else "met"
-    conclusive = passing.high < required or passing.low >= required
+    verdict = requirement_verdict(analysis)
+    conclusive = passing.high < required or passing.low >= required or verdict == "not decided"
     doubt = "" if conclusive else ", but the confidence interval includes the required value (more surveys are needed)"
     where = " over all values of the varied keys" if analysis.study.seek is not None else ""
     return f" The required {percent(required)} is {verdict}{where}{doubt}."
+
+
+def requirement_verdict(analysis: StudyAnalysis) -> str:
+    """Returns whether the required fraction of the surveys passed; "not decided" if unknown results matter."""
+    if not analysis.requirement_missed:
+        return "met"
+    is_possible = analysis.evaluated.any() and analysis.possible_fractions[1] >= (analysis.required_probability or 0.0)
+    return "not decided" if is_possible else "not met"
 
 
 def sample_count(n: int) -> str:
@@ -224,13 +237,30 @@ def sample_count(n: int) -> str:
 
 
 def _refused(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on the samples that cannot be flown and are not counted; "" if there are none."""
-    if not (samples := analysis.refused_samples):
-        return ""
-    surveys = _count(int(analysis.refused.sum()))
-    verb = "is" if len(samples) == 1 else "are"
-    n, reason = sample_count(len(samples)), analysis.refusal_reasons[0].reason
-    return f" {n} ({surveys}) cannot be flown and {verb} not counted, e.g.: {reason}."
+    """Returns sentences on the samples that cannot be flown or that only the surrogate refuses; "" without any."""
+    sentences = ""
+    if (refused := analysis.refused & ~analysis.unmodelled).any():
+        n, verb = _refused_count(analysis, refused)
+        sentences += f" {n} cannot be flown and {verb} not counted, e.g.: {_first_reason(analysis, refused)}."
+    if analysis.unmodelled.any():
+        n, verb = _refused_count(analysis, analysis.unmodelled)
+        sentences += (
+            f" {n} {verb} unknown, because the surrogate cannot simulate them: they count as not passed at the lower "
+            'bound and as passed at the upper bound of the confidence intervals; imaging.fidelity = "rendered" flies '
+            f"them; e.g.: {_first_reason(analysis, analysis.unmodelled)}."
+        )
+    return sentences
+
+
+def _refused_count(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, str]:
+    """Returns a phrase with the numbers of the samples and of the chosen surveys (n,) in them, and the verb for it."""
+    n = len(np.unique(analysis.numbers("sample")[chosen]))
+    return f"{sample_count(n)} ({_count(int(chosen.sum()))})", "is" if n == 1 else "are"
+
+
+def _first_reason(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> str:
+    """Returns the most frequent reason of the chosen surveys (n,)."""
+    return next(iter(count_similar(analysis.reason[chosen])))
 
 
 def _duplicates(analysis: StudyAnalysis) -> str:
@@ -250,7 +280,7 @@ def _failed(analysis: StudyAnalysis) -> str:
     n = int(analysis.failed.sum())
     if not n:
         return ""
-    lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.evaluated.sum())))
+    lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.counted.sum())))
     subject, none, again = (
         ("1 more survey", "it had not", "it") if n == 1 else (f"{n} more surveys", "none of them had", "them")
     )

@@ -12,6 +12,8 @@ import numpy as np
 
 from twin.core.geometry import Array
 
+_LARGEST_BOUND_PX = 1e100  # replaces infinite bounds in ratios, which then have their limits instead of inf / inf
+
 
 class SigmaLaw(NamedTuple):
     """Standard deviation as a function of the Cramér-Rao bound c [px]: sqrt(floor_px^2 + (slope c)^2).
@@ -89,7 +91,7 @@ class DepthLaw(NamedTuple):
 
     def noise_share(self, bound_px: Array | float) -> Array:
         """Returns the fraction of the variance that the image noise causes, at a Cramér-Rao bound [px]."""
-        noise_px2 = np.square(self.slope * np.asarray(bound_px))
+        noise_px2 = np.square(self.slope * np.minimum(bound_px, _LARGEST_BOUND_PX))
         return noise_px2 / np.maximum(self.floor_px**2 + noise_px2, 1e-24)
 
     def relative_variance(
@@ -124,7 +126,7 @@ class ScatterLaw(NamedTuple):
 
     def __call__(self, bound_px: Array | float, texture_scatter: Array | float) -> Array:
         """Returns the standard deviation at a Cramér-Rao bound c [px] and a scatter t of the texture."""
-        bound = np.asarray(bound_px)
+        bound = np.minimum(bound_px, _LARGEST_BOUND_PX)
         return self.gain * np.asarray(texture_scatter) * bound / np.maximum(bound + self.half_px, 1e-12)
 
 

@@ -592,7 +592,7 @@ def _sample_patch(
 
     Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
     the lateral error and walls to `systematic`. Updates the arrays of `runs` and `fused`. The mean depth is over the
-    cells that have a height; 0 without any.
+    cells that have a height; 0 without any. A height that is not finite raises a FloatingPointError: it is no hole.
     """
     (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px, information) = floor, observed
     next_row, next_col, next_depth_m = following
@@ -625,7 +625,8 @@ def _sample_patch(
             rough_px = roughness[i, j] / per_px
             complete = _interpolate(errors.completeness, k, fraction) / (1 + (rough_px / errors.edge_half_px) ** 2)
             complete *= 1 - errors.border_share * np.exp(-border / _interpolate(errors.border_width_px, k, fraction))
-            if errors.dropout[i, j] > complete:
+            depth_error_px = _interpolate(errors.depth_error_px, k, fraction)
+            if errors.dropout[i, j] > complete or depth_error_px == np.inf:  # nothing is matched at an infinite bound
                 continue
             error_noise = _interpolate(errors.error_noise_share, k, fraction)
             sigma_noise = _interpolate(errors.sigma_noise_share, k, fraction)
@@ -643,7 +644,7 @@ def _sample_patch(
             steep = np.sqrt(sx * sx + sy * sy)
             log_scale = _interpolate(errors.cell_scatter, k, fraction) * errors.cell_noise[i, j]
             error_px = np.exp(errors.error_scatter_share * log_scale) * np.sqrt(error_share)
-            error_px *= _interpolate(errors.depth_error_px, k, fraction)
+            error_px *= depth_error_px
             border_depth = _interpolate(errors.border_depth, ring, in_ring)
             error_px *= border_depth * _interpolate(errors.bound_error, q, in_ratios)
             value += per_px * error_px * depth_noise[i - row, j - col]
@@ -661,6 +662,8 @@ def _sample_patch(
             )
             systematic[i - row, j - col] += (surface.LATERAL_SIGMA_PX * depth / camera[0] * steep) ** 2
             systematic[i - row, j - col] += (errors.edge_sigma_gain * edge[i, j]) ** 2
+            if not np.isfinite(value + complete + variance[i - row, j - col] + systematic[i - row, j - col]):
+                raise FloatingPointError("the error model gives a height or a variance that is not finite")
             total += depth
             count += 1
     return total / max(count, 1)

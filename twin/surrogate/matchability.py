@@ -97,6 +97,7 @@ class Matchability:
         clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
     """
 
+    @np.errstate(invalid="raise")
     def __init__(
         self,
         scenario: Scenario,
@@ -161,11 +162,6 @@ class Matchability:
     def unevenness_at(self, depth_m: float) -> float:
         """Returns the unevenness [px of the binned images per unit of baseline / depth] at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
-
-
-def bounds_px(scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array) -> Array:
-    """Returns the Cramér-Rao bound (n,) [px] at depths (n,) [m], without binning; see `precision`."""
-    return precision(scenario, illumination, terrain, depths_m)[0]
 
 
 def precision(

@@ -22,6 +22,7 @@ from twin.imaging.snow import BOX_M
 Gray = NDArray[np.float32]
 
 _MIN_CORRELATION = 0.7  # least correlation of a match, as in `estimate.vision.patches`
+_LEAST_VARIANCE_PX2 = 1e-12  # of a match that neither noise nor a particle disturbs
 _VIEWS = 3  # number of views with different particles
 
 
@@ -96,7 +97,7 @@ def _patches(
     spread = [_variance(part, patch_px) for part in snow]
     texture = _variance(clean, patch_px)
     correlation = texture / np.sqrt((texture + spread[0]) * (texture + spread[1]) + 1e-9)
-    variance_px2 = (2 * noise**2 + spread[0] + spread[1]) / information
+    variance_px2 = np.maximum((2 * noise**2 + spread[0] + spread[1]) / information, _LEAST_VARIANCE_PX2)
     inside = np.zeros(clean.shape, np.bool_)
     inside[patch_px : -patch_px or None : 2, patch_px : -patch_px or None : 2] = True
     return variance_px2[inside], error_px[inside], correlation[inside] > _MIN_CORRELATION

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.timing import StageTimer
-from twin.errors import ScenarioError, TwinError
+from twin.errors import TwinError, UnmodelledError
 from twin.estimate.pipeline import Navigator
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s
@@ -49,7 +49,7 @@ class SurrogateWorld(World):
         vision: source of the sampled visual measurements.
 
     Raises:
-        ScenarioError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set; or marine
+        UnmodelledError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set; or marine
             snow prevents all matches at `Matchability.medium_depth_m`.
     """
 
@@ -102,14 +102,14 @@ def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Ma
     """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`.
 
     Raises:
-        ScenarioError: the survey lies outside this range, and `imaging.extrapolate` is not set.
+        UnmodelledError: the survey lies outside this range, and `imaging.extrapolate` is not set.
     """
     found = fitted.quantities_outside_fit(survey_conditions(mission, matchability))
     if not found:
         return ()
     if not mission.scenario.imaging.extrapolate:
         source = mission.scenario.source
-        raise ScenarioError([source.describe(_refusal(quantity)) for quantity in found])
+        raise UnmodelledError([source.describe(_refusal(quantity)) for quantity in found])
     texts = [f"{one.value_text} ({one.allowed_text})" for one in found]
     return (f"The surrogate extrapolates outside the range of its error model: {'; '.join(texts)}.",)
 
@@ -124,7 +124,7 @@ def _refusal(quantity: QuantityOutsideFit) -> TwinError:
 
 
 def _check_matches(mission: Mission, matchability: Matchability) -> None:
-    """Raises ScenarioError if marine snow prevents all matches at `Matchability.medium_depth_m`."""
+    """Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`."""
     if math.isfinite(matchability.medium_bound_px):
         return
     error = TwinError(
@@ -133,7 +133,7 @@ def _check_matches(mission: Mission, matchability: Matchability) -> None:
         f"{matchability.medium_depth_m:.3g} m",
         'less [snow], or imaging.fidelity = "rendered"',
     )
-    raise ScenarioError([mission.scenario.source.describe(error)])
+    raise UnmodelledError([mission.scenario.source.describe(error)])
 
 
 def surrogate_vision(
@@ -148,7 +148,7 @@ def surrogate_vision(
         stopwatch: timer of the stages.
 
     Raises:
-        ScenarioError: marine snow prevents all matches at `Matchability.medium_depth_m`.
+        UnmodelledError: marine snow prevents all matches at `Matchability.medium_depth_m`.
     """
     scenario, terrain = mission.scenario, mission.terrain
     matchability = Matchability(scenario, mission.illumination, terrain, mission.plan.area.at_fractions)

@@ -265,7 +265,7 @@ class SurrogateVision:
             pose, model, scene = self.scene.left_camera(), self.model, self.scene
             scene.map_model.mark_seen(pose)
             depth_m = scene.floor.depth_at(self._true_pixels, pose, self.rig)
-            hits = np.flatnonzero(depth_m < np.inf)
+            hits = np.flatnonzero((depth_m > 0) & (depth_m < np.inf))  # 0: the camera is below the floor
             if len(hits) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, 0, None))
                 return None
@@ -500,6 +500,7 @@ class SurrogateVision:
             progress(k + 1)
         return mapper.result()
 
+    @np.errstate(invalid="raise")
     def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
         """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells.
 

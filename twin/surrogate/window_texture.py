@@ -51,7 +51,8 @@ def window_texture(signal: NDArray[np.floating], relative_gradients: Array = _EV
     squares /= cv2.resize(np.square(relative_gradients), squares.shape[::-1], interpolation=cv2.INTER_LINEAR)
     whole = float(np.sqrt(squares.mean()))
     inner = WINDOW_PX // 2
-    means = cv2.blur(squares, (WINDOW_PX, WINDOW_PX))[inner:-inner, inner:-inner]
+    # the running sums of the blur end just below zero in windows without texture
+    means = np.maximum(cv2.blur(squares, (WINDOW_PX, WINDOW_PX))[inner:-inner, inner:-inner], 0)
     if whole == 0 or not means.size:
         return EVEN_TEXTURE
     relative = np.maximum(np.sqrt(means) / whole, _WEAKEST)
