@@ -420,7 +420,7 @@ def _evaluation(
     guard: StageGuard,
 ) -> ReplayEvaluation:
     """Returns the input of the evaluation, without timing."""
-    findings = check_survey(result, opened.frames.rectification.rig) if len(result.keyframe_rows) else []
+    findings = check_survey(result, opened.frames.rectification.rig, elevation) if len(result.keyframe_rows) else []
     sentences = [*_unused(opened.frames), *(finding.sentence for finding in findings)]
     reasons = [guard.reason] if guard.reason else sentences
     identity = {

@@ -228,14 +228,14 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
     extents = [float(np.linalg.norm(np.ptp(path.positions, axis=0))) for path in (a, b)]  # noise adds to lengths
     if max(extents) > max(_MAX_EXTENT_RATIO * min(extents), 0.05):
         found.append(
-            f"The true path extends over {extents[1]:.3g} m, the estimated one over {extents[0]:.3g} m: the truth seems "
-            "to have another unit or scale."
+            f"The true path extends over {extents[1]:.3g} m, the estimated one over {extents[0]:.3g} m: the truth "
+            "seems to have another unit or scale."
         )
     angle_deg, sigma_deg = axis_turn_deg(a, b)
     if angle_deg > max(_MAX_AXIS_DEG, _SIGNIFICANT * sigma_deg) and sigma_deg < _MAX_AXIS_SIGMA_DEG:
         found.append(
-            f"The axes of the truth are turned by {angle_deg:.0f} degrees (sigma {sigma_deg:.0f}) from those of the left "
-            "camera: the truth seems to be that of another body."
+            f"The axes of the truth are turned by {angle_deg:.0f} degrees (sigma {sigma_deg:.0f}) from those of the "
+            "left camera: the truth seems to be that of another body."
         )
     return found
 
@@ -259,7 +259,7 @@ def axis_turn_deg(estimate: Trajectory, truth: Trajectory) -> tuple[float, float
 
 
 def _axis_turn(estimate: Trajectory, truth: Trajectory) -> Array:
-    """Returns the mean rotation (3, 3) of the true bodies in the axes of the camera after the alignment of positions."""
+    """Returns the mean rotation (3, 3) of the true bodies in the axes of the camera, once the positions are aligned."""
     rotation = rigid_alignment(estimate.positions, truth.positions)[:3, :3]
     turns = np.swapaxes(rotation @ estimate.world_from_camera[:, :3, :3], 1, 2) @ truth.world_from_camera[:, :3, :3]
     return geometry.nearest_rigid(geometry.pose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
