@@ -489,9 +489,8 @@ def test_a_stored_image_of_another_size_is_not_used():
 
 
 def test_a_focal_length_far_below_the_image_size_is_refused(tmp_path):
-    file = recorded.write_opencv(
-        tmp_path / "calibration.yaml", M1=np.diag([5.0, 5.0, 1.0]) + RIG.matrix * [[0, 0, 1]] * 3
-    )
+    matrix = np.array([[5.0, 0, RIG.cx_px], [0, 5.0, RIG.cy_px], [0, 0, 1]])
+    file = recorded.write_opencv(tmp_path / "calibration.yaml", M1=matrix)
     with pytest.raises(TwinError, match=r"the focal length of the left camera is 5, 5 px .allowed: at least 0.05 of"):
         read_calibration(file).for_images(RIG.width_px, RIG.height_px)
 

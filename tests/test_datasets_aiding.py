@@ -12,11 +12,9 @@ from recorded_datasets import RIG
 
 import twin
 from twin.core import geometry
-from twin.core.records import ImuReadings, Readings, Trajectory
-from twin.core.settings import EstimatorSettings
-from twin.datasets.aiding import Aiding, Opening
+from twin.core.records import ImuReadings, Readings
 from twin.datasets.bag_reader import BagReader
-from twin.datasets.readings import RecordedReadings, SensorSeries, read_folder
+from twin.datasets.readings import read_folder
 from twin.datasets.replay import ReplayOptions, open_dataset
 from twin.errors import TwinError
 from twin.exchange import euroc, ros2
@@ -182,15 +180,6 @@ def test_an_imu_without_orientation_makes_the_world_level(tmp_path, writer):
     assert np.deg2rad(0.4) < sigma[0] < np.deg2rad(1.6)
 
 
-def test_the_residual_of_verticals_is_in_standard_deviations():
-    """Tilts of one standard deviation about both horizontal axes: 1."""
-    sigma, tilt = 0.01, geometry.so3_exp(np.array([0.01, 0.01, 0.0]))
-    up = SensorSeries(np.array([5.0, 5.1]), np.tile(tilt[2], (2, 1)), np.array([sigma]))
-    aiding = Aiding(RecordedReadings(np.eye(4), vertical=up), np.eye(4), 5.0, 10.0)
-    level = Trajectory(np.array([0.0, 0.1]), np.tile(np.eye(4), (2, 1, 1)))
-    assert aiding.residuals(level)["vertical"] == pytest.approx(1.0, rel=1e-3)
-
-
 def test_an_attitude_precedes_an_imu_and_heights_need_either(tmp_path):
     imu = inertial(np.zeros(3))
     contents = exported_run.flown(tmp_path / "run", N, noisy_readings(), scenario=SCENARIO, imu=imu)
@@ -221,61 +210,6 @@ def test_a_bad_description_of_an_imu_is_named(tmp_path, old, new, message):
     except TwinError as error:
         found = str(error)
     assert re.search(message, found), found
-
-
-def series(rate_hz, values, sigma):
-    return SensorSeries(np.arange(len(values)) / rate_hz + 5.0, np.array(values, float), np.full(len(values[0]), sigma))
-
-
-def test_velocities_are_interpolated_and_their_noise_is_that_of_a_frame():
-    """At 5 Hz, 3 frames at 15 Hz share a reading: their sum has the variance of 3 independent errors 3^0.5 larger."""
-    velocity = series(5.0, [[0, 0, 0], [0.2, 0, 0], [0.2, 0, 0]], 0.01)
-    aiding = Aiding(RecordedReadings(np.eye(4), velocity=velocity), np.eye(4), 5.0, 15.0)
-    np.testing.assert_allclose(aiding.at(0.1).dvl_mps, [0.1, 0, 0])
-    assert aiding.at(0.5).dvl_mps is None and aiding.at(0.1).pressure_z_m is None
-    assert aiding.noise.dvl_mps == pytest.approx(0.01 * 3**0.5)
-    gapped = series(5.0, [[0.1, 0, 0]] * 5, 0.01)
-    gapped = Aiding(
-        RecordedReadings(np.eye(4), velocity=gapped._replace(times_s=np.array([5, 5.2, 5.4, 5.6, 6.6]))),
-        np.eye(4),
-        5.0,
-        15.0,
-    )
-    assert gapped.at(0.5).dvl_mps is not None and gapped.at(1.0).dvl_mps is None
-
-
-def test_an_attitude_belongs_to_the_frame_within_ten_milliseconds():
-    attitude = series(10.0, [[0, 0, 0.1], [0, 0, 0.2]], 0.01)
-    aiding = Aiding(RecordedReadings(np.eye(4), attitude=attitude), np.eye(4), 5.0, 15.0)
-    assert aiding.at(0.009).ahrs_rpy_rad[2] == 0.1 and aiding.at(0.011).ahrs_rpy_rad is None
-
-
-@pytest.mark.parametrize(
-    ("attitude_s", "height_s", "known", "used"),
-    [
-        (0.0, 0.0, None, ["pressure", "attitude"]),
-        (20.0, 0.0, None, []),
-        (0.0, 20.0, None, ["attitude"]),
-        (20.0, 0.0, np.eye(4), ["pressure", "attitude"]),
-        (0.0, 20.0, np.eye(4), ["attitude"]),
-    ],
-)
-def test_readings_that_no_first_frame_has_are_not_used_later(monkeypatch, attitude_s, height_s, known, used):
-    """Heights of -30 m in a world whose start is at 1.5 m would otherwise be fused as they are."""
-    attitude, height = series(10.0, [[0.0, 0.0, 0.0]] * 300, 0.01), series(10.0, [[-30.0]] * 300, 0.01)
-    attitude = attitude._replace(times_s=attitude.times_s + attitude_s)
-    height = height._replace(times_s=height.times_s + height_s)
-    aiding = Aiding(RecordedReadings(np.eye(4), height=height, attitude=attitude), np.eye(4), 5.0, 10.0)
-    at_start = geometry.pose(np.eye(3), np.array([0.0, 0.0, 1.5]))
-    monkeypatch.setattr(Aiding, "_first_motions", lambda self, _: [(np.eye(4), self.at(k / 10)) for k in range(60)])
-    start = aiding.start(Opening((), RIG, EstimatorSettings(), at_start), known)
-    assert aiding.used == used and len(aiding.notes) == 2 - len(used)
-    assert (start is None) == (not used)
-    later = aiding.at(25.0)
-    assert (later.pressure_z_m is None) == ("pressure" not in used)
-    assert (later.ahrs_rpy_rad is None) == ("attitude" not in used)
-    if "pressure" in used:
-        assert later.pressure_z_m == pytest.approx(1.5 if known is None else 0.0)
 
 
 STATIC = {

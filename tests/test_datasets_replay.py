@@ -477,3 +477,15 @@ def test_the_truth_is_sorted_and_of_equal_times_the_first_pose_counts():
 def test_topics_of_a_data_set_that_is_no_bag_are_refused(euroc):
     with pytest.raises(TwinError, match="--topics: .* is not a ROS 2 bag"):
         open_dataset(euroc, ReplayOptions(topics=("/a", "/b")))
+
+
+def test_a_recording_of_one_place_with_a_noisy_truth_is_complete_without_a_warning_on_the_truth(tmp_path):
+    still = np.repeat(recorded.poses(1), 20, axis=0)
+    folder = recorded.write_folder(tmp_path / "set", recorded.frames(still))
+    rng = np.random.default_rng(1)
+    w, x, y, z = geometry.quaternion_wxyz(still[0, :3, :3])
+    positions = still[:, :3, 3] + 1e-3 * rng.normal(size=(20, 3))
+    rows = [[100 + k / RIG.frame_rate_hz, *position, x, y, z, w] for k, position in enumerate(positions)]
+    np.savetxt(tmp_path / "truth.txt", rows, fmt="%.9f")
+    found = twin.replay(folder, tmp_path / "out", ReplayOptions(outputs=(), truth=tmp_path / "truth.txt")).metrics
+    assert found["status"] == "complete" and not [one for one in found["warnings"] if "truth" in one]

@@ -154,6 +154,25 @@ def test_each_check_finds_its_fault_and_nothing_else(changes, observed, check):
     assert [finding.check for finding in check_survey(bad, RIG)] == [check]
 
 
+YAW = EpipolarError(np.array([0, np.deg2rad(0.04), 0, 0]), np.full(4, 1e-5), np.zeros(4))
+
+
+def test_an_error_of_the_rectification_is_judged_by_its_effect_in_millimetres():
+    """0.04 deg at a depth of 2 m and a baseline of 0.15 m: 0.93 % of the reach of the path, 18.6 mm of the depth."""
+    result = replace(survey_result(), quality=quality(epipolar=YAW), stereo_observations=[OBSERVATION])
+    elevation, keys = survey()[1], result.keyframe_rows
+    assert float(np.nanmedian(elevation.sigma_m)) == pytest.approx(0.008)
+    reach_m = np.linalg.norm(result.final.positions[keys] - result.final.positions[keys[0]], axis=1).max()
+    (far,) = check_survey(result, RIG, elevation)
+    assert far.check == "yaw" and far.value == pytest.approx(0.0093 * reach_m, rel=0.01)
+    assert far.limit == pytest.approx(3 * 3**0.5 * 1e-3) and f"{1000 * far.value:.2g} mm over" in far.sentence
+    result.node_cov[:, 3:, 3:] = np.eye(3) * (far.value / 3) ** 2 / 3 * 1.01
+    assert check_survey(result, RIG, elevation) == []
+    sharp = replace(elevation, sigma_m=elevation.sigma_m * np.float32(0.5))
+    (high,) = check_survey(result, RIG, sharp)
+    assert high.value == pytest.approx(0.0186, rel=0.01) and "19 mm at 2 m, their standard" in high.sentence
+
+
 def test_an_uncertain_position_is_a_finding():
     result = replace(survey_result(), quality=quality(), stereo_observations=[OBSERVATION])
     result.node_cov[-1, 3:, 3:] = np.eye(3) * 0.1**2

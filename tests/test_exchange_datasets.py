@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 import rasterio.warp
 import yaml
+from ifdo import iFDO
 from physics_world import vehicle
 from scipy.spatial.transform import Rotation
 
 from twin.app.camera_models import believed_calibration, true_calibration
 from twin.core import geometry
+from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, ImuReadings, MapGrid, Readings, StereoRig, Trajectory
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.readers import read_dataset
@@ -202,6 +204,54 @@ def test_positions_are_in_the_crs_of_the_export(contents, tmp_path):
     np.testing.assert_allclose([east[0], north[0]], poses()[3, :2, 3] + [432000.01, 5571000], atol=1e-3, rtol=0)
     assert item["image-altitude-meters"] == pytest.approx(2.06 - 35)
     assert item["image-datetime"] == "1970-01-01 00:00:00.600000"
+
+
+FEET = 1200 / 3937  # US survey foot [m], the unit of EPSG:2263
+
+
+@pytest.mark.parametrize(
+    ("crs", "origin", "metres_per_unit", "zone", "epsg", "convergence_deg"),
+    [
+        ("EPSG:32633", (432000.0, 5571000.0), 1.0, "33N", "32633", -0.7343),  # (longitude - 15) sin(latitude)
+        ("EPSG:25833+5783", (432000.0, 5571000.0), 1.0, "33N", "32633", -0.7343),
+        ("EPSG:32756", (334000.0, 6250000.0), 1.0, "56S", "32756", 1.0007),
+        ("EPSG:2263", (984000.0, 210000.0), FEET, "18N", "32618", -0.0006),
+    ],
+)
+def test_the_ifdo_package_opens_a_file_with_zone_position_and_attitude(
+    contents, tmp_path, crs, origin, metres_per_unit, zone, epsg, convergence_deg
+):
+    wkt = rasterio.crs.CRS.from_user_input(crs).to_wkt()
+    place = Georeference(*origin, -35.0, wkt, metres_per_unit)
+    (file, _) = ifdo.export(replace(contents, georeference=place), tmp_path)
+    opened = iFDO.load(file)
+    found, pose = opened.image_set_items["left_000003.png"], contents.trajectories["final"].world_from_camera[3]
+    assert (found.image_camera_pose.pose_utm_zone, found.image_camera_pose.pose_utm_epsg) == (zone, epsg)
+    scene = np.array(origin) + pose[:2, 3] / metres_per_unit
+    expected = np.array(rasterio.warp.transform(wkt, f"EPSG:{epsg}", *([value] for value in scene)))[:2, 0]
+    *horizontal, up = found.image_camera_pose.pose_utm_east_north_up_meters
+    np.testing.assert_allclose(horizontal, expected, atol=1e-3, rtol=0)
+    assert up == pytest.approx(pose[2, 3] - 35)
+    assert 4.0e5 < horizontal[0] < 6.0e5 or zone == "56S"  # metres, not feet
+    ahead = np.array(rasterio.warp.transform(wkt, f"EPSG:{epsg}", [scene[0]], [scene[1] + 10 / metres_per_unit]))[:2, 0]
+    turned = np.array(found.image_camera_pose.pose_absolute_orientation_utm_matrix) @ pose[:3, :3].T
+    np.testing.assert_allclose(turned @ [0, 10, 0], [*(ahead - expected), 0], atol=0.01)
+    yaw = yaw_pitch_roll_deg(pose)[0] + convergence_deg
+    assert found.image_camera_yaw_degrees == pytest.approx(yaw % 360, abs=2e-3)
+    assert opened.image_set_header.image_coordinate_reference_system == "EPSG:4326"
+
+
+@pytest.mark.parametrize("wkt", [None, 'LOCAL_CS["tank",UNIT["metre",1],AXIS["x",EAST],AXIS["y",NORTH]]'])
+def test_an_ifdo_file_in_local_coordinates_has_no_place_on_the_earth_and_says_so(contents, tmp_path, wkt):
+    (file, _) = ifdo.export(replace(contents, georeference=Georeference(10.0, 20.0, 0.0, wkt)), tmp_path)
+    opened = iFDO.load(file)
+    item, header = opened.image_set_items["left_000003.png"], opened.image_set_header
+    assert item.image_latitude is None and item.image_camera_pose is None
+    assert (
+        header.image_coordinate_reference_system is None and "cannot state where on the Earth" in header.image_abstract
+    )
+    position = contents.trajectories["final"].world_from_camera[3, :3, 3]
+    np.testing.assert_allclose(item.image_acquisition_settings["local-position-meters"], position)
 
 
 @pytest.mark.parametrize("replayed", [False, True])

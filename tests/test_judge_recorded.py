@@ -81,6 +81,34 @@ def test_a_truth_of_another_clock_unit_or_body_is_named(pair):
     assert "turned by 180 degrees" in found[0] and "another body" in found[0]
 
 
+def noisy(positions, sigma_m, rng, turn=0.0):
+    """Returns poses at noisy positions (n, 3), with equal attitudes that are turned about z [rad]."""
+    poses = np.tile(geometry.pose(geometry.rotation_from_rpy(0, 0, turn), np.zeros(3)), (len(positions), 1, 1))
+    poses[:, :3, 3] = positions + sigma_m * rng.normal(size=positions.shape)
+    return Trajectory(np.arange(len(positions)) / 20, poses)
+
+
+@pytest.mark.parametrize("scale_m", [0.0, 0.0005])
+def test_the_turn_of_the_axes_is_not_judged_over_a_nearly_still_path(scale_m):
+    """In noise of 1 mm any turn fits the positions best; 3 of 40 may seem determined."""
+    rng, walk = np.random.default_rng(5), scale_m / 10 * np.random.default_rng(6).normal(size=(95, 3)).cumsum(axis=0)
+    found = [truth_warnings(noisy(walk, 1e-3, rng), noisy(walk, 1e-3, rng)) for _ in range(40)]
+    assert sum("turned by" in " ".join(one) for one in found) <= 3
+
+
+def test_noise_of_a_truth_is_not_taken_for_another_scale():
+    rng, still = np.random.default_rng(8), np.zeros((400, 3))
+    assert truth_warnings(noisy(still, 1e-4, rng), noisy(still, 1e-3, rng)) == []
+
+
+def test_a_turn_of_the_axes_is_found_along_a_curve_in_spite_of_drift():
+    rng, t = np.random.default_rng(7), np.linspace(0, 1, 95)
+    curve_m = np.column_stack([2 * t, 0.1 * np.sin(3 * t) + 0.03 * np.sin(9 * t), 0 * t])
+    drifted = curve_m + 0.001 * rng.normal(size=(95, 3)).cumsum(axis=0)
+    assert "turned by 9" in truth_warnings(noisy(drifted, 0, rng), noisy(curve_m, 1e-3, rng, np.pi / 2))[-1]
+    assert truth_warnings(noisy(drifted, 0, rng), noisy(curve_m, 1e-3, rng)) == []
+
+
 def test_a_truth_without_poses_is_a_warning(pair):
     estimate, truth = pair
     empty = Trajectory(truth.times_s[:0], truth.world_from_camera[:0])

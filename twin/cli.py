@@ -143,7 +143,7 @@ DatasetArgument = Annotated[
 ]
 CalibrationOption = Annotated[
     Path | None,
-    typer.Option("--calibration", metavar="FILE", help="OpenCV or Kalibr YAML, or COLMAP cameras.txt beside rigs.txt."),
+    typer.Option("--calibration", metavar="FILE", help="OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt."),
 ]
 TruthOption = Annotated[
     Path | None,

@@ -9,8 +9,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
-from twin.datasets.calibration_files import distortion_kind
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked, distortion_kind
 from twin.errors import TwinError
 
 _UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1

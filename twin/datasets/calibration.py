@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,6 +16,10 @@ _MOST_PX = 16384  # largest side of an image
 _LONGEST_BASELINE_M = 10.0
 _SHORTEST_FOCAL = 0.05  # smallest focal length as a fraction of the image size; a fisheye lens of 180 degrees has 0.3
 _ORTHONORMAL = 1e-3  # largest deviation of a rotation matrix from an orthonormal one (calibration files round)
+_SKEW_PX = 0.01  # largest skew of a camera matrix, which the camera models do not have
+_OFF_CENTRE = 0.1  # largest distance of a principal point from the image centre, if no image size is stated [sides]
+_FISHEYE = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannala_brandt")
+_RADTAN = ("radtan", "plumb_bob", "radial-tangential", "rational_polynomial", "pinhole", "none", "opencv")
 
 
 @dataclass(frozen=True)
@@ -76,6 +80,11 @@ class StereoCalibration:
             if not (0 < cx < width_px and 0 < cy < height_px):
                 problem = f"the principal point ({cx:.1f}, {cy:.1f}) px of the {name} camera is outside the images"
                 raise TwinError(str(self.file), problem, f"a calibration of {width_px} x {height_px} px")
+            if given is None and max(abs(cx / width_px - 0.5), abs(cy / height_px - 0.5)) > _OFF_CENTRE:
+                implied = f"{2 * cx + 1:.0f} x {2 * cy + 1:.0f} px"
+                problem = f"states no image size, and the principal point of the {name} camera implies about {implied}"
+                allowed = f"{width_px} x {height_px} px, the size of the images, or image_width and image_height"
+                raise TwinError(str(self.file), problem, allowed)
         return replace(self, left=replace(self.left, size_px=size), right=replace(self.right, size_px=size))
 
 
@@ -126,9 +135,30 @@ def _check_camera(file: str, name: str, camera: RecordedCamera) -> None:
     if not (0 < matrix[0, 0] < 1e6 and 0 < matrix[1, 1] < 1e6):
         shown = f"{matrix[0, 0]:g}, {matrix[1, 1]:g}"
         raise TwinError(file, f"the focal length of the {name} camera is {shown} px", "positive numbers up to 1e6 px")
+    other = matrix - np.array([[matrix[0, 0], 0, matrix[0, 2]], [0, matrix[1, 1], matrix[1, 2]], [0, 0, 1]])
+    if np.abs(other).max() > _SKEW_PX:
+        is_skew = np.abs(other).max() == abs(matrix[0, 1])
+        problem = f"has a skew of {matrix[0, 1]:g} px" if is_skew else "has no camera matrix"
+        raise TwinError(file, f"the {name} camera {problem}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
     allowed = (0, 4) if camera.kind == "fisheye" else (0, 4, 5, 8, 12, 14)
     if len(distortion) not in allowed:
         counts = ", ".join(map(str, allowed))
         raise TwinError(file, f"the {name} camera has {len(distortion)} coefficients of distortion", counts)
     if camera.size_px is not None and not all(16 <= side <= _MOST_PX for side in camera.size_px):
         raise TwinError(file, f"the image size of the {name} camera is {camera.size_px}", f"16 to {_MOST_PX} px")
+
+
+def distortion_kind(name: Any, file: Path) -> Any:
+    """Returns the kind of distortion that a calibration names: "radtan" or "fisheye".
+
+    Args:
+        name: name of the lens model, for example "plumb_bob".
+        file: file or topic of the calibration, for messages.
+
+    Raises:
+        TwinError: the lens model is not supported.
+    """
+    text = str(name).lower()
+    if text in _FISHEYE or text in _RADTAN:
+        return "fisheye" if text in _FISHEYE else "radtan"
+    raise TwinError(str(file), f"distortion model {text[:40]!r} is not supported", "radtan or equidistant (fisheye)")

@@ -25,7 +25,7 @@ class PlainFolderReader:
     """
 
     name = "folder"
-    layout = "left/ and right/ with images of equal names, and a calibration (OpenCV, Kalibr or COLMAP)"
+    layout = "left/ and right/ with images of equal names, and a calibration (OpenCV, Kalibr, ROS, ORB-SLAM3, COLMAP)"
 
     def recognises(self, folder: Path) -> bool:
         """Returns whether a folder has the subfolders left and right."""

@@ -23,6 +23,7 @@ from twin.datasets.aiding import Aiding, Opening, Start
 from twin.datasets.bag import is_bag
 from twin.datasets.bag_reader import BagTopics
 from twin.datasets.calibration_files import read_calibration
+from twin.datasets.calibration_values import READ
 from twin.datasets.dataset import Dataset
 from twin.datasets.frames import RecordedFrames
 from twin.datasets.image_files import BAYER, Bayer
@@ -309,7 +310,7 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     if isinstance(calibration, TwinError):
         raise calibration
     if calibration is None:
-        raise TwinError(str(folder), "has no calibration", "--calibration FILE (OpenCV, Kalibr or COLMAP)")
+        raise TwinError(str(folder), "has no calibration", f"--calibration FILE: {READ}")
     frames = RecordedFrames(dataset, calibration, options.bayer)
     truth = _truth(dataset, frames, None if in_bag else options.truth)
     first = frames.first_pair()
@@ -420,7 +421,7 @@ def _evaluation(
     guard: StageGuard,
 ) -> ReplayEvaluation:
     """Returns the input of the evaluation, without timing."""
-    findings = check_survey(result, opened.frames.rectification.rig) if len(result.keyframe_rows) else []
+    findings = check_survey(result, opened.frames.rectification.rig, elevation) if len(result.keyframe_rows) else []
     sentences = [*_unused(opened.frames), *(finding.sentence for finding in findings)]
     reasons = [guard.reason] if guard.reason else sentences
     identity = {

@@ -2,17 +2,19 @@
 
 Each check compares a quantity that the estimators measure with a limit. The limits lie between the values of ordinary
 surveys, whose errors agree with their covariances (generated and photographed floors, Jerlov types I to 3C), and the
-values of surveys with gross errors of the trajectory; docs/findings.md (section 9) lists both.
+values of surveys with gross errors of the trajectory; docs/findings.md (section 9) lists both. An error of disparities
+above its limit is a finding only if positions or heights are wrong by more than their standard deviations cover.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from twin.core.quality import Finding
-from twin.core.records import StereoRig, SurveyResult
+from twin.core.records import ElevationMap, StereoRig, SurveyResult
 
 MAX_FRAMES_LOST = 0.02  # fraction of the frames
 MAX_LINKS_FAILED = 0.15  # fraction of the links
@@ -26,9 +28,18 @@ MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
 _SIGNIFICANT = 4.0  # standard deviations
+_COVERED = 3.0  # largest effect of a calibration error that the standard deviation of a result covers [its sigmas]
 
 
-def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
+class _Effect(NamedTuple):
+    """Effect of an error of all disparities on positions or heights, with its largest tolerable value [m]."""
+
+    error_m: float
+    limit_m: float
+    text: str
+
+
+def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None = None) -> list[Finding]:
     """Returns the findings of all checks; an empty list if every check passes.
 
     The findings are in the order of tracking, stereo, rectification and consistency.
@@ -36,12 +47,44 @@ def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
     Args:
         result: output of the estimators.
         rig: believed calibration.
+        elevation: map of the survey; None if none was built.
     """
     return [
-        finding
-        for findings in (_tracking(result), _stereo(result), _rectification(result, rig), _consistency(result, rig))
-        for finding in findings
+        *_tracking(result),
+        *_stereo(result),
+        *_rectification(result, rig, elevation),
+        *_consistency(result, rig, elevation),
     ]
+
+
+def _disparity_error(
+    check: str, error: float, limit_px: float, survey: tuple[SurveyResult, StereoRig, ElevationMap | None], text: str
+) -> Iterator[Finding]:
+    """Yields a finding if an error of all disparities [focal lengths] is above its limit and has a damaging effect."""
+    result, rig, elevation = survey
+    if not abs(error) * rig.focal_px > limit_px or not len(result.keyframe_depth_m):
+        return
+    effect = max(_effects(result, rig, elevation, abs(error)), key=lambda one: one.error_m / max(one.limit_m, 1e-9))
+    if effect.error_m > effect.limit_m:
+        yield Finding(check, effect.error_m, effect.limit_m, f"{text}; {effect.text}")
+
+
+def _effects(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None, error: float) -> Iterator[_Effect]:
+    """Yields the effects of an error e of all disparities: depths Z = b / d, and all lengths, change by Z e / b."""
+    depth_m = float(np.median(result.keyframe_depth_m))
+    share = error * depth_m / rig.baseline_m
+    positions = result.final.positions[result.keyframe_rows]
+    reach_m = float(np.linalg.norm(positions - positions[0], axis=1).max())
+    sigma_m = float(np.sqrt(np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2).max(initial=0.0)))
+    yield _effect("positions", share * reach_m, sigma_m, f"over {reach_m:.3g} m")
+    if elevation is not None and np.isfinite(elevation.sigma_m).any():
+        yield _effect("heights", share * depth_m, float(np.nanmedian(elevation.sigma_m)), f"at {depth_m:.3g} m")
+
+
+def _effect(name: str, error_m: float, sigma_m: float, where: str) -> _Effect:
+    """Returns an effect with its words."""
+    text = f"{name} may be off by {1000 * error_m:.2g} mm {where}, their standard deviation is {1000 * sigma_m:.2g} mm"
+    return _Effect(error_m, _COVERED * sigma_m, text)
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
@@ -75,7 +118,7 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
         yield Finding("repetition", repeated, MAX_REPETITION, text)
 
 
-def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
+def _rectification(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None) -> Iterator[Finding]:
     """Yields a finding for each rectification error above its limit: row offset, yaw, pattern of row differences.
 
     The scatter of row differences within a region of the image is not a finding: the covariances of matches include it
@@ -85,25 +128,24 @@ def _rectification(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
     if offset is not None and abs(offset) > MAX_ROW_OFFSET_PX:
         text = f"the rows of the right image are offset by {offset:+.2f} px"
         yield Finding("row_offset", abs(offset), MAX_ROW_OFFSET_PX, text)
-    epipolar = result.quality.epipolar
+    epipolar, survey = result.quality.epipolar, (result, rig, elevation)
     if epipolar is not None:
         yaw, sigma = float(epipolar.estimate[1]), float(epipolar.sigma[1])
         shift_px, pattern_px = abs(yaw) * rig.focal_px, epipolar.pattern * rig.focal_px
-        if shift_px > MAX_YAW_PX and abs(yaw) > _SIGNIFICANT * sigma:
+        if abs(yaw) > _SIGNIFICANT * sigma:
             text = (
                 f"row differences imply a yaw of {np.rad2deg(yaw):+.3f} deg between the cameras, or a distortion error:"
                 f" disparities may be off by {shift_px:.1f} px"
             )
-            yield Finding("yaw", shift_px, MAX_YAW_PX, text)
-        if pattern_px > MAX_ROW_PATTERN_PX:
-            text = (
-                f"row differences of stereo matches vary systematically over the image by {pattern_px:.2f} px, which no"
-                " rotation of a camera explains: the distortion or the port is not as calibrated"
-            )
-            yield Finding("row_pattern", pattern_px, MAX_ROW_PATTERN_PX, text)
+            yield from _disparity_error("yaw", yaw, MAX_YAW_PX, survey, text)
+        text = (
+            f"row differences of stereo matches vary systematically over the image by {pattern_px:.2f} px, which no"
+            " rotation of a camera explains: the distortion or the port is not as calibrated"
+        )
+        yield from _disparity_error("row_pattern", epipolar.pattern, MAX_ROW_PATTERN_PX, survey, text)
 
 
-def _consistency(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
+def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None) -> Iterator[Finding]:
     """Yields a finding for each quantity that shows inconsistent links or a large uncertainty.
 
     These are the residuals of the matched points, the offset of all disparities, the chi-square of the links, an
@@ -115,14 +157,13 @@ def _consistency(result: SurveyResult, rig: StereoRig) -> Iterator[Finding]:
         text = f"residuals of points matched between keyframes are {quality.link_residual:.1f} times their noise"
         yield Finding("link_residual", quality.link_residual, MAX_LINK_RESIDUAL, text)
     offset = quality.disparity_offset
-    if offset is not None:
-        offset_px = offset.estimate * rig.focal_px
-        if abs(offset_px) > MAX_DISPARITY_OFFSET_PX and abs(offset.estimate) > _SIGNIFICANT * offset.sigma:
-            text = (
-                f"the motions of near and far points imply that all disparities are off by {offset_px:+.2f} px:"
-                " a principal point or the yaw of a camera is not as calibrated"
-            )
-            yield Finding("disparity_offset", abs(offset_px), MAX_DISPARITY_OFFSET_PX, text)
+    if offset is not None and abs(offset.estimate) > _SIGNIFICANT * offset.sigma:
+        offset_px, survey = offset.estimate * rig.focal_px, (result, rig, elevation)
+        text = (
+            f"the motions of near and far points imply that all disparities are off by {offset_px:+.2f} px:"
+            " a principal point or the yaw of a camera is not as calibrated"
+        )
+        yield from _disparity_error("disparity_offset", offset.estimate, MAX_DISPARITY_OFFSET_PX, survey, text)
     if quality.link_chi2 is not None and quality.link_chi2 > MAX_LINK_CHI2:
         text = f"the motions between keyframes contradict each other (chi-square {quality.link_chi2:.1f}, 1 expected)"
         yield Finding("link_chi2", quality.link_chi2, MAX_LINK_CHI2, text)

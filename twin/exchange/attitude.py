@@ -21,7 +21,7 @@ def yaw_pitch_roll_deg(world_from_camera: Array) -> tuple[float, float, float]:
     towards the top of the image. This is the definition of iFDO and of Metashape.
 
     Args:
-        world_from_camera: (4, 4) pose of the camera in the world (x east, y north, z up).
+        world_from_camera: (4, 4) pose of the camera, or its rotation (3, 3), in the world (x east, y north, z up).
     """
     r = _NED_FROM_ENU @ world_from_camera[:3, :3] @ _CAMERA_FROM_TOP_RIGHT_SIGHT
     yaw = np.arctan2(r[1, 0], r[0, 0])

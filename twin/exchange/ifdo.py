@@ -8,9 +8,10 @@ import uuid
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from twin.core.georeference import Georeference
 from twin.core.records import Array
@@ -22,6 +23,13 @@ from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RunConte
 VERSION = "v2.1.0"
 _START = datetime(1970, 1, 1, tzinfo=UTC)  # a run has no date
 _UNKNOWN = "unknown"
+_WGS84 = "EPSG:4326"
+_UTM_LATITUDES = -80.0, 84.0  # [deg]
+_LINE_M = 100.0  # length of the line to the grid north of the scene whose direction is transformed
+_LOCAL = (
+    " The file cannot state where on the Earth the images are: positions and orientations are local (metres, z up), in"
+    " image-acquisition-settings, and yaw counts from the y axis."
+)
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
@@ -29,7 +37,8 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     The file has the calibration of the left camera, and position, attitude and hash of each image. Positions and
     attitudes are those of the final trajectory or, without one, the true ones. Latitude and longitude (EPSG:4326),
-    which iFDO requires, are written if the export has a CRS; otherwise, the file has only poses in scene coordinates.
+    which iFDO requires, and poses in UTM are written if the export has a projected CRS; otherwise, the abstract says
+    that the file has only poses in scene coordinates.
     Times count from 1970-01-01, because a run has no date.
 
     For a replay, the file states that the images are recorded; their platform, licence and copyright are "unknown".
@@ -39,20 +48,19 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         OSError: a file cannot be read or written.
     """
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
-    items: dict[str, Any] = {}
+    items, place = dict[str, Any](), _place(contents.georeference)
     for image in copy_images(contents, folder / "images", contents.rig.left_from_right):
         pose = path.world_from_camera[image.frame.index] @ image.left_from_camera
-        items[image.name] = _item(contents, image.frame, folder / "images" / image.name, pose)
+        items[image.name] = _item(place, image.frame, folder / "images" / image.name, pose)
     target = folder / "ifdo.json"
-    text = json.dumps({"image-set-header": _header(contents), "image-set-items": items}, indent=1)
+    text = json.dumps({"image-set-header": _header(contents, place), "image-set-items": items}, indent=1)
     target.write_text(text, encoding="utf-8")
     return [target, folder / "images"]
 
 
-def _header(contents: RunContents) -> dict[str, Any]:
+def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
     """Returns the fields that hold for the whole image set."""
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
-    origin = contents.georeference
     named = {"image-project": contents.name, "image-event": contents.name}
     header: dict[str, Any] = {
         "image-set-name": contents.name,
@@ -71,8 +79,9 @@ def _header(contents: RunContents) -> dict[str, Any]:
     }
     header |= {key: {"name": name} for key, name in named.items()}
     header |= _recorded() if "replay" in contents.scenario else _simulated(_illumination(contents.scenario))
-    crs = "EPSG:4326" if origin is not None and origin.crs_wkt is not None else "local metres, x east, y north, z up"
-    return header | {"image-coordinate-reference-system": crs}
+    if place is None:
+        return header | {"image-abstract": header["image-abstract"] + _LOCAL}
+    return header | {"image-coordinate-reference-system": _WGS84}
 
 
 def _illumination(scenario: Mapping[str, Any]) -> str:
@@ -128,11 +137,12 @@ def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:
     }
 
 
-def _item(contents: RunContents, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
+def _item(place: _Place | None, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
     """Returns the fields of one image, given its frame, its file and the pose (4, 4) of its camera in the world."""
     digest = hashlib.sha256(read_bytes(image, most_bytes=MOST_IMAGE_BYTES)).hexdigest()
     time = _START + timedelta(seconds=frame.time_s)
-    yaw, pitch, roll = yaw_pitch_roll_deg(pose)
+    turn = np.eye(3) if place is None else place.north_from_scene
+    yaw, pitch, roll = yaw_pitch_roll_deg(turn @ pose[:3, :3])
     return {
         "image-uuid": _uuid(digest.encode() + image.name.encode()),
         "image-hash-sha256": digest,
@@ -140,35 +150,84 @@ def _item(contents: RunContents, frame: RecordedFrame, image: Path, pose: Array)
         "image-camera-yaw-degrees": yaw,
         "image-camera-pitch-degrees": pitch,
         "image-camera-roll-degrees": roll,
-        **_position(contents.georeference, pose),
+        **_position(place, pose),
     }
 
 
-def _position(origin: Georeference | None, pose: Array) -> dict[str, Any]:
-    """Returns the fields of the position for the pose (4, 4) of a camera in the world.
+class _Place(NamedTuple):
+    """Place of a scene on the Earth.
 
-    The position is in the CRS of `origin` and in EPSG:4326; without a CRS, it is in scene coordinates [m].
+    Args:
+        origin: position of the scene in its CRS.
+        zone, epsg: UTM zone (for example "33N") and its EPSG code on WGS 84.
+        north_from_scene, utm_from_scene: (3, 3) rotations from the scene axes to (east, true north, up) and to the grid
+            axes of the zone, at the origin of the scene.
     """
-    x, y, z = (float(value) for value in pose[:3, 3])
-    rotation = [float(value) for value in pose[:3, :3].ravel()]
-    if origin is None or origin.crs_wkt is None:
-        where = {"pose-utm-east-north-up-meters": [x, y, z], "pose-absolute-orientation-utm-matrix": rotation}
-        return {"image-camera-pose": where}
-    from rasterio.crs import CRS
+
+    origin: Georeference
+    zone: str
+    epsg: int
+    north_from_scene: Array
+    utm_from_scene: Array
+
+    def transformed(self, easting: ArrayLike, northing: ArrayLike, target: str) -> Array:
+        """Returns the coordinates (n, 2) in a CRS of points in the CRS of the scene."""
+        return _transformed(self.origin.crs_wkt or "", target, easting, northing)
+
+
+def _transformed(source: str, target: str, x: ArrayLike, y: ArrayLike) -> Array:
+    """Returns the coordinates (n, 2) in the CRS `target` of points in the CRS `source`."""
     from rasterio.warp import transform
 
-    crs = CRS.from_wkt(origin.crs_wkt)
-    easting, northing = (float(value) for value in origin.from_scene(x, y))
-    (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [easting], [northing])[:2]
-    altitude_m = z + origin.elevation_m
+    return np.column_stack(transform(source, target, np.atleast_1d(x), np.atleast_1d(y))[:2])
+
+
+def _place(origin: Georeference | None) -> _Place | None:
+    """Returns the place of the scene; None without a projected CRS, or near a pole, where there is no UTM zone."""
+    from rasterio.crs import CRS
+
+    if origin is None or origin.crs_wkt is None or not CRS.from_wkt(origin.crs_wkt).is_projected:
+        return None
+    line = [origin.easting, origin.easting], [origin.northing, origin.northing + _LINE_M / origin.metres_per_unit]
+    longitude, latitude = (float(value) for value in _transformed(origin.crs_wkt, _WGS84, *line)[0])
+    if not _UTM_LATITUDES[0] <= latitude < _UTM_LATITUDES[1]:
+        return None
+    number = int((longitude + 180) % 360 // 6) + 1
+    epsg = (32600 if latitude >= 0 else 32700) + number
+    local = f"+proj=tmerc +lat_0={latitude} +lon_0={longitude} +datum=WGS84"
+    turns = (_turn(_transformed(origin.crs_wkt, target, *line)) for target in (local, f"EPSG:{epsg}"))
+    return _Place(origin, f"{number}{'N' if latitude >= 0 else 'S'}", epsg, *turns)
+
+
+def _turn(line: Array) -> Array:
+    """Returns the rotation (3, 3) about the vertical that turns the y axis to the direction of a line (2, 2)."""
+    east, north = (line[1] - line[0]) / np.linalg.norm(line[1] - line[0])
+    return np.array([[north, east, 0.0], [-east, north, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _position(place: _Place | None, pose: Array) -> dict[str, Any]:
+    """Returns the fields of the position and the pose (4, 4) of a camera in the world.
+
+    The position is in EPSG:4326, the pose in UTM on WGS 84. Without a place, iFDO has no field for either; both are
+    then written as settings of the acquisition, in scene coordinates [m].
+    """
+    x, y, z = (float(value) for value in pose[:3, 3])
+    if place is None:
+        settings = {"local-position-meters": [x, y, z], "local-orientation-matrix": pose[:3, :3].tolist()}
+        return {"image-acquisition-settings": settings}
+    scene = place.origin.from_scene(x, y)
+    altitude_m = z + place.origin.elevation_m
+    longitude, latitude = place.transformed(*scene, _WGS84)[0]
+    easting_m, northing_m = place.transformed(*scene, f"EPSG:{place.epsg}")[0]
     return {
-        "image-latitude": round(latitude, 9),
-        "image-longitude": round(longitude, 9),
+        "image-latitude": round(float(latitude), 9),
+        "image-longitude": round(float(longitude), 9),
         "image-altitude-meters": altitude_m,
         "image-camera-pose": {
-            "pose-utm-epsg": str(crs.to_epsg() or ""),
-            "pose-utm-east-north-up-meters": [easting, northing, altitude_m],
-            "pose-absolute-orientation-utm-matrix": rotation,
+            "pose-utm-zone": place.zone,
+            "pose-utm-epsg": str(place.epsg),
+            "pose-utm-east-north-up-meters": [float(easting_m), float(northing_m), altitude_m],
+            "pose-absolute-orientation-utm-matrix": (place.utm_from_scene @ pose[:3, :3]).tolist(),
         },
     }
 

@@ -30,7 +30,10 @@ MAX_DIFFERENCE_S = 0.01
 #: Keys of `network_residuals`.
 NETWORK_KEYS = ("links", "loops", "loop_translation_m", "loop_rotation_deg", "loop_chi2")
 _MIN_ASSOCIATED = 3  # two positions leave the rotation about the line through them undetermined
-_MAX_AXIS_DEG, _MAX_LENGTH_RATIO = 5.0, 2.0
+_MAX_AXIS_DEG, _MAX_EXTENT_RATIO = 5.0, 2.0
+_MAX_AXIS_SIGMA_DEG = 10.0  # where the turn is less certain, it is not judged: along a line or noise, any turn fits
+_SIGNIFICANT = 3.0  # standard deviations of the turn of the axes
+_BLOCKS = 4  # parts of the path, left out one at a time for the standard deviation of the turn
 
 
 class Associated(NamedTuple):
@@ -222,23 +225,44 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
             f"{truth.times_s.max():.3f} s after the first frame. The truth seems to have another clock."
         ]
     found = []
-    lengths = [float(cumulative_length(path.positions)[-1]) for path in (a, b)]
-    ratio = max(lengths) / max(min(lengths), 1e-9)
-    if ratio > _MAX_LENGTH_RATIO and max(lengths) > 0.05:
+    extents = [float(np.linalg.norm(np.ptp(path.positions, axis=0))) for path in (a, b)]  # noise adds to lengths
+    if max(extents) > max(_MAX_EXTENT_RATIO * min(extents), 0.05):
         found.append(
-            f"The true path is {lengths[1]:.3g} m long, the estimated one {lengths[0]:.3g} m: the truth seems to have "
-            "another unit or scale."
+            f"The true path extends over {extents[1]:.3g} m, the estimated one over {extents[0]:.3g} m: the truth "
+            "seems to have another unit or scale."
         )
-    rotation = rigid_alignment(a.positions, b.positions)[:3, :3]
-    turns = np.swapaxes(rotation @ a.world_from_camera[:, :3, :3], 1, 2) @ b.world_from_camera[:, :3, :3]
-    offset = geometry.nearest_rigid(geometry.pose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
-    angle_deg = float(np.rad2deg(np.linalg.norm(geometry.so3_log(offset))))
-    if _is_spatial(b.positions) and angle_deg > _MAX_AXIS_DEG:
+    angle_deg, sigma_deg = axis_turn_deg(a, b)
+    if angle_deg > max(_MAX_AXIS_DEG, _SIGNIFICANT * sigma_deg) and sigma_deg < _MAX_AXIS_SIGMA_DEG:
         found.append(
-            f"The axes of the truth are turned by {angle_deg:.0f} degrees from those of the left camera: the truth "
-            "seems to be that of another body."
+            f"The axes of the truth are turned by {angle_deg:.0f} degrees (sigma {sigma_deg:.0f}) from those of the "
+            "left camera: the truth seems to be that of another body."
         )
     return found
+
+
+def axis_turn_deg(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
+    """Returns the angle by which the axes of the true bodies are turned from those of the camera, and its sigma [deg].
+
+    The angle is that between the rotation that fits the positions and the one that fits the attitudes. The standard
+    deviation is that of the jackknife that leaves out one of `_BLOCKS` parts of the path at a time (Kuensch 1989), so
+    errors that are correlated along the path count; over a nearly still path it is as large as the angle.
+
+    Args:
+        estimate, truth: poses that are associated row by row.
+    """
+    block = np.arange(len(truth)) * _BLOCKS // len(truth)
+    kept = [block != k for k in range(-1, _BLOCKS)]  # first all rows
+    turns = [_axis_turn(_selected(estimate, rows), _selected(truth, rows)) for rows in kept]
+    changes = [geometry.so3_log(turns[0].T @ part) for part in turns[1:]]
+    sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum(np.square(changes)))
+    return float(np.rad2deg(np.linalg.norm(geometry.so3_log(turns[0])))), float(np.rad2deg(sigma))
+
+
+def _axis_turn(estimate: Trajectory, truth: Trajectory) -> Array:
+    """Returns the mean rotation (3, 3) of the true bodies in the axes of the camera, once the positions are aligned."""
+    rotation = rigid_alignment(estimate.positions, truth.positions)[:3, :3]
+    turns = np.swapaxes(rotation @ estimate.world_from_camera[:, :3, :3], 1, 2) @ truth.world_from_camera[:, :3, :3]
+    return geometry.nearest_rigid(geometry.pose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
 
 
 def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
@@ -277,12 +301,6 @@ def _associated_poses(estimate: Trajectory, truth: Trajectory) -> tuple[Trajecto
     return _selected(estimate, rows.estimate), _selected(truth, rows.truth)
 
 
-def _selected(path: Trajectory, rows: NDArray[np.int64]) -> Trajectory:
-    """Returns the poses of a trajectory in the given rows."""
+def _selected(path: Trajectory, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Trajectory:
+    """Returns the poses of a trajectory in the given rows or where a mask is true."""
     return Trajectory(path.times_s[rows], path.world_from_camera[rows])
-
-
-def _is_spatial(positions: Array) -> bool:
-    """Returns whether positions (n, 3) determine a rotation, which they do not if they lie nearly on a line."""
-    spread = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
-    return bool(spread[1] > 0.05 * spread[0] > 0)

@@ -28,7 +28,8 @@ def survey_findings(
         elevation: elevation map; None if none was built.
         reference_m: (n, 3) planned positions of the left camera at the frames [m].
     """
-    return [*check_survey(result, mission.rig), *_off_course(mission, result, reference_m), *_area(mission, elevation)]
+    found = check_survey(result, mission.rig, elevation)
+    return [*found, *_off_course(mission, result, reference_m), *_area(mission, elevation)]
 
 
 def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:

@@ -1,0 +1,66 @@
+"""Values of a calibration file: numbers, matrices, image sizes; keys that nobody read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.errors import TwinError
+
+#: Calibration files that are read.
+READ = "OpenCV (YAML, XML, JSON), Kalibr camchain, ROS camera_info pair, ORB-SLAM3, COLMAP cameras.txt and rigs.txt"
+_LARGEST = 1e12  # largest absolute value of a number in a calibration file
+
+
+def refuse_unknown(keys: Iterable[Any], file: Path) -> None:
+    """Raises TwinError if there are keys that were neither read nor known to be irrelevant."""
+    unknown = [str(key)[:40] for key in keys]
+    if unknown:
+        names = ", ".join(map(repr, unknown[:5]))
+        raise TwinError(str(file), f"has unknown or repeated keys, which could change its meaning: {names}", READ)
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
+    """Returns the camera matrix (3, 3)."""
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
+
+
+def table_of(value: Any, file: Path) -> Mapping[str, Any]:
+    """Returns the value if it is a table (keys and values); raises TwinError otherwise."""
+    if not isinstance(value, Mapping):
+        raise TwinError(str(file), "has no table of a camera", READ)
+    return value
+
+
+def numbers_of(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = None) -> Array:
+    """Returns a list of numbers, or those under its key `data`, as an array, reshaped to `shape` if it is given.
+
+    Raises:
+        TwinError: the value is not a list of numbers below 1e12 in absolute value, or their number does not fit
+            `shape`; the message names `key`.
+    """
+    value = value.get("data") if isinstance(value, Mapping) else value
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.array(np.nan)
+    count = None if shape is None else int(np.prod(shape))
+    if value is None or not (np.abs(array) < _LARGEST).all() or (count is not None and array.size != count):
+        raise TwinError(str(file), f"{key} is missing or not valid", f"{count or 'finite'} numbers")
+    return array if shape is None else array.reshape(shape)
+
+
+def size_of(value: Any, file: Path) -> tuple[int, int] | None:
+    """Returns an image size [width, height] as a tuple [px]; None if the value is None.
+
+    Raises:
+        TwinError: the value is not two numbers.
+    """
+    if value is None:
+        return None
+    width, height = numbers_of(value, file, "the image size", (2,))
+    return int(width), int(height)
