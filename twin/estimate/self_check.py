@@ -51,6 +51,10 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
     if lost > MAX_FRAMES_LOST:
         text = f"the motion of {quality.frames_lost} of {len(result.online)} frames was predicted, not measured"
         yield Finding("frames_lost", lost, MAX_FRAMES_LOST, text)
+    for status, rows in quality.repeats.items():
+        if len(rows) > MAX_FRAMES_LOST * len(result.online):
+            text = f"{status} in {len(rows)} of {len(result.online)} frames"
+            yield Finding("frames_repeated", len(rows) / len(result.online), MAX_FRAMES_LOST, text)
     if quality.nodes_bridged:
         text = f"{quality.nodes_bridged} keyframes could not be linked to the keyframe before them"
         yield Finding("nodes_bridged", quality.nodes_bridged, 0, text)

@@ -94,7 +94,7 @@ def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> 
         result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
         [
             *plugin_notes(scenario), *world.warnings, *calibration_notes(result, mission.rig),
-            *filter(None, [actions.sentence]),
+            *result.quality.repeat_notes, *filter(None, [actions.sentence]),
         ],
         idealisations(scenario), actions, None if orthomosaic is None else orthomosaic.metrics,
     )  # fmt: skip
