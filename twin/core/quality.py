@@ -42,6 +42,19 @@ class DisparityOffset(NamedTuple):
     sigma: float
 
 
+class LengthScale(NamedTuple):
+    """Lengths from the images divided by those of navigation sensors; 1 is expected.
+
+    Args:
+        estimate, sigma: the ratio and its standard deviation.
+        sensors: names of the sensors that determine it.
+    """
+
+    estimate: float
+    sigma: float
+    sensors: str
+
+
 class EstimationQuality(NamedTuple):
     """Consistency of the estimates of a survey, measured by the estimators without the truth.
 
@@ -60,6 +73,8 @@ class EstimationQuality(NamedTuple):
             keyframe.
         disparity_offset: offset common to all disparities, estimated from the links; None without images, or if
             the offset is not observable.
+        length_scale, depth_scale: scale of the lengths from the images across and along the optical axis; None without
+            a sensor that determines it.
         repeats: rows of the frames at which a camera was frozen, by status ("the left camera repeats its image").
         independent_errors: number of independent errors to which the correlated position errors of the keyframes are
             equivalent, by their joint covariance; None without a final alignment.
@@ -76,6 +91,8 @@ class EstimationQuality(NamedTuple):
     frame_sigma_m: float | None = None
     disparity_offset: DisparityOffset | None = None
     independent_errors: float | None = None
+    length_scale: LengthScale | None = None
+    depth_scale: LengthScale | None = None
     repeats: Mapping[str, Sequence[int]] = MappingProxyType({})
 
     @property

@@ -36,6 +36,7 @@ from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate import disparity_offset
+from twin.estimate.length_scale import length_scales
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
@@ -333,6 +334,7 @@ class Navigator:
         nodes = self.network.nodes
         poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
         n_views = disparity_offset.mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
+        across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
             frames_lost=self.log.n_lost,
             repeats=self.log.repeats,
@@ -348,6 +350,8 @@ class Navigator:
                 history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px
             ),
             independent_errors=history.independent_errors,
+            length_scale=across,
+            depth_scale=along,
         )
 
     @property
