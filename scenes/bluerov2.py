@@ -58,6 +58,7 @@ class VehicleParameters:
         thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) coefficients of the transfer function from
             steady to actual thrust.
         size_m: (3,) length, width, height of the hull.
+        hull_centre_m: (3,) centre of the hull in the body.
     """
 
     mass_kg: float = 13.5
@@ -74,6 +75,7 @@ class VehicleParameters:
         default_factory=lambda: (_array(6136.0, 108700.0), _array(1.0, 89.0, 9258.0, 108700.0))
     )
     size_m: Array = field(default_factory=lambda: _array(0.457, 0.575, 0.254))
+    hull_centre_m: Array = field(default_factory=lambda: _array(0.0, 0.0, -0.03))
 
     @property
     def thrust_configuration(self) -> Array:

@@ -131,7 +131,9 @@ def _add_hull(body: MjsBody, vehicle: VehicleParameters) -> None:
     length, width, height = vehicle.size_m / 2
     common = {"type": mujoco.mjtGeom.mjGEOM_BOX, "group": VEHICLE_GROUP, "mass": 0.0, "contype": 0, "conaffinity": 0}
     body.add_geom(name="float", size=[length, width, height / 4], pos=[0, 0, 0.075], rgba=[0.1, 0.35, 0.8, 1], **common)
-    body.add_geom(name="frame", size=[length, width / 2, height / 2], pos=[0, 0, -0.03], rgba=[0.1] * 3 + [1], **common)
+    body.add_geom(
+        name="frame", size=[length, width / 2, height / 2], pos=vehicle.hull_centre_m, rgba=[0.1] * 3 + [1], **common
+    )
 
 
 def _add_cameras(body: MjsBody, cameras: CameraPair) -> None:

@@ -81,8 +81,8 @@ def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
     while not (terminated or truncated):
         _, reward, terminated, truncated, info = env.step(down.astype(np.float32))
         assert reward == pytest.approx(-info["truth"]["distance_to_plan_m"])
-    assert terminated and info["ended"] == "the camera touched the floor"
-    assert info["truth"]["world_from_camera"][2, 3] < 0.1 < info["truth"]["distance_to_plan_m"]
+    assert terminated and info["ended"].startswith("contact of the hull with the floor at ")
+    assert info["truth"]["distance_to_plan_m"] > 0.1
     env.close()
 
 

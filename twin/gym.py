@@ -28,8 +28,6 @@ except ImportError as error:
 ENVIRONMENT = "SeabedTwin-v0"
 #: Turn rate for a yaw action of 1 [rad/s]; speed for a velocity action of 1, divided by the planned speed.
 YAW_RATE_RADPS, SPEED_RATIO = 0.5, 1.5
-#: An episode ends if the left camera is less than this above the floor below it [m].
-LEAST_CLEARANCE_M = 0.1
 
 Observation = dict[str, Any]
 
@@ -39,8 +37,9 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     A step lasts from one keyframe to the next: `frames_per_step` frames, the last of which has both images. The
     estimators of the scenario run in the loop and give the believed pose. The truth is only in `info` and in the
-    reward. An episode is truncated after the last frame of the plan. It is terminated if, at the end of a step, the
-    left camera is outside the terrain or less than 0.1 m above the floor, or if the survey is aborted.
+    reward. An episode is truncated after the last frame of the plan. It is terminated if the survey
+    is aborted, for example because the hull touches the floor, or if the left camera is outside the terrain at the end
+    of a step.
 
     Observation (dictionary):
         left, right: (H, W, 3) uint8 RGB, rectified stereo pair.
@@ -156,7 +155,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
                 self._estimate = self._navigator.update(frame, self._world.track)
         except SurveyAborted as error:
             self._ended = str(error)
-        self._ended = self._ended or self._collision()
+        self._ended = self._ended or self._departure()
         seen_m2 = self._seen_m2()
         gained_m2, self._covered_m2 = seen_m2 - self._covered_m2, seen_m2
         reward = gained_m2 if self._reward == "coverage" else -self._distance_to_plan_m()
@@ -223,13 +222,10 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Returns the part of the asked area that both cameras have seen in a keyframe [m2]."""
         return float((self._world.world.seen() & self._asked).sum()) * self._world.mission.grid.cell_m**2
 
-    def _collision(self) -> str:
-        """Returns why the episode ends: the camera left the terrain or came too near to the floor; otherwise ""."""
-        x, y, z = self._world.true_pose[:3, 3]
-        floor_m = float(self._world.mission.terrain.height_at(x, y))
-        if np.isnan(floor_m):
-            return "the camera left the terrain"
-        return "the camera touched the floor" if z - floor_m < LEAST_CLEARANCE_M else ""
+    def _departure(self) -> str:
+        """Returns why the episode ends, if the camera left the terrain; otherwise ""."""
+        x, y = self._world.true_pose[:2, 3]
+        return "the camera left the terrain" if np.isnan(self._world.mission.terrain.height_at(x, y)) else ""
 
 
 def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -40,6 +42,19 @@ class DisparityOffset(NamedTuple):
     sigma: float
 
 
+class LengthScale(NamedTuple):
+    """Lengths from the images divided by those of navigation sensors; 1 is expected.
+
+    Args:
+        estimate, sigma: the ratio and its standard deviation.
+        sensors: names of the sensors that determine it.
+    """
+
+    estimate: float
+    sigma: float
+    sensors: str
+
+
 class EstimationQuality(NamedTuple):
     """Consistency of the estimates of a survey, measured by the estimators without the truth.
 
@@ -58,6 +73,9 @@ class EstimationQuality(NamedTuple):
             keyframe.
         disparity_offset: offset common to all disparities, estimated from the links; None without images, or if
             the offset is not observable.
+        length_scale, depth_scale: scale of the lengths from the images across and along the optical axis; None without
+            a sensor that determines it.
+        repeats: rows of the frames at which a camera was frozen, by status ("the left camera repeats its image").
         independent_errors: number of independent errors to which the correlated position errors of the keyframes are
             equivalent, by their joint covariance; None without a final alignment.
     """
@@ -73,6 +91,24 @@ class EstimationQuality(NamedTuple):
     frame_sigma_m: float | None = None
     disparity_offset: DisparityOffset | None = None
     independent_errors: float | None = None
+    length_scale: LengthScale | None = None
+    depth_scale: LengthScale | None = None
+    repeats: Mapping[str, Sequence[int]] = MappingProxyType({})
+
+    @property
+    def repeat_notes(self) -> list[str]:
+        """Returns for each frozen camera a sentence that names the frames at which it was frozen."""
+        return [
+            f"{status.capitalize()} in {len(rows)} frames ({_spans(rows)}); these images were not used."
+            for status, rows in self.repeats.items()
+        ]
+
+
+def _spans(rows: Sequence[int], most: int = 5) -> str:
+    """Returns increasing rows as a text of at most `most` spans, "3 to 8, 12, ..."."""
+    spans = np.split(np.array(rows), np.flatnonzero(np.diff(rows) > 1) + 1)
+    texts = [str(s[0]) if len(s) == 1 else f"{s[0]} to {s[-1]}" for s in spans[:most]]
+    return ", ".join(texts + ["..."] * (len(spans) > most))
 
 
 class Finding(NamedTuple):

@@ -36,6 +36,7 @@ class EstimatorSettings:
             predicted poses; for large or unpredictable motions between keyframes. It costs time only where links fail.
             Otherwise this is done only where the covariance of the predicted poses exceeds the search range, and a link
             must agree with this covariance.
+        noisy_images: whether the images have noise, so that no image of a live camera equals the image before it.
 
     Raises:
         TwinError: a value is out of range.
@@ -51,6 +52,7 @@ class EstimatorSettings:
     patch_px: int = 11
     keyframe_overlap: float = 0.9
     wide_search: bool = False
+    noisy_images: bool = True
 
     def __post_init__(self) -> None:
         for name, low, high in (

@@ -253,7 +253,7 @@ def _navigator(
         return
     setup = EstimatorSetup(rig, start.world_from_camera, noise)
     with (
-        StereoVision(rig, settings, folder, stopwatch=timer) as vision,
+        StereoVision(rig, settings, folder, stopwatch=timer, noise=noise) as vision,
         PluginNavigator(estimator, setup, settings, vision, timer, ESTIMATOR_OPTION) as navigator,
     ):
         yield navigator
@@ -482,7 +482,7 @@ def _unused(frames: RecordedFrames) -> list[str]:
 
 def _notes(opened: OpenedDataset, options: ReplayOptions, result: SurveyResult) -> tuple[str, ...]:
     """Returns the notes of the reader and the readings, and sentences on a plug-in and on readings that do not fit."""
-    notes = list(opened.dataset.notes)
+    notes = [*opened.dataset.notes, *result.quality.repeat_notes]
     if options.estimator is not None:
         notes.append(NOTE.format(options.estimator))
     if opened.aiding is not None:

@@ -36,6 +36,7 @@ from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate import disparity_offset
+from twin.estimate.length_scale import length_scales
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
@@ -47,6 +48,7 @@ from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.trajectory import interpolate_between_keyframes
 from twin.estimate.viewing_plane import viewing_plane
 from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.repeated_images import REPEATS, RIGHT_REPEATS
 from twin.estimate.vision_interface import Vision
 
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
@@ -99,8 +101,8 @@ class Navigator:
         self.rig, self.settings = rig, settings or EstimatorSettings()
         self.stopwatch = stopwatch or Stopwatch()
         self._resources = ExitStack()
-        self.vision = vision or self._image_vision(folder)
         noise = readings_noise or SensorNoise()
+        self.vision = vision or self._image_vision(folder, noise)
         self.dvl = DvlIntegrator(rig, noise)
         self.f2f_pose = (_DEFAULT_START if start is None else start).copy()
         self._f2f_at_pair = self.f2f_pose.copy()
@@ -151,12 +153,15 @@ class Navigator:
         """
         interval_s = self._interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
-        self.log.n_lost += status != "ok"
+        self.log.n_lost += status not in ("ok", RIGHT_REPEATS)
         aiding = readings_as_arrays(frame.readings)
         state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
         self.filter.fuse_vertical(frame.readings)
-        if self._is_keyframe(frame, status):
+        if status in REPEATS:
+            self.log.repeats.setdefault(status, []).append(len(self.log))
+            self.filter.fuse_position_fixes(frame.readings)
+        elif self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
         self.log.append(frame.time_s, f2f, online)
@@ -329,8 +334,10 @@ class Navigator:
         nodes = self.network.nodes
         poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
         n_views = disparity_offset.mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
+        across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
             frames_lost=self.log.n_lost,
+            repeats=self.log.repeats,
             nodes_bridged=history.nodes_bridged,
             links_tried=len(residuals),
             links_failed=int(failed.sum()),
@@ -343,6 +350,8 @@ class Navigator:
                 history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px
             ),
             independent_errors=history.independent_errors,
+            length_scale=across,
+            depth_scale=along,
         )
 
     @property
@@ -361,14 +370,15 @@ class Navigator:
         self.since_node = self.since_node._replace(motion=state.since_node, cov=state.since_node_cov)
         self.filter.world_from_camera, self.filter.cov = state.online, state.cov
 
-    def _image_vision(self, folder: Path | None) -> StereoVision:
+    def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
         """Returns a source of visual measurements from images, which stores them in `folder`.
 
         If `folder` is None, a temporary folder is created. `close` closes the source and removes the temporary folder.
         """
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
-        return self._resources.enter_context(StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch))
+        vision = StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch, noise=noise)
+        return self._resources.enter_context(vision)
 
     def _interval_s(self, time_s: float) -> float:
         """Returns the time since the last frame [s].

@@ -11,10 +11,12 @@ class PoseLog:
 
     Attributes:
         n_lost: number of frames whose motion was not measured but predicted.
+        repeats: rows of the frames at which a camera was frozen, by status (`vision.repeated_images`).
     """
 
     def __init__(self) -> None:
         self.n_lost = 0
+        self.repeats: dict[str, list[int]] = {}
         self._times_s, self._f2f, self._online = GrowingArray(), GrowingArray(4, 4), GrowingArray(4, 4)
 
     def __len__(self) -> int:

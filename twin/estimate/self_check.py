@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.quality import Finding
+from twin.core.quality import EstimationQuality, Finding
 from twin.core.records import ElevationMap, StereoRig, SurveyResult
 
 MAX_FRAMES_LOST = 0.02  # fraction of the frames
@@ -24,6 +24,7 @@ MAX_ROW_OFFSET_PX = 0.1  # median row difference that remains after the correcti
 MAX_ROW_PATTERN_PX = 0.1  # systematic row difference that pitch, yaw, roll and a row offset do not explain, RMS
 MAX_YAW_PX = 0.08  # disparity error that the estimated yaw of the right camera would cause
 MAX_DISPARITY_OFFSET_PX = 0.08  # offset of all disparities, estimated from the motions between keyframes
+MAX_SCALE_ERROR = 0.01  # relative difference of lengths from the images and from navigation sensors
 MAX_REPETITION = 0.6  # highest autocorrelation of the image outside the central peak
 MIN_POINTS = 60  # matched points of a stereo pair, 10th percentile
 MAX_SIGMA_DEPTHS = 0.02  # standard deviation of a position / depth of the floor
@@ -94,6 +95,10 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
     if lost > MAX_FRAMES_LOST:
         text = f"the motion of {quality.frames_lost} of {len(result.online)} frames was predicted, not measured"
         yield Finding("frames_lost", lost, MAX_FRAMES_LOST, text)
+    for status, rows in quality.repeats.items():
+        if len(rows) > MAX_FRAMES_LOST * len(result.online):
+            text = f"{status} in {len(rows)} of {len(result.online)} frames"
+            yield Finding("frames_repeated", len(rows) / len(result.online), MAX_FRAMES_LOST, text)
     if quality.nodes_bridged:
         text = f"{quality.nodes_bridged} keyframes could not be linked to the keyframe before them"
         yield Finding("nodes_bridged", quality.nodes_bridged, 0, text)
@@ -164,6 +169,7 @@ def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
             " a principal point or the yaw of a camera is not as calibrated"
         )
         yield from _disparity_error("disparity_offset", offset.estimate, MAX_DISPARITY_OFFSET_PX, survey, text)
+    yield from _scale(quality)
     if quality.link_chi2 is not None and quality.link_chi2 > MAX_LINK_CHI2:
         text = f"the motions between keyframes contradict each other (chi-square {quality.link_chi2:.1f}, 1 expected)"
         yield Finding("link_chi2", quality.link_chi2, MAX_LINK_CHI2, text)
@@ -181,6 +187,18 @@ def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
         if not share <= MAX_SIGMA_DEPTHS:
             text = f"the standard deviation of a keyframe position reaches {sigma_m * 100:.1f} cm"
             yield Finding("sigma", share, MAX_SIGMA_DEPTHS, text)
+
+
+def _scale(quality: EstimationQuality) -> Iterator[Finding]:
+    """Yields findings for lengths from the images that differ from those of the navigation sensors."""
+    for check, scale, which, cause in (
+        ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),
+        ("depth_scale", quality.depth_scale, " along the optical axis", "the baseline or the focal length"),
+    ):
+        if scale is not None and abs(scale.estimate - 1) > max(MAX_SCALE_ERROR, _SIGNIFICANT * scale.sigma):
+            ratio = f"{scale.estimate:.3f} +- {scale.sigma:.3f} times those of {scale.sensors}"
+            text = f"the lengths{which} from the images are {ratio}: {cause} is not as calibrated"
+            yield Finding(check, abs(scale.estimate - 1), MAX_SCALE_ERROR, text)
 
 
 def _median(values: Iterator[float | None]) -> float | None:

@@ -14,7 +14,16 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
-from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
+from twin.core.records import (
+    ElevationMap,
+    Frame,
+    Image,
+    MapGrid,
+    SensorNoise,
+    StereoObservation,
+    StereoRig,
+    SurveyResult,
+)
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
@@ -27,6 +36,7 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.light_pattern import LightPattern, light_pattern, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
+from twin.estimate.vision.repeated_images import LEFT_REPEATS, RepeatedImages
 from twin.estimate.vision.repetition import repetition
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
@@ -63,6 +73,7 @@ class StereoVision:
         cell_m: cell size of the mosaic for images of full size [m]; for binned images it is multiplied by the binning.
             By default, it is the ground sample distance of the first keyframe at full size.
         stopwatch: function that returns a context manager which times the stage of a given name.
+        noise: noise of the navigation sensors, which tell a frozen camera from a vehicle at rest (`RepeatedImages`).
     """
 
     runs_in_background = True  # matching takes long enough to justify a separate thread
@@ -74,7 +85,9 @@ class StereoVision:
         folder: Path,
         cell_m: float | None = None,
         stopwatch: StageTimer | None = None,
+        noise: SensorNoise | None = None,
     ):
+        self.repeats = RepeatedImages(settings.noisy_images, noise or SensorNoise())
         self.full_rig, self.settings, self.stopwatch = rig.with_square_pixels(), settings, stopwatch or Stopwatch()
         self._row_scale, self._size_px = rig.fx_px / rig.fy_px, (rig.width_px, rig.height_px)
         self._cell_m, self._folder = cell_m, folder
@@ -152,7 +165,10 @@ class StereoVision:
         check_image_sizes(frame, self._size_px)
         with self.stopwatch("f2f"):
             self._set_image(self._square(frame.left))
-            return self.f2f.step(self._image, self._interval_s(frame.time_s))
+            interval_s = self._interval_s(frame.time_s)
+            frozen = self.repeats.status(frame, self.f2f.filter.velocity, interval_s or 1 / self.rig.frame_rate_hz)
+            motion, status = self.f2f.step(self._image, interval_s, frozen if frozen == LEFT_REPEATS else "")
+            return motion, status if frozen == "ok" else frozen
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None

@@ -22,7 +22,8 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     imply (both are fractions of the focal length). sigma_max_m is the largest 3-D standard deviation (square root of
     the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D standard deviation of the position
     of a keyframe relative to the previous keyframe, by frame-to-frame motion alone: the 90th percentile over the
-    keyframes [m].
+    keyframes [m]. length_scale and depth_scale are the lengths from the images across and along the optical axis,
+    divided by those of DVL, USBL and pressure; None where these do not determine them.
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
@@ -30,6 +31,7 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     repeated = [pair.repetition for pair in pairs if pair.repetition is not None]
     epipolar = quality.epipolar
     pitch, yaw, roll = (None,) * 3 if epipolar is None else np.rad2deg(epipolar.estimate[:3]).tolist()
+    across, along = quality.length_scale, quality.depth_scale
     variances = np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2)
     return {
         "frames_lost": quality.frames_lost / len(result.online) if len(result.online) else None,
@@ -48,4 +50,8 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
         "disparity_offset": None if quality.disparity_offset is None else quality.disparity_offset.estimate,
         "sigma_max_m": float(np.sqrt(variances.max())) if len(variances) else None,
         "frame_sigma_m": quality.frame_sigma_m,
+        "length_scale": None if across is None else across.estimate,
+        "length_scale_sigma": None if across is None else across.sigma,
+        "depth_scale": None if along is None else along.estimate,
+        "depth_scale_sigma": None if along is None else along.sigma,
     }

@@ -59,6 +59,7 @@ class PluginNavigator(Navigator):
         self._plugin = GuardedPlugin(key, ESTIMATORS, name, METHODS, setup)
         self._images, self._pose, self._cov = vision, setup.start.copy(), np.zeros((6, 6))
         self._node_covs: list[Array] = []
+        self._twist = np.zeros(6)  # velocity at the last frame
         self._finishes = True
 
     def update(self, frame: Frame, track: int = 1) -> Estimate:
@@ -78,19 +79,23 @@ class PluginNavigator(Navigator):
             found = self._plugin.call("update", frame)
             cov = self._plugin.call("covariance")
         last, status = self._pose, "ok" if found is not None else _NO_POSE
+        frozen = self._images.repeats.status(frame, self._twist, interval_s)
         if found is not None:
             self._pose = self._plugin.poses("update", found, (4, 4))
         self._cov = np.zeros((6, 6)) if cov is None else self._plugin.covariance("covariance", cov)
         self.log.n_lost += found is None
         self.f2f_pose = self.filter.world_from_camera = self._pose  # by which keyframes are chosen
-        keyframe = self._stereo_keyframe(frame, track)
+        if frozen != "ok":
+            self.log.repeats.setdefault(frozen, []).append(len(self.log))
+        keyframe = self._stereo_keyframe(frame, track) if frozen == "ok" else None
         if keyframe is not None:
             self.network.add(keyframe)
             self._node_covs.append(self._cov)
         moved = geometry.inverse(last) @ self._pose if len(self.log) else np.eye(4)
         self.log.append(frame.time_s, self._pose, self._pose)
-        velocity, sigma_m = geometry.log(moved) / interval_s, float(np.sqrt(np.trace(self._cov[3:, 3:])))
-        return Estimate(frame.time_s, self._pose.copy(), self._pose.copy(), velocity, sigma_m, status)
+        self._twist, sigma_m = geometry.log(moved) / interval_s, float(np.sqrt(np.trace(self._cov[3:, 3:])))
+        status = status if frozen == "ok" else frozen
+        return Estimate(frame.time_s, self._pose.copy(), self._pose.copy(), self._twist, sigma_m, status)
 
     def align_track(self, track: int) -> None:
         """Does nothing: the plug-in corrects its poses itself."""

@@ -30,6 +30,7 @@ from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of the default size of a texel [m]
 SEA_WATER_INDEX = 1.339  #: refractive index of sea water in visible light
 PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry point
+_VISIBLE_NOISE = 1e-4  # noise that changes an 8-bit image, a fraction of full scale
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
 
@@ -1007,7 +1008,9 @@ class Scenario(Section):
 
     def estimator_settings(self) -> EstimatorSettings:
         """Returns the settings of the estimators."""
-        return EstimatorSettings(**self.estimate.model_dump(exclude={"plugin"}))
+        noise = self.imaging.noise_sd, self.imaging.shot_noise
+        settings = self.estimate.model_dump(exclude={"plugin"})
+        return EstimatorSettings(**settings, noisy_images=self.sensor is not None or max(noise) >= _VISIBLE_NOISE)
 
     def fingerprint(self) -> str:
         """Returns a hash of all values, 16 hexadecimal digits; of files, only the paths are hashed.

@@ -61,7 +61,8 @@ def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> Stere
     """Returns the source of visual measurements from images; it uses the believed calibration, not the true one."""
     cell_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
     settings = mission.scenario.estimator_settings()
-    return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch)
+    noise = mission.scenario.believed_noise()
+    return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch, noise)
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:

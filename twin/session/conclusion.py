@@ -94,7 +94,8 @@ def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> 
         result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
         [
             *plugin_notes(scenario), *mission.terrain.hole_notes, *world.warnings,
-            *calibration_notes(result, mission.rig), *filter(None, [actions.sentence]),
+            *calibration_notes(result, mission.rig), *result.quality.repeat_notes,
+            *filter(None, [actions.sentence]),
         ],
         idealisations(scenario), actions, None if orthomosaic is None else orthomosaic.metrics,
     )  # fmt: skip

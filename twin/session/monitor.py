@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from twin.core.records import Estimate, Frame
 from twin.errors import SurveyAborted
+from twin.estimate.vision.repeated_images import REPEATS
 from twin.report.run_writer import RunFolder
 from twin.session.mission_actions import Action, MissionActions
 from twin.world.mission import Mission
@@ -85,7 +86,8 @@ class SurveyMonitor:
         share = min((frame.index + 1) / self.n_frames, 1.0)  # a slowed survey has more frames than planned
         self.progress(SurveyProgress(estimate.time_s, self.wall_s, share, estimate.sigma_m, "survey"))
         if sum(self._measured) < _MIN_MEASURED * len(self._measured):
-            raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s in water {self.water}: {estimate.status}")
+            where = "" if estimate.status in REPEATS else f" in water {self.water}"
+            raise SurveyAborted(f"vision lost at {estimate.time_s:.1f} s{where}: {estimate.status}")
         if self.actions.times.held_s > _MAX_HELD_S:
             raise SurveyAborted(f"the vehicle was stopped for {_MAX_HELD_S:g} s in total because vision was lost")
         if estimate.sigma_m > self.max_sigma_m:

@@ -17,6 +17,7 @@ from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
+from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches_floor
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.thrusters import (
@@ -44,6 +45,8 @@ class RigidBodyState(NamedTuple):
         hull: hull of the vehicle.
         current: (3,) velocity of the steady current in the world [m/s].
         timestep_s: physics timestep.
+        floor: floor that the hull must not touch.
+        left: (1,) number of timesteps that were not simulated since the hull touched the floor; -1 if it did not.
     """
 
     pose: Array
@@ -54,6 +57,8 @@ class RigidBodyState(NamedTuple):
     hull: Hull
     current: Array
     timestep_s: float
+    floor: FloorField
+    left: NDArray[np.int64]
 
 
 class CompiledVehicle:
@@ -64,13 +69,22 @@ class CompiledVehicle:
         current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
         timestep_s: physics timestep.
+        floor: floor that the hull must not touch.
     """
 
-    def __init__(self, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array, timestep_s: float):
+    def __init__(
+        self,
+        vehicle: VehicleConfig,
+        current_mps: Array,
+        world_from_body: Array,
+        timestep_s: float,
+        floor: FloorField = OPEN_WATER,
+    ):
         thrusters = LaggedThrusters(BLUEROV2_HEAVY, timestep_s).state
         self.state = RigidBodyState(
             np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
             trimmed_hull(vehicle), np.array(current_mps, float), timestep_s,
+            floor, np.full(1, -1),
         )  # fmt: skip
         self._time_s = 0.0
 
@@ -88,20 +102,22 @@ class CompiledVehicle:
         """Simulates `duration_s`, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
 
         Raises:
-            SurveyAborted: the physics diverged.
+            SurveyAborted: the physics diverged, or the hull touches the floor.
             ValueError: the duration is not a whole number of timesteps.
         """
         advance(self.state, thruster_u, whole_timesteps(duration_s, self.state.timestep_s))
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
-        """Advances the clock and checks the state for divergence; to be called after `advance`.
+        """Advances the clock and checks the state (`has_ended`); to be called after `advance`.
 
         Raises:
-            SurveyAborted: the physics diverged.
+            SurveyAborted: the physics diverged, or the hull touches the floor.
         """
         self._time_s += duration_s
-        if has_diverged(self.state):
+        if (left := int(self.state.left[0])) >= 0:
+            raise contact_error("the floor", self._time_s - left * self.state.timestep_s, self.state.pose)
+        if has_ended(self.state):
             raise SurveyAborted(f"the physics diverged at {self._time_s:.3f} s")
 
 
@@ -113,21 +129,25 @@ def body_twist(body):
 
 
 @kernel
-def has_diverged(body):
-    """Returns whether a component of the velocity is NaN or its magnitude reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS.
+def has_ended(body):
+    """Returns whether the hull touches the floor, or the physics diverged.
 
+    It diverged if a component of the velocity is NaN or its magnitude reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS.
     SPEED_LIMIT_MPS applies to the linear components, RATE_LIMIT_RADPS to the angular ones.
     """
     speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
-    return not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
+    return body.left[0] >= 0 or not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
 
 
 @kernel
 def advance(body, command, n_steps):
-    """Advances the state in place by `n_steps` timesteps under thruster commands (8,), clipped to [-1, 1]."""
+    """Advances the state in place by `n_steps` timesteps under thruster commands (8,), clipped to [-1, 1].
+
+    It stops early if the hull touches the floor.
+    """
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
     set_thruster_command(thrusters, command)
-    for _ in range(n_steps):
+    for n in range(n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
         wrench = thruster_wrench(thrusters)
         geometry.copy_into(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench))
@@ -139,3 +159,6 @@ def advance(body, command, n_steps):
             next_pose[i, 3] += body.timestep_s * velocity[i]
         geometry.copy_into(pose, next_pose)
         step_thrusters(thrusters)
+        if touches_floor(body.floor, pose):
+            body.left[0] = n_steps - 1 - n
+            return

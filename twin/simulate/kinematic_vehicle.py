@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import SurveyAborted
+from twin.simulate.contact import contact_error
 from twin.simulate.inertial_sensor import inertial_quantities
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ class KinematicVehicle:
         inertial: true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]. The angular rate is zero. The
             acceleration is the change of velocity at the start of the last step, divided by the duration of the step.
         after_timestep: function called with `inertial` after each step; None: none is called.
+        touched: as in `MujocoVehicle`; called after each step.
     """
 
     def __init__(self, world_from_body: Array):
@@ -34,6 +36,7 @@ class KinematicVehicle:
         self._velocity = np.zeros(3)
         self.inertial = inertial_quantities(world_from_body[:3, :3], np.zeros(3), np.zeros(3))
         self.after_timestep: Callable[[Array], None] | None = None
+        self.touched: Callable[[Array], str] = lambda _: ""
 
     @property
     def twist_body(self) -> Array:
@@ -44,7 +47,7 @@ class KinematicVehicle:
         """Moves the vehicle for a duration at the horizontal part of a velocity command (3,) in world axes [m/s].
 
         Raises:
-            SurveyAborted: the command is not finite.
+            SurveyAborted: the command is not finite, or the hull touches an obstacle.
         """
         if not np.isfinite(command).all():
             raise SurveyAborted(f"the commanded velocity is not finite at {self.time_s:.3f} s")
@@ -58,3 +61,5 @@ class KinematicVehicle:
         self.inertial = inertial_quantities(pose[:3, :3], np.zeros(3), acceleration)
         if self.after_timestep is not None:
             self.after_timestep(self.inertial)
+        if obstacle := self.touched(pose):
+            raise contact_error(obstacle, self.time_s, pose)

@@ -13,6 +13,7 @@ from scenes.gl import MjModel, mujoco
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
+from twin.simulate.contact import contact_error
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.inertial_sensor import inertial_quantities
@@ -36,6 +37,8 @@ class MujocoVehicle:
 
     Attributes:
         after_timestep: function called with `inertial` after each timestep; None: none is called.
+        touched: function that returns which obstacle the hull touches at a pose world_from_body, "" for none; called
+            after each timestep.
     """
 
     def __init__(self, model: MjModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
@@ -54,6 +57,7 @@ class MujocoVehicle:
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
         mujoco.mj_step1(self._model, self._data)
         self.after_timestep: Callable[[Array], None] | None = None
+        self.touched: Callable[[Array], str] = lambda _: ""
 
     @property
     def time_s(self) -> float:
@@ -90,7 +94,7 @@ class MujocoVehicle:
         """Simulates `duration_s`, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
 
         Raises:
-            SurveyAborted: the physics diverged.
+            SurveyAborted: the physics diverged, or the hull touches an obstacle.
             ValueError: the duration is not a whole number of timesteps.
         """
         n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
@@ -100,6 +104,8 @@ class MujocoVehicle:
             self._thrusters.step()
             if self.after_timestep is not None:
                 self.after_timestep(self.inertial)
+            if obstacle := self.touched(self.world_from_body):
+                raise contact_error(obstacle, self.time_s, self.world_from_body)
         self._history.append(self._snapshot())
 
     def _advance(self, wrench: Array) -> None:

@@ -8,7 +8,7 @@ from twin.core import geometry
 from twin.estimate.navigation.dead_reckoning import dead_reckon
 from twin.estimate.pipeline import Navigator
 from twin.kernels import kernel
-from twin.simulate.compiled_vehicle import CompiledVehicle, advance, body_twist, has_diverged
+from twin.simulate.compiled_vehicle import CompiledVehicle, advance, body_twist, has_ended
 from twin.simulate.hull import whole_timesteps
 from twin.simulate.sensors import read_per_frame_sensors
 from twin.surrogate.sampling import sample_f2f_motion
@@ -26,8 +26,8 @@ def compiled_loop(
     The function performs the same operations with the same random numbers as the loop in `survey.fly`, so the results
     are equal. It returns the index of the next frame to simulate: that of the next keyframe, or the number of frames if
     the sequence has no further keyframe. If F2F has no points to track, it simulates no frames and returns the given
-    index. If the physics diverges, it records the frames up to the one after which this was detected, and raises
-    SurveyAborted.
+    index. If the physics diverges or the hull touches the floor, it records the frames up to the one after which this
+    was detected, and raises SurveyAborted.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
@@ -62,7 +62,7 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
     """Runs the closed loop over n frames.
 
     Returns:
-        Number of simulated frames (the last one is that after which the vehicle's state diverged, if it did),
+        Number of simulated frames (the last one is that after which the flight ended, `has_ended`),
         dead-reckoning state after the last frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated
         from F2F alone, and online estimates; only the simulated frames are set.
     """
@@ -85,6 +85,6 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
         twist = geometry.log(motion) * (1 / interval_s)  # bit-identical to `Navigator.update`
         command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)
-        if has_diverged(body):
+        if has_ended(body):
             return k + 1, state, true, f2f, online
     return n, state, true, f2f, online

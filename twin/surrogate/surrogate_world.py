@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -31,6 +32,7 @@ from twin.surrogate.measured_view import measured_view
 from twin.surrogate.vision import SurrogateVision, TrueScene
 from twin.world.coverage import true_heights
 from twin.world.mission import Mission, Step
+from twin.world.obstacles import Obstacles, floor_of
 from twin.world.pilot import PilotOfEstimates, RovPilot
 from twin.world.world import CameraImages, FastForward, World, left_camera, streams
 
@@ -58,11 +60,13 @@ class SurrogateWorld(World):
         vehicle = (
             CompiledVehicle(
                 scenario.vehicle, np.array(scenario.current.velocity_mps), mission.start_of_body,
-                physics_timestep_s(rig.frame_rate_hz),
+                physics_timestep_s(rig.frame_rate_hz), floor_of(mission),
             )
             if scenario.vehicle.dynamics == "rigid"
             else KinematicVehicle(mission.start_of_body)
         )  # fmt: skip
+        if isinstance(vehicle, KinematicVehicle):
+            vehicle.touched = Obstacles(replace(mission, objects=())).touched
         super().__init__(
             mission,
             stopwatch,

@@ -21,6 +21,7 @@ from twin.simulate.sensors import NavigationSensors
 from twin.world.coverage import Coverage, true_heights
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, Step, motion_rate_hz
+from twin.world.obstacles import Obstacles
 from twin.world.top_surface import top_surface
 from twin.world.world import CameraImages, TrueSurface, World, streams
 
@@ -45,6 +46,7 @@ class RenderedWorld(World):
             if scenario.vehicle.dynamics == "rigid"
             else KinematicVehicle(mission.start_of_body)
         )
+        vehicle.touched = Obstacles(mission).touched
         noise, believed = scenario.believed_noise(), mission.rig
         imu = None
         if scenario.imu is not None:

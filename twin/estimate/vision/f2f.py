@@ -110,12 +110,15 @@ class FrameToFrame:
         self._reference_cov = np.zeros((6, 6))
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
-    def step(self, image: matching.Image, interval_s: float | None = None) -> tuple[two_view_motion.Motion, str]:
+    def step(
+        self, image: matching.Image, interval_s: float | None = None, unusable: str = ""
+    ) -> tuple[two_view_motion.Motion, str]:
         """Estimates the motion from the last frame to this one.
 
         Args:
             image: (height, width) normalised frame.
             interval_s: time since the last frame [s]; by default that of the frame rate.
+            unusable: reason why the frame must not be matched; "" if it may be.
 
         Returns:
             The motion, and "ok" or the reason for a failure; at the first frame, the identity and "ok". As covariance
@@ -127,8 +130,9 @@ class FrameToFrame:
             return two_view_motion.Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         last_from_reference = geometry.inverse(self.filter.pose)
         self.filter.predict(1 / self.rig.frame_rate_hz if interval_s is None else interval_s)
-        located = None if self.reference is None else self._locate(image, self.reference, self.filter.pose)
-        status = self._fuse(located)
+        reference = None if unusable else self.reference
+        located = None if reference is None else self._locate(image, reference, self.filter.pose)
+        status = unusable or self._fuse(located)
         motion = last_from_reference @ self.filter.pose
         if status != "ok":
             self._common_cov = geometry.transport_covariance(self._common_cov, motion)

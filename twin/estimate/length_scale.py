@@ -1,0 +1,150 @@
+"""Scale of the lengths that the images give, compared with those of DVL, USBL and pressure.
+
+A relative error e of the baseline multiplies all lengths by 1 + e, one of the focal length only those along the optical
+axis: depth and motion towards the floor. The image shows motion across the axis in units of the baseline at any focal
+length. Two scales are therefore estimated: across the optical axis and along it. Sensors fix the second one only where
+the camera moves along its axis; over a path at constant height an error of the focal length is not observable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.links import Link, Links
+from twin.core.quality import LengthScale
+from twin.core.records import SensorNoise, StereoRig
+from twin.estimate.navigation.dvl import body_displacement
+from twin.estimate.vision.keyframes import Keyframe
+
+_MOST_SIGMA = 0.1  # a scale with a larger standard deviation is not observed
+_SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together
+
+
+class _Fit(NamedTuple):
+    """Factors (2,) by which lengths across and along the optical axis agree with a sensor, and covariance (2, 2)."""
+
+    factors: Array
+    cov: Array
+
+
+def length_scales(
+    nodes: Sequence[Keyframe], links: Links, rig: StereoRig, noise: SensorNoise
+) -> tuple[LengthScale | None, LengthScale | None]:
+    """Returns the scales of the lengths from the images across and along the optical axis; None where not observed.
+
+    Args:
+        nodes: the nodes with their readings.
+        links: measured motions between these nodes; those between consecutive nodes are used.
+        rig: believed calibration.
+        noise: believed noise of the readings.
+    """
+    number = np.array([node.number for node in nodes])
+    at_i, at_j = np.searchsorted(number, links.i), np.searchsorted(number, links.j)
+    consecutive = links.select((links.n_points > 0) & (at_j == at_i + 1))
+    measured = {link.j: link for link in consecutive}
+    steps = [measured.get(node.number) for node in nodes[1:]]
+    fits = {name: fit for name, fit in _fits(nodes, steps, rig, noise) if fit is not None}
+    if not fits:
+        return None, None
+    cov = np.linalg.inv(np.sum([np.linalg.inv(fit.cov) for fit in fits.values()], axis=0))
+    factors = cov @ np.sum([np.linalg.solve(fit.cov, fit.factors) for fit in fits.values()], axis=0)
+    return _scale(0, factors, cov, fits), _scale(1, factors, cov, fits)
+
+
+def _scale(k: int, factors: Array, cov: Array, fits: dict[str, _Fit]) -> LengthScale | None:
+    """Returns the scale k (0 across, 1 along the axis); None if its standard deviation exceeds `_MOST_SIGMA`."""
+    estimate, sigma = 1 / factors[k], cov[k, k] ** 0.5 / factors[k] ** 2
+    sensors = [name for name, fit in fits.items() if fit.cov[k, k] < _SHARE**2 * cov[k, k]]
+    return LengthScale(float(estimate), float(sigma), " and ".join(sensors)) if sigma < _MOST_SIGMA else None
+
+
+def _fits(
+    nodes: Sequence[Keyframe], steps: Sequence[Link | None], rig: StereoRig, noise: SensorNoise
+) -> Iterator[tuple[str, _Fit | None]]:
+    """Yields the name and the fit of each sensor that knows lengths."""
+    dvl = _dvl(nodes, steps, rig)
+    yield "DVL", None if dvl is None else dvl._replace(cov=dvl.cov + noise.dvl_scale**2)
+    across, along = _paths(nodes, steps)
+    position = np.array([np.full(3, np.nan) if n.readings.usbl_m is None else n.readings.usbl_m for n in nodes])
+    yield "USBL", _absolute(position.reshape(-1, 3), across, along, noise.usbl_m)
+    height = np.full((len(nodes), 3), np.nan)
+    height[:, 2] = [np.nan if n.readings.pressure_z_m is None else n.readings.pressure_z_m for n in nodes]
+    yield "pressure", _absolute(height, across, along, noise.pressure_m)
+
+
+def _dvl(nodes: Sequence[Keyframe], steps: Sequence[Link | None], rig: StereoRig) -> _Fit | None:
+    """Returns the fit to the DVL's displacements between consecutive nodes, in the axes of the earlier camera.
+
+    A small rotation between the axes of DVL and camera is estimated with the factors.
+    """
+    to_camera, rows = rig.body_from_camera[:3, :3].T, []
+    for node, step in zip(nodes[1:], steps, strict=True):
+        if step is None or node.dvl_displacement is None:
+            continue
+        turned, moved = step.i_from_j.copy(), step.i_from_j[:3, 3]
+        turned[:3, 3] = 0.0
+        lever_m = body_displacement(turned, rig.body_from_camera)[0]
+        cov = step.i_from_j[:3, :3] @ step.cov[3:, 3:] @ step.i_from_j[:3, :3].T
+        cov = cov + to_camera @ node.dvl_displacement.cov @ to_camera.T
+        measured = to_camera @ (node.dvl_displacement.displacement_m - lever_m)
+        rows += [(measured[k], _split(moved)[k], geometry.skew(moved)[k], cov[k, k]) for k in range(3)]
+    return _fit(*(np.array(part) for part in zip(*rows, strict=True))) if rows else None
+
+
+def _split(moved: Array) -> Array:
+    """Returns the parts (3, 2) of a motion (3,) in camera axes across and along the optical axis."""
+    return np.array([[moved[0], 0.0], [moved[1], 0.0], [0.0, moved[2]]])
+
+
+def _paths(nodes: Sequence[Keyframe], steps: Sequence[Link | None]) -> tuple[Array, Array]:
+    """Returns the sums (n, 3) of the motions across and along the optical axis by the images alone, in world axes.
+
+    The motion between two nodes without a link is that of their estimated poses.
+    """
+    parts, rotation = [np.zeros((3, 2))], nodes[0].world_from_camera[:3, :3] if nodes else np.eye(3)
+    for a, b, step in zip(nodes[:-1], nodes[1:], steps, strict=True):
+        motion = geometry.inverse(a.world_from_camera) @ b.world_from_camera if step is None else step.i_from_j
+        parts.append(rotation @ _split(motion[:3, 3]))
+        rotation = rotation @ motion[:3, :3]
+    across, along = np.cumsum(parts, axis=0).transpose(2, 0, 1)
+    return across, along
+
+
+def _absolute(measured: Array, across: Array, along: Array, sigma_m: float) -> _Fit | None:
+    """Returns the fit to positions (n, 3) with NaN where unknown; their origin and a small rotation are estimated."""
+    known = np.isfinite(measured)
+    turn = np.array([geometry.skew(p) for p in across + along]).reshape(-1, 3, 3)
+    nuisance = np.concatenate([turn, np.tile(np.eye(3), (len(turn), 1, 1))], axis=2)
+    lengths = np.stack([across, along], axis=2)
+    return _fit(measured[known], lengths[known], nuisance[known], np.full(known.sum(), max(sigma_m, 1e-6) ** 2))
+
+
+def _fit(measured: Array, lengths: Array, nuisance: Array, variance: Array) -> _Fit | None:
+    """Returns the least-squares factors (2,) in measured = lengths @ factors + nuisance @ unknowns; None for few rows.
+
+    The covariance is that of the noise, multiplied by the chi-square per degree of freedom if that exceeds 1. Errors of
+    `lengths` reduce the factors by at most the ratio of the variance of the residuals to that of the lengths, which is
+    added as a standard deviation. A weak prior (1 +- 1) makes factors finite that the readings do not determine.
+
+    Args:
+        measured, variance: (m,) measured lengths and their variances.
+        lengths, nuisance: (m, 2), (m, n).
+    """
+    freedom = len(measured) - nuisance.shape[-1] - 2
+    if freedom < 1:
+        return None
+    weight = 1 / np.sqrt(variance)
+    given = np.column_stack([(measured - lengths.sum(axis=1)), lengths]) * weight[:, None]
+    unknown = nuisance * weight[:, None]
+    given = given - unknown @ np.linalg.lstsq(unknown, given, rcond=None)[0]
+    difference, weighted = given[:, 0], given[:, 1:]
+    cov = np.linalg.inv(weighted.T @ weighted + np.eye(2))
+    correction = cov @ weighted.T @ difference
+    residual2 = float(((difference - weighted @ correction) ** 2).sum())
+    attenuation = residual2 / np.maximum((weighted**2).sum(axis=0), 1e-12)
+    return _Fit(1 + correction, max(residual2 / freedom, 1.0) * cov + np.diag(attenuation**2))

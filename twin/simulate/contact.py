@@ -1,0 +1,126 @@
+"""Contact of the vehicle's hull, a box, with the floor and with meshes; it ends a survey."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+
+from scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.core.geometry import Array
+from twin.errors import SurveyAborted
+from twin.kernels import kernel
+
+HALF_M, CENTRE_M = BLUEROV2_HEAVY.size_m / 2, BLUEROV2_HEAVY.hull_centre_m  # of the box, in the axes of the body
+_REACH_M = float(np.linalg.norm(HALF_M))
+
+
+class FloorField(NamedTuple):
+    """Floor with which the hull may come into contact.
+
+    Args:
+        height_m: (ny, nx) heights of the nodes; row 0 = south. Cells are split from node (r, c) to (r + 1, c + 1).
+        spacing_m: distance between neighbouring nodes.
+        west_m, south_m: position of node (0, 0).
+        highest_m: greatest height within the reach of a hull whose centre lies in a block of n x n cells.
+        block_m: side of a block.
+    """
+
+    height_m: NDArray[np.float32]
+    spacing_m: float
+    west_m: float
+    south_m: float
+    highest_m: NDArray[np.float32]
+    block_m: float
+
+
+def floor_field(height_m: NDArray[np.float32], spacing_m: float, west_m: float, south_m: float) -> FloorField:
+    """Returns the floor of a height grid; see `FloorField`."""
+    n = int(np.ceil(_REACH_M / spacing_m)) + 1
+    padding = [(0, -size % n) for size in height_m.shape]
+    padded = np.pad(height_m, padding, constant_values=-np.inf)
+    blocks = padded.reshape(padded.shape[0] // n, n, padded.shape[1] // n, n).max(axis=(1, 3))
+    highest_m = np.asarray(maximum_filter(blocks, 3, mode="nearest"), np.float32)
+    return FloorField(np.ascontiguousarray(height_m, np.float32), spacing_m, west_m, south_m, highest_m, n * spacing_m)
+
+
+OPEN_WATER = floor_field(np.full((2, 2), -np.inf, np.float32), 1.0, 0.0, 0.0)
+
+
+def contact_error(obstacle: str, time_s: float, world_from_body: Array) -> SurveyAborted:
+    """Returns the error that ends a survey by contact of the hull with an obstacle."""
+    x, y, z = world_from_body[:3, 3]
+    return SurveyAborted(f"contact of the hull with {obstacle} at {time_s:.2f} s, x {x:.2f}, y {y:.2f}, z {z:.2f} m")
+
+
+@kernel
+def touches_floor(floor, pose):
+    """Returns whether the hull at a pose world_from_body (4, 4) meets the floor or lies below it."""
+    centre, reach = pose[:3, 3].copy(), np.zeros(3)
+    for i in range(3):
+        for k in range(3):
+            centre[i] += pose[i, k] * CENTRE_M[k]
+            reach[i] += abs(pose[i, k]) * HALF_M[k]
+    low, x, y = centre[2] - reach[2], centre[0] - floor.west_m, centre[1] - floor.south_m
+    block_row, block_col = int(np.floor(y / floor.block_m)), int(np.floor(x / floor.block_m))
+    rows, cols = floor.highest_m.shape
+    if not (0 <= block_row < rows and 0 <= block_col < cols) or low > floor.highest_m[block_row, block_col]:
+        return False
+    corners, z = np.empty((4, 3)), floor.height_m
+    ny, nx = z.shape
+    for r in range(
+        max(int((y - reach[1]) / floor.spacing_m), 0), min(int((y + reach[1]) / floor.spacing_m) + 1, ny - 1)
+    ):
+        for c in range(
+            max(int((x - reach[0]) / floor.spacing_m), 0), min(int((x + reach[0]) / floor.spacing_m) + 1, nx - 1)
+        ):
+            if max(z[r, c], z[r, c + 1], z[r + 1, c], z[r + 1, c + 1]) < low:
+                continue
+            if r == int(y / floor.spacing_m) and c == int(x / floor.spacing_m) and z[r, c] > centre[2]:
+                return True
+            for n, (i, j) in enumerate(((0, 0), (0, 1), (1, 1), (1, 0))):  # into the axes of the box
+                p, q = (c + j) * floor.spacing_m - x, (r + i) * floor.spacing_m - y
+                for k in range(3):
+                    corners[n, k] = pose[0, k] * p + pose[1, k] * q + pose[2, k] * (z[r + i, c + j] - centre[2])
+            if _meets(corners[0], corners[1], corners[2]) or _meets(corners[0], corners[2], corners[3]):
+                return True
+    return False
+
+
+@kernel
+def touches_mesh(vertices, faces):
+    """Returns whether the hull meets a triangle of `faces` (m, 3) with `vertices` (n, 3) in axes of the box [m]."""
+    for f in range(len(faces)):
+        if _meets(vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]):
+            return True
+    return False
+
+
+@kernel
+def _meets(a, b, c):
+    """Returns whether the box meets a triangle (separating axes: Akenine-Moller 2001, Fast 3D triangle-box overlap)."""
+    for k in range(3):
+        if min(a[k], b[k], c[k]) > HALF_M[k] or max(a[k], b[k], c[k]) < -HALF_M[k]:
+            return False
+    u, v = b - a, c - b
+    if _apart(np.cross(u, v), a, b, c):
+        return False
+    for edge in (u, v, a - c):
+        for k in range(3):
+            axis = np.zeros(3)
+            axis[(k + 1) % 3], axis[(k + 2) % 3] = -edge[(k + 2) % 3], edge[(k + 1) % 3]
+            if _apart(axis, a, b, c):
+                return False
+    return True
+
+
+@kernel
+def _apart(axis, a, b, c):
+    """Returns whether the projections of the box and of a triangle on an axis are apart."""
+    p, q, r, reach = 0.0, 0.0, 0.0, 0.0
+    for k in range(3):
+        p, q, r = p + axis[k] * a[k], q + axis[k] * b[k], r + axis[k] * c[k]
+        reach += abs(axis[k]) * HALF_M[k]
+    return min(p, q, r) > reach or max(p, q, r) < -reach
