@@ -54,14 +54,15 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
 
     Args:
         scenario: the survey, from `load_scenario`.
-        out: run folder to write.
+        out: run folder to write, new or empty.
 
     Returns:
         Status, metrics and run folder of the survey.
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
-        TwinError: the run folder, or metrics.json at the end, cannot be written, or the world cannot be created.
+        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
+            world cannot be created.
     """
     from twin import survey
 
@@ -73,15 +74,15 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
 
     Args:
         dataset: folder or ROS 2 bag of the data set.
-        out: run folder to write.
+        out: run folder to write, new or empty.
         options: calibration, truth, alignment and settings (`twin.datasets.replay.ReplayOptions`).
 
     Returns:
         Status, metrics and run folder of the replay, the trajectories and the map.
 
     Raises:
-        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder cannot be
-            written.
+        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder is not
+            empty, is written by another process, or cannot be written.
     """
     from twin.datasets import replay as recorded
 
