@@ -393,7 +393,7 @@ def test_an_interrupted_export_leaves_no_data_set(recorded_run, tmp_path, error)
     with pytest.raises(error):
         export(recorded_run, ["kitti"], tmp_path / "out", progress=fail)
     assert not (tmp_path / "out").exists()
-    (tmp_path / "out" / ".kitti.partial").mkdir()  # as an export that was killed leaves it
+    (tmp_path / "out" / ".kitti.partial").mkdir(parents=True)  # as an export that was killed leaves it
     written = export(recorded_run, ["kitti"], tmp_path / "out")
     assert [path.is_dir() for path in written["kitti"]] == [True]
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["kitti"]
