@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +13,6 @@ if TYPE_CHECKING:
     from twin.session.stepped_world import SteppedWorld as World
 
 __all__ = ["World", "load_scenario", "replay", "run"]
-
-# OpenBLAS reads this variable when numpy is imported. Multithreading slows down operations on small matrices: with two
-# threads, the final alignment of 25 tracks takes more than twice as long.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def __getattr__(name: str) -> Any:

@@ -10,6 +10,7 @@ refused, missing system library or failed check of the machine; 130 interrupted 
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -217,6 +218,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics
 def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
     console.accept_any_text()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `one_blas_thread`; read when numpy is imported, after this
     with sigterm_as_interrupt():
         try:
             app()

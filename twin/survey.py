@@ -8,6 +8,7 @@ from pathlib import Path
 from twin.core.interrupts import StageGuard
 from twin.core.output_folder import sole_writer
 from twin.core.records import Estimate, Frame
+from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
@@ -55,7 +56,7 @@ def run(
         TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
             world cannot be created.
     """
-    with sole_writer(out):
+    with sole_writer(out), one_blas_thread():
         return _run(prepare(scenario), out, progress, live, outputs)
 
 

@@ -19,6 +19,7 @@ from twin.core.output_folder import sole_writer
 from twin.core.paths import is_file
 from twin.core.records import ElevationMap, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
+from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch, timing_summary
 from twin.datasets.aiding import Aiding, Opening, Start
 from twin.datasets.bag import is_bag
@@ -162,7 +163,7 @@ def replay(
         TwinError: the data set, one of its files or the estimator cannot be used (nothing was written), or the run
             folder is not empty, is written by another process, or cannot be written.
     """
-    with sole_writer(out):
+    with sole_writer(out), one_blas_thread():
         return _replay(folder, out, options or ReplayOptions(), progress)
 
 
