@@ -16,6 +16,7 @@ from twin.errors import TwinError
 
 LOCK_FILE = ".lock"  #: is in a folder while this is written, and names the process
 _HELD = (errno.EACCES, errno.EAGAIN, errno.EDEADLK)  # of an attempt to lock what another process has locked
+_FREE = "another folder, or without its file .lock if that process has ended"
 _LOCKED_BYTE = 1 << 20  # on Windows, which lets no other process read a locked byte
 NEW_FOLDER = "a new or an empty folder"
 
@@ -86,7 +87,7 @@ def _locked(folder: Path, option: str) -> int:
         try:
             if not _lock(lock):
                 owner = os.read(lock, 200).decode(errors="replace") or "another process"
-                raise TwinError(option, f"{folder} is being written by {owner}", "another folder")
+                raise TwinError(option, f"{folder} is being written by {owner}", _FREE)
             if file.exists() and os.path.samestat(os.fstat(lock), file.stat()):  # else its last owner removed it
                 started = time.strftime("%Y-%m-%d %H:%M:%S")
                 os.write(lock, f"process {os.getpid()} on {platform.node()} since {started}".encode())
