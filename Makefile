@@ -11,9 +11,11 @@ $(READY): pyproject.toml constraints.txt .ci/system-packages
 	PYTHON="$(PYTHON)" .ci/system-packages
 	[ -x $(BIN)/python ] || "$(PYTHON)" -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'
+	-$(BIN)/python -m twin.warm_up
 	touch $@
 
-demo: env ## a small complete survey
+demo: env ## a small complete survey; compiles the kernels first where the sources have changed
+	-$(BIN)/python -m twin.warm_up
 	$(BIN)/twin demo
 
 test: env ## style, types and the fast tests

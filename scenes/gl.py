@@ -1,6 +1,6 @@
 """MuJoCo, configured for offscreen rendering. All modules import it from here: ``from scenes.gl import mujoco``.
 
-MuJoCo imports PyOpenGL, so the OpenGL backend must be chosen before MuJoCo is imported.
+MuJoCo imports PyOpenGL, so the OpenGL backend must be chosen before MuJoCo is imported. Both happen at the first use.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from functools import cache
 from typing import Any, TypeAlias
 
 from twin.errors import TwinError
@@ -36,11 +37,23 @@ def _configure_egl() -> str:
     return ""
 
 
-_egl_error = _configure_egl()
+@cache
+def _loaded() -> tuple[Any, str]:
+    """Returns the module of MuJoCo, imported after the configuration, and the result of `_configure_egl`."""
+    reason = _configure_egl()
+    import mujoco
 
-import mujoco as _mujoco  # noqa: E402
+    return mujoco, reason
 
-mujoco: Any = _mujoco  #: Any: type checkers cannot read the compiled modules of MuJoCo
+
+class _MuJoCo:
+    """The module of MuJoCo, which is imported when its first attribute is used."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_loaded()[0], name)
+
+
+mujoco: Any = _MuJoCo()  #: Any: type checkers cannot read the compiled modules of MuJoCo
 #: Type aliases for signatures: compiled model, model specification, body of a specification, renderable scene.
 MjModel: TypeAlias = Any
 MjSpec: TypeAlias = Any
@@ -54,8 +67,8 @@ def offscreen_context(width_px: int, height_px: int) -> Any:
     Raises:
         TwinError: OpenGL is missing; the message contains the command that installs it.
     """
-    if _egl_error:
-        raise _opengl_missing(_egl_error)
+    if reason := _loaded()[1]:
+        raise _opengl_missing(reason)
     try:
         if os.environ.get("MUJOCO_GL", "").strip().lower() == "egl":
             from mujoco.egl import GLContext  # works even if mujoco was imported before this module

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one test runs on each core
 OUTSIDE_DATA = Path(os.environ.get("TWIN_DATA", "../shared/data"))
 _SKIPPED_WITHOUT = "needs outside data"
 #: Modules that take longest, in the order in which they start: before the short modules, so that the workers end at the

@@ -254,3 +254,18 @@ def test_set_up_installs_the_packages_that_the_doctor_names():
 def test_constraints_contain_only_exact_versions():
     lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert lines and all(len(line.split("==")) == 2 and not set(line) & set(" @/:") for line in lines)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("start", [("-m", "twin"), ("-P", "-c", "from twin.cli import main; main()")])
+def test_packages_of_the_current_folder_do_not_hide_those_of_the_program(tmp_path, start):
+    """`doctor` also starts a process of its own."""
+    for name in ("controllers", "scenes", "terrains"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise SystemExit('a package of the current folder')")
+    command = [sys.executable, *start]
+    variables = os.environ | {"PYTHONPATH": str(ROOT)}
+    for words, printed in (["plan", "nowhere"], "no such scenario"), (["doctor"], "opengl"):
+        done = subprocess.run([*command, *words], cwd=tmp_path, env=variables, capture_output=True, text=True)
+        assert printed in (done.stdout + done.stderr).lower() and "current folder" not in done.stderr
+        assert done.returncode == (0 if words == ["doctor"] else 2)

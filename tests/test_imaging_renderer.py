@@ -212,7 +212,7 @@ def test_linear_depth_inverts_the_projection() -> None:
 def test_missing_opengl_is_reported_with_the_package_to_install(
     monkeypatch: pytest.MonkeyPatch, world: SceneModel
 ) -> None:
-    monkeypatch.setattr(scenes.gl, "_egl_error", "ImportError: no libEGL.so.1")
+    monkeypatch.setattr(scenes.gl, "_loaded", lambda: (sys.modules["mujoco"], "ImportError: no libEGL.so.1"))
     with pytest.raises(TwinError, match=r"no libEGL.*apt-get install -y libegl1"):
         Renderer(world, W, H, VFOV)
 

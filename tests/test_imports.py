@@ -2,6 +2,7 @@
 
 import ast
 import functools
+import os
 import re
 import subprocess
 import sys
@@ -179,6 +180,23 @@ def test_the_estimators_load_neither_simulator_nor_scenario():
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     forbidden = ("mujoco", "OpenGL", "pydantic", "scenes", "terrains", "controllers", "twin.world", "twin.scenario")
     assert [name for name in loaded if any(within(name, package) for package in forbidden)] == []
+
+
+SETTINGS = ("MUJOCO_GL", "PYOPENGL_PLATFORM", "OPENBLAS_NUM_THREADS")
+
+
+def test_an_import_changes_no_setting_of_the_process():
+    """Also where there is no module `resource` (Windows)."""
+    code = f"""
+import os, sys
+sys.modules["resource"] = None
+import scenes.builder, twin.estimate, twin.imaging.renderer
+assert "mujoco" not in sys.modules and "OpenGL" not in sys.modules
+assert not os.environ.keys() & {set(SETTINGS)}
+"""
+    variables = {key: value for key, value in os.environ.items() if key not in SETTINGS}
+    done = subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_rerun_is_imported_by_one_module():

@@ -147,9 +147,16 @@ def test_write_errors_are_reported(study, tmp_path, monkeypatch):
 
 def test_a_folder_of_another_study_is_rejected(study, tmp_path):
     run_study(study, tmp_path / "out")
-    with pytest.raises(TwinError, match="--out: .* exists and is not empty"):
+    with pytest.raises(TwinError, match="--out: .* is not empty .*--resume"):
         run_study(study, tmp_path / "out")
     other = study_of(tmp_path, STUDY, ("[1.0, 40.0]", "[1.0, 50.0]"))
+    with pytest.raises(TwinError, match="--resume: .* contains the results of another study"):
+        run_study(other, tmp_path / "out", resume=True)
+
+
+def test_a_folder_with_results_of_other_seeds_only_is_rejected(study, tmp_path):
+    run_study(study, tmp_path / "out")
+    other = study_of(tmp_path, STUDY, ("samples = 12", "samples = 8\nseed = 500"))
     with pytest.raises(TwinError, match="--resume: .* contains the results of another study"):
         run_study(other, tmp_path / "out", resume=True)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,10 +13,6 @@ if TYPE_CHECKING:
     from twin.session.stepped_world import SteppedWorld as World
 
 __all__ = ["World", "load_scenario", "replay", "run"]
-
-# OpenBLAS reads this variable when numpy is imported. Multithreading slows down operations on small matrices: with two
-# threads, the final alignment of 25 tracks takes more than twice as long.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
 def __getattr__(name: str) -> Any:
@@ -56,14 +51,15 @@ def run(scenario: Scenario, out: str | Path) -> RunResult:
 
     Args:
         scenario: the survey, from `load_scenario`.
-        out: run folder to write.
+        out: run folder to write, new or empty.
 
     Returns:
         Status, metrics and run folder of the survey.
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
-        TwinError: the run folder, or metrics.json at the end, cannot be written, or the world cannot be created.
+        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
+            world cannot be created.
     """
     from twin import survey
 
@@ -75,15 +71,15 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
 
     Args:
         dataset: folder or ROS 2 bag of the data set.
-        out: run folder to write.
+        out: run folder to write, new or empty.
         options: calibration, truth, alignment and settings (`twin.datasets.replay.ReplayOptions`).
 
     Returns:
         Status, metrics and run folder of the replay, the trajectories and the map.
 
     Raises:
-        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder cannot be
-            written.
+        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder is not
+            empty, is written by another process, or cannot be written.
     """
     from twin.datasets import replay as recorded
 

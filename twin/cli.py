@@ -10,6 +10,7 @@ refused, missing system library or failed check of the machine; 130 interrupted 
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -18,6 +19,7 @@ import typer
 
 from twin.app import console, outputs
 from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
+from twin.core.output_folder import sole_writer
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
@@ -221,6 +223,7 @@ def main() -> None:
     """Runs the command line; a TwinError is printed on stderr and ends the program with exit status 2."""
     console.accept_any_text()
     console.hide_log_failures()
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as `one_blas_thread`; read when numpy is imported, after this
     with sigterm_as_interrupt():
         try:
             app()
@@ -327,7 +330,7 @@ def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: Summary
 
     outputs.output_file(out / "turbidity.png")
     _require_rendering()
-    with outputs.writing(out):
+    with sole_writer(out, used=True), outputs.writing(out):
         summary = experiment.write(experiment.render_levels(), out)
     if as_json:
         print(json.dumps(summary, indent=1))
@@ -352,7 +355,7 @@ def light(
     selection = comparison.QUICK if quick else comparison.ALL
     found = list(comparison.cells(selection, walks, phase))
     under_sun = list(daylight.daylight_cells(daylight.QUICK_DAYLIGHT if quick else daylight.ALL_DAYLIGHT, walks))
-    with outputs.writing(out):
+    with sole_writer(out, used=True), outputs.writing(out):
         summary = comparison.write(found, out) | {"daylight": daylight.write_daylight(under_sun, out)}
     if as_json:
         print(json.dumps(summary, indent=1))
@@ -368,7 +371,7 @@ def _reproduce(name: str, out: Path, quick: bool, as_json: bool) -> None:
 
     outputs.output_file(out / f"{name}.json")
     _require_rendering()
-    with outputs.writing(out):
+    with sole_writer(out, used=True), outputs.writing(out):
         exhibit = EXPERIMENTS[name](out, quick)
     if as_json:
         print(json.dumps(exhibit.as_dict(), indent=1))
@@ -417,7 +420,7 @@ def all_experiments(out: TurbidityOutOption = Path("runs/reproduce"), quick: Qui
 
     outputs.output_file(out / catalogue.PAGE_FILE)
     _require_rendering()
-    with outputs.writing(out):
+    with sole_writer(out, used=True), outputs.writing(out):
         catalogue.run_all(out, quick, report=console.print_error)
     print(f"Page: {out / catalogue.PAGE_FILE}")
 
@@ -671,10 +674,10 @@ def _run_survey(
     from twin.scenario.file import load_scenario
 
     scenario = load_scenario(scene, overrides, allow_plugins)
-    folder = _new_folder(scenario, out)
     _require_rendering()
     from twin import survey  # imported here because it needs OpenGL
 
+    folder = _new_folder(scenario, out)  # last, because two surveys that begin at once must find different folders
     with console.progress_bar() as progress:
         return survey.run(scenario, folder, progress, live)
 

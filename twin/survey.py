@@ -6,7 +6,9 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from twin.core.interrupts import StageGuard
+from twin.core.output_folder import sole_writer
 from twin.core.records import Estimate, Frame
+from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
@@ -39,7 +41,7 @@ def run(
 
     Args:
         scenario: description of the survey.
-        out: run folder.
+        out: run folder, new or empty.
         progress: function called with the progress during the later stages and after every frame, except frames between
             keyframes that the compiled loop of a surrogate survey simulates.
         live: whether to show the survey in Rerun while it runs.
@@ -51,9 +53,22 @@ def run(
 
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
-        TwinError: the run folder, or metrics.json at the end, cannot be written, or the world cannot be created.
+        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
+            world cannot be created.
     """
-    mission = prepare(scenario)
+    with sole_writer(out), one_blas_thread():
+        return _run(prepare(scenario), out, progress, live, outputs)
+
+
+def _run(
+    mission: Mission,
+    out: Path,
+    progress: Callable[[SurveyProgress], None],
+    live: bool,
+    outputs: Collection[str] | None,
+) -> RunResult:
+    """Runs a survey as `run` does, in a folder that this process has locked."""
+    scenario = mission.scenario
     stopwatch, guard = Stopwatch(), StageGuard()
     with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
         if (share := mission.terrain.orthophoto_share) is not None and share < 1.0:

@@ -57,7 +57,7 @@ def check_machine(folder: Path) -> list[Check]:
 def check_rendering() -> Check:
     """Returns the result of rendering an image with OpenGL, without a display, in a separate process."""
     try:
-        command = [sys.executable, "-m", "twin.app.doctor"]
+        command = [sys.executable, "-P", "-m", "twin.app.doctor"]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_LIMIT_S, check=False)
     except subprocess.TimeoutExpired:
         return Check("OpenGL", False, f"rendering did not finish within {_PROBE_LIMIT_S} s", _gl_remedy())

@@ -18,6 +18,7 @@ from twin.app.camera_models import believed_calibration, true_calibration
 from twin.app.outputs import new_folder
 from twin.app.recorded_frames import missing_files, recorded_frames, recorded_imu
 from twin.core.georeference import Georeference
+from twin.core.output_folder import sole_writer
 from twin.core.records import ElevationMap, Image
 from twin.errors import TwinError
 from twin.exchange import geotiff
@@ -82,10 +83,11 @@ def export(
         check_needs(name, contents)
         new_folder(out / name)
     written = {}
-    for name in chosen:
-        with _completed(out / name) as unfinished:
-            files = FORMATS[name].write(replace(contents, progress=partial(progress, name)), unfinished)
-        written[name] = [out / name / file.relative_to(unfinished) for file in files]
+    with sole_writer(out, used=True):
+        for name in chosen:
+            with _completed(out / name) as unfinished:
+                files = FORMATS[name].write(replace(contents, progress=partial(progress, name)), unfinished)
+            written[name] = [out / name / file.relative_to(unfinished) for file in files]
     for note in contents.notes:
         warn(note)
     return written

@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.progress import track
 
 from twin.app import console
+from twin.core.output_folder import sole_writer
 from twin.study.local_engine import default_jobs
 from twin.study.study_file import load_study
 from twin.study.surveys import surveys
@@ -45,7 +46,8 @@ def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) ->
     ]
     os.environ.update(SINGLE_THREADED)  # of the new processes
     found = all_statistics(rendered, compared, jobs or default_jobs())
-    statistics = list(track(found, "Rendered surveys", total=len(rendered)))
+    with sole_writer(runs, "--runs", used=True):
+        statistics = list(track(found, "Rendered surveys", total=len(rendered)))
     fitted = fit_to_surveys(statistics, compared)
     error_model_file.save(fitted, out)
     rows: list[tuple[str, ...]] = [(name, f"{value:.1%}") for name, value in fitted.misfit.items()]

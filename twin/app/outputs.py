@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from twin.core.paths import path_problem, resolved
+from twin.core.output_folder import check_folder, check_path
+from twin.core.paths import resolved
 from twin.errors import TwinError
 
 #: Largest number of bytes of the name of a scenario or study that a file name contains.
@@ -16,11 +17,7 @@ _STEM_BYTES = 100
 
 def new_folder(folder: Path, option: str = "--out") -> Path:
     """Returns the folder. Raises TwinError unless the folder is new or empty and can be written."""
-    _check_path(folder, option, "a new or an empty folder")
-    if folder.exists() and not folder.is_dir():
-        raise TwinError(option, f"{folder} is not a folder", "a new or an empty folder")
-    if folder.exists() and not is_empty(folder):
-        raise TwinError(option, f"{folder} is not empty", "a new or an empty folder")
+    check_folder(folder, option)
     _check_writable(folder, option)
     return folder
 
@@ -36,7 +33,7 @@ def unused_folder(first: Path) -> Path:
 
 def output_file(file: Path, option: str = "--out") -> Path:
     """Returns `file`. Raises TwinError if the path is invalid or not that of a file, or the folder is not writable."""
-    _check_path(file, option, "the path of a file")
+    check_path(file, option, "the path of a file")
     if file.exists() and not file.is_file():
         raise TwinError(option, f"{file} is not a file", "the path of a file")
     _check_writable(file, option)
@@ -75,13 +72,6 @@ def path_stem(path: Path) -> str:
 def is_empty(folder: Path) -> bool:
     """Returns whether a path is an empty folder."""
     return folder.is_dir() and not any(folder.iterdir())
-
-
-def _check_path(path: Path, option: str, allowed: str) -> None:
-    """Raises TwinError if the file system rejects a path (see `path_problem`); the path need not exist."""
-    if problem := path_problem(path):
-        shown = str(path) if len(str(path)) <= 200 else f"{str(path)[:100]}..."
-        raise TwinError(option, f"{ascii(shown)}: {problem}", allowed)
 
 
 def _check_writable(path: Path, option: str) -> None:

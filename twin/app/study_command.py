@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from twin.app import console
 from twin.app.outputs import file_stem, output_file
+from twin.core.output_folder import sole_writer
 from twin.errors import TwinError
 from twin.study import agreement, agreement_report, rendered_check, summary, tuning, tuning_report, wording
 from twin.study.candidates import tuning_config
@@ -128,7 +129,8 @@ def tune(file: str, options: StudyOptions) -> int:
     folder = _folder(options, "tune", study)
     with options.engine() as engine, study_progress(options.live) as progress:
         result = tuning.tune(study, folder, options.resume, engine, progress)
-    tuning_report.write_tuning_report(study, config, result, folder)
+    with sole_writer(folder, used=True):
+        tuning_report.write_tuning_report(study, config, result, folder)
     if options.as_json:
         print(json.dumps(tuning_report.summary(study, config, result), indent=1))
     else:

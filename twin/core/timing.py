@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import resource
+import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Generator
@@ -41,13 +41,25 @@ class Stopwatch:
 
 
 def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
-    """Returns wall time and simulated or recorded time [s], peak memory [MiB], and the durations of the stages."""
+    """Returns wall time and simulated or recorded time [s], peak memory [MiB], and the durations of the stages.
+
+    The peak memory is None on Windows.
+    """
     return {
         "wall_s": wall_s,
         "simulated_s": simulated_s,
-        "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_rss_mb": _peak_rss_mb(),
         "stages": stopwatch.summary(),
     }
+
+
+def _peak_rss_mb() -> float | None:
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    unit = 2**20 if sys.platform == "darwin" else 2**10  # of ru_maxrss
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
 
 
 def _summary(durations_s: list[float]) -> dict[str, float | int | None]:

@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
+from twin.core.output_folder import sole_writer
 from twin.core.paths import is_file, resolved
 from twin.core.records import ElevationMap, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
+from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch, timing_summary
 from twin.datasets.aiding import Aiding, Opening, Start
 from twin.datasets.bag import is_bag
@@ -154,15 +156,20 @@ def replay(
 
     Args:
         folder: folder of the data set, or a ROS 2 bag.
-        out: run folder to write.
+        out: run folder to write, new or empty.
         options: options of the replay.
         progress: called with the stage ("replay", "map" or "report") and its completed fraction.
 
     Raises:
         TwinError: the data set, one of its files or the estimator cannot be used (nothing was written), or the run
-            folder cannot be written.
+            folder is not empty, is written by another process, or cannot be written.
     """
-    chosen = options or ReplayOptions()
+    with sole_writer(out), one_blas_thread():
+        return _replay(folder, out, options or ReplayOptions(), progress)
+
+
+def _replay(folder: Path, out: Path, chosen: ReplayOptions, progress: Progress) -> ReplayResult:
+    """Replays a data set as `replay` does, into a folder that this process has locked."""
     check_loadable(ESTIMATOR_OPTION, ESTIMATORS, chosen.estimator)
     opened = open_dataset(folder, chosen)
     settings = replace(chosen.settings or EstimatorSettings(), window_tracks=_ALL_TRACKS, wide_search=True)

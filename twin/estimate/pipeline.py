@@ -33,6 +33,7 @@ from twin.core.records import (
     Trajectory,
 )
 from twin.core.settings import EstimatorSettings
+from twin.core.threads import one_blas_thread
 from twin.core.timing import StageTimer, Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate import disparity_offset
@@ -101,6 +102,7 @@ class Navigator:
         self.rig, self.settings = rig, settings or EstimatorSettings()
         self.stopwatch = stopwatch or Stopwatch()
         self._resources = ExitStack()
+        self._resources.enter_context(one_blas_thread())
         noise = readings_noise or SensorNoise()
         self.vision = vision or self._image_vision(folder, noise)
         self.dvl = DvlIntegrator(rig, noise)

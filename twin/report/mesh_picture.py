@@ -50,7 +50,7 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
         with tempfile.TemporaryDirectory() as folder:
             picture = Path(folder) / "surface.png"
             pose = json.dumps(np.eye(4).tolist() if map_from_world is None else map_from_world.tolist())
-            command = [sys.executable, "-m", __name__, str(mesh_file), str(picture), pose]
+            command = [sys.executable, "-P", "-m", __name__, str(mesh_file), str(picture), pose]
             subprocess.run(command, capture_output=True, timeout=LIMIT_S, check=True)
             return read_rgb(picture)
     except (OSError, subprocess.SubprocessError):

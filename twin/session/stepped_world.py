@@ -13,6 +13,7 @@ import numpy as np
 from controllers.segments import Reference
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame, Image, StereoRig, Truth
+from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
 from twin.estimate.pipeline import Navigator
 from twin.scenario.model import Scenario
@@ -77,6 +78,7 @@ class SteppedWorld:
             TwinError: the world cannot be created (`open_world`).
         """
         self.close()
+        self._open.enter_context(one_blas_thread())
         scenario = self._mission.scenario
         if seed is not None and seed != scenario.seed:
             self._mission = prepare(scenario.model_copy(update={"seed": seed}))

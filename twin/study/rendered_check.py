@@ -18,7 +18,7 @@ from twin.study.design import samples
 from twin.study.engine import Engine
 from twin.study.flight import Row, has_passed
 from twin.study.progress import StudyProgress
-from twin.study.runner import fly_surveys, open_folder
+from twin.study.runner import check_results, fly_surveys, open_folder
 from twin.study.statistics import Array, Interval, wilson_interval
 from twin.study.study_file import Study
 from twin.study.surveys import Survey, surveys
@@ -113,11 +113,12 @@ def check(
     others = {sample.number for sample in samples(study)} - {number for number, _ in keys}  # some may be refused
     found = (survey for survey in surveys(study, folder, without=others) if survey.key in keys)
     chosen = {survey.key: _rendered(survey, folder / FOLDER) for survey in found}
-    log = open_folder(folder / FOLDER, True, ((key, survey.scenario_hash) for key, survey in chosen.items()))
-    done = log.done()
-    progress.begin(progress.done + len(set(keys) - done))
-    completed = fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
-    log.flush()
+    with open_folder(folder / FOLDER, True) as log:
+        check_results(log, ((key, survey.scenario_hash) for key, survey in chosen.items()))
+        done = log.done()
+        progress.begin(progress.done + len(set(keys) - done))
+        completed = fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
+        log.flush()
     rows = {(row["sample"], row["seed"]): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
     results, n_lost = [rows[keys[k]] for k in flown], sum(key in rows for key in keys) - len(flown)

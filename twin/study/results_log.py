@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 
 from twin.study.flight import Row
 
+JOURNAL_FILE = "optuna.journal"  #: in the folder of a search, beside the log: its candidates
 _CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionaries would take gigabytes
 
 

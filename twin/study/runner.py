@@ -5,9 +5,11 @@ from __future__ import annotations
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
+from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
 from twin.errors import TwinError
 from twin.study.agreement_report import write_document
 from twin.study.analysis import StudyAnalysis
@@ -16,7 +18,7 @@ from twin.study.engine import Engine, Outcome
 from twin.study.flight import Row, fly, refused_row, row_of
 from twin.study.progress import StudyProgress
 from twin.study.report import write_report
-from twin.study.results_log import ResultsLog, write_parquet
+from twin.study.results_log import JOURNAL_FILE, ResultsLog, write_parquet
 from twin.study.study_file import Study
 from twin.study.surveys import Survey, refusals, survey_keys, surveys
 from twin.study.worker import TaskLimits
@@ -70,13 +72,29 @@ def run_study(
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
-        TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study;
-            or the engine lost its connection.
+        TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written,
+            or belongs to another study; or the engine lost its connection.
         ScenarioError: no sample has a valid scenario; nothing was flown.
     """
     refused = refusals(study)
-    log = open_folder(folder, resume, _identities(study, folder, refused))
+    with open_folder(folder, resume) as log:
+        return _run_study(study, folder, refused, log, engine, progress, function)
+
+
+def _run_study(
+    study: Study,
+    folder: Path,
+    refused: dict[int, str],
+    log: ResultsLog,
+    engine: Engine,
+    progress: StudyProgress,
+    function: Callable[[Survey], Row],
+) -> StudyResult:
+    """Runs a study as `run_study` does, with the log of its folder and the errors of its invalid samples."""
+    check_results(log, _identities(study, folder, refused))
     done, planned = log.done(), set(survey_keys(study))
+    if done and done.isdisjoint(planned):
+        raise _another_study(log)
     for row in _refused_rows(study, refused):
         if (row["sample"], row["seed"]) not in done:
             log.add(row)
@@ -130,33 +148,59 @@ def refusal_notice(refused: dict[int, str]) -> str:
     return f"{len(refused)} samples cannot be flown and are left out, e.g. sample {number}: {reason}"
 
 
-def open_folder(folder: Path, resume: bool, planned: Iterable[tuple[tuple[int, int], str]]) -> ResultsLog:
-    """Returns the results log of a new folder or, with `resume`, of the folder of an earlier run of the study.
+@contextmanager
+def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[ResultsLog]:
+    """Locks a new folder or, with `resume`, that of an earlier run, and yields its results log.
 
     Creates the folder if it does not exist, and deletes unfinished run folders.
 
     Args:
         folder: results folder.
         resume: whether the folder may contain results.
-        planned: ((sample, seed), scenario hash) of each survey of the study.
+        search: whether the results are those of a search, not of a study.
 
     Raises:
-        TwinError: the folder is not empty and `resume` is not set, cannot be written, or belongs to another study.
+        TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written, or
+            has other contents than results of this kind.
     """
-    if folder.exists() and not (folder.is_dir() and (resume or not any(folder.iterdir()))):
-        raise TwinError("--out", f"{folder} exists and is not empty", "a new or an empty folder, or --resume")
-    try:
-        (folder / "runs").mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder") from None
-    log = ResultsLog(folder)
+    with sole_writer(folder, used=resume, allowed=f"{NEW_FOLDER}, or --resume"):
+        log = ResultsLog(folder)
+        names = {path.name for path in folder.iterdir()} - {LOCK_FILE}
+        if names and not _is_results_folder(names, log, search):
+            kind = "search" if search else "study"
+            raise TwinError("--resume", f"{folder} is not the folder of a {kind}", f"the folder of this {kind}")
+        try:
+            log.file.touch()
+            (folder / "runs").mkdir(exist_ok=True)
+        except OSError as error:
+            raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder") from None
+        for leftover in (folder / "runs").glob(".*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        yield log
+
+
+def _is_results_folder(names: set[str], log: ResultsLog, search: bool) -> bool:
+    """Returns whether these are the files of a search, which has its journal before its first row, or of a study."""
+    has_journal = JOURNAL_FILE in names
+    return log.file.name in names and (has_journal == search or (search and not any(log.rows())))
+
+
+def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]]) -> None:
+    """Raises TwinError if the log has a row of another scenario.
+
+    Args:
+        log: results log.
+        planned: ((sample, seed), scenario hash) of each survey of the study.
+    """
     hashes = {(row["sample"], row["seed"]): row["scenario_hash"] for row in log.rows()}
     for key, scenario_hash in planned if hashes else ():
         if hashes.get(key, scenario_hash) != scenario_hash:
-            raise TwinError("--resume", f"{folder} contains the results of another study", "the folder of this study")
-    for leftover in (folder / "runs").glob(".*"):
-        shutil.rmtree(leftover, ignore_errors=True)
-    return log
+            raise _another_study(log)
+
+
+def _another_study(log: ResultsLog) -> TwinError:
+    problem = f"{log.file.parent} contains the results of another study"
+    return TwinError("--resume", problem, "the folder of this study")
 
 
 def fly_surveys(

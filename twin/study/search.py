@@ -17,6 +17,7 @@ from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 from twin.errors import TwinError
 from twin.judge.require import more_is_better
 from twin.study.distribution import Distribution
+from twin.study.results_log import JOURNAL_FILE
 from twin.study.study_file import Study, TuningConfig
 
 NAME = "twin"  #: name of the Optuna study of the first round in the journal
@@ -54,7 +55,7 @@ class Search:
         self.n_trials = further_trials(config) if search_round else config.trials
         self.space = {key: _optuna_distribution(distribution) for key, distribution in config.search.items()}
         self.optuna_study = optuna.create_study(
-            storage=JournalStorage(JournalFileBackend(str(folder / "optuna.journal"))),
+            storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL_FILE))),
             study_name=f"{NAME}-round-{search_round}" if search_round else NAME,
             directions=["maximize" if more_is_better(name) else "minimize" for name in config.objectives],
             load_if_exists=True,

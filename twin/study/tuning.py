@@ -120,23 +120,24 @@ def tune(
         function: flies one survey; must be importable by name on the workers.
 
     Raises:
-        TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, cannot be written,
-            or belongs to another search or scenario; or the engine lost its connection.
+        TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, is written by
+            another process, cannot be written, or belongs to another search or scenario; or the engine lost its
+            connection.
         ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
         OSError: the results cannot be written.
     """
     config = tuning_config(study)
     check_bounds(study, config)
-    log = open_folder(folder, resume, ())
-    tuning = Tuning(study, config, folder, TuningFlights(engine, progress, function, log))
-    interrupted = False
-    try:
-        tuning.run()
-    except KeyboardInterrupt:
-        interrupted = True
-    log.flush()
-    write_parquet(log.table(), folder / "results.parquet")
-    return tuning.result(interrupted)
+    with open_folder(folder, resume, search=True) as log:
+        tuning = Tuning(study, config, folder, TuningFlights(engine, progress, function, log))
+        interrupted = False
+        try:
+            tuning.run()
+        except KeyboardInterrupt:
+            interrupted = True
+        log.flush()
+        write_parquet(log.table(), folder / "results.parquet")
+        return tuning.result(interrupted)
 
 
 class Tuning:
