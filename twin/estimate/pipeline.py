@@ -153,13 +153,15 @@ class Navigator:
         motion, status = self.vision.track_frame(frame)
         self.log.n_lost += status != "ok"
         aiding = readings_as_arrays(frame.readings)
-        state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
+        last = self.dead_reckoning
+        state, moved, cov = dead_reckon(last, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
         self.filter.fuse_vertical(frame.readings)
+        step = moved if status == "ok" else geometry.inverse(last.online) @ self.filter.world_from_camera
         if self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
-        self.log.append(frame.time_s, f2f, online)
+        self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(cov))
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
@@ -195,8 +197,8 @@ class Navigator:
         aligned_cov = self.network.align_all()
         rows = np.array([k.row for k in keyframes], dtype=np.int64)
         final = log.online
-        if self.settings.use_ga:
-            final = interpolate_between_keyframes(log.f2f, rows, self.network.poses)
+        if self.settings.use_ga and len(rows):
+            final = interpolate_between_keyframes(log.steps, log.variances, rows, self.network.poses)
         return SurveyResult(
             f2f=Trajectory(log.times_s, log.f2f),
             online=Trajectory(log.times_s, log.online),

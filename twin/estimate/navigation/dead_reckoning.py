@@ -66,7 +66,7 @@ def dead_reckon(
     height_m: float,
     rpy_rad: Array,
     velocity_mps: Array,
-) -> tuple[DeadReckoningState, Array]:
+) -> tuple[DeadReckoningState, Array, Array]:
     """Advances dead reckoning by one frame.
 
     Args:
@@ -78,11 +78,11 @@ def dead_reckon(
         velocity_mps: (3,) velocity measured by the DVL, in body axes [m/s]; NaN if there is no reading.
 
     Returns:
-        The new state, and the motion (4, 4) of this frame after fusion with the DVL.
+        The new state, and the motion (4, 4) of this frame after fusion with the DVL, with its covariance (6, 6).
     """
     motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps)
     online, online_cov = predict(last.online, last.cov, motion, motion_cov)
     online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding.pressure_ahrs, height_m, rpy_rad)
     since_node, since_node_cov = predict(last.since_node, last.since_node_cov, motion, motion_cov)
     f2f = geometry.compose(last.f2f, a_from_b)
-    return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion
+    return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion, motion_cov
