@@ -464,7 +464,7 @@ def test_pressure_corrects_height_only_weighted_by_its_noise():
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([1.0, 2.0, 3.0]))
     believed = PoseFilter(pose, RIG, SensorNoise(0.01, 0.003, 0.01))
     believed.cov = np.diag([1e-8] * 3 + [1e-4] * 3)
-    after, _ = fuse_pressure_ahrs(pose, believed.cov, believed.pressure_ahrs, 3.02, np.full(3, np.nan))
+    after, _ = fuse_pressure_ahrs(pose, believed.cov, believed.pressure_ahrs, 3.02, np.full(3, np.nan), believed.gates)
     np.testing.assert_allclose(after[:3, 3], [1.0, 2.0, 3.01], atol=1e-6)  # equal variances: half way
 
 

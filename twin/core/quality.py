@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +62,10 @@ class EstimationQuality(NamedTuple):
             the offset is not observable.
         independent_errors: number of independent errors to which the correlated position errors of the keyframes are
             equivalent, by their joint covariance; None without a final alignment.
+        readings_rejected: number of readings of each navigation sensor that were not used, because they contradicted
+            the estimates.
+        readings_disputed: number of readings of each navigation sensor that contradicted the estimates but were used,
+            because many before them had done so in the same way.
     """
 
     frames_lost: int = 0
@@ -73,6 +79,8 @@ class EstimationQuality(NamedTuple):
     frame_sigma_m: float | None = None
     disparity_offset: DisparityOffset | None = None
     independent_errors: float | None = None
+    readings_rejected: Mapping[str, int] = MappingProxyType({})
+    readings_disputed: Mapping[str, int] = MappingProxyType({})
 
 
 class Finding(NamedTuple):

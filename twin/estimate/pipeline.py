@@ -40,7 +40,7 @@ from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_t
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator
-from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance
+from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, clip_covariance
 from twin.estimate.network import KeyframeNetwork
 from twin.estimate.pose_log import PoseLog
 from twin.estimate.stereo_vision import StereoVision
@@ -152,16 +152,17 @@ class Navigator:
         interval_s = self._interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
         self.log.n_lost += status != "ok"
-        aiding = readings_as_arrays(frame.readings)
+        aiding, rejected = readings_as_arrays(frame.readings), self.filter.rejected
         last = self.dead_reckoning
-        state, moved, cov = dead_reckon(last, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
+        state, moved = dead_reckon(last, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
         self.filter.fuse_vertical(frame.readings)
-        step = moved if status == "ok" else geometry.inverse(last.online) @ self.filter.world_from_camera
+        frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
+        step = motion.a_from_b if status == "ok" else geometry.inverse(last.online) @ self.filter.world_from_camera
         if self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
-        self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(cov))
+        self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
@@ -345,6 +346,8 @@ class Navigator:
                 history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px
             ),
             independent_errors=history.independent_errors,
+            readings_rejected=dict(zip(SENSORS, self.filter.gates.counts[:, 1].tolist(), strict=True)),
+            readings_disputed=dict(zip(SENSORS, self.filter.gates.counts[:, 2].tolist(), strict=True)),
         )
 
     @property
@@ -355,7 +358,7 @@ class Navigator:
 
     def aiding(self, interval_s: float) -> FrameAiding:
         """Returns the sensors' error models for the interval since the last frame [s], and the DVL state."""
-        return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
+        return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.filter.gates)
 
     def set_dead_reckoning(self, state: DeadReckoningState) -> None:
         """Replaces the F2F pose, the online pose and the motion since the last node by those of a given state."""
@@ -435,7 +438,9 @@ class Navigator:
         chain = self._follow_chain(keyframe) if is_node else None
         if chain is not None and status != "ok" and self.settings.wide_search:
             self.log.n_lost, status = self.log.n_lost - 1, "ok"  # the motion was measured after all
-        self.filter.fuse_position_fixes(frame.readings)  # after `_follow_chain`, to correct its error too
+        keyframe.readings = self.filter.fuse_position_fixes(
+            frame.readings
+        )  # after `_follow_chain`, to correct its error too
         with self.stopwatch("f2m"):
             self._register_with_mosaic(keyframe, chain)
             keyframe.world_from_camera = self.filter.world_from_camera

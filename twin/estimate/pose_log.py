@@ -38,9 +38,9 @@ class PoseLog:
 
     @property
     def steps(self) -> Array:
-        """Returns the twists (n, 6) from frame to frame: of vision and DVL, or of the online pose where vision failed.
+        """Returns the twists (n, 6) from frame to frame: those of vision, or of the online pose where vision failed.
 
-        The online pose also has the noise of pressure and AHRS, but where vision fails they determine it.
+        The online pose also has the noise of the navigation sensors, but where vision fails they determine it.
         """
         return self._steps.array
 

@@ -31,7 +31,7 @@ _SIGNIFICANT = 4.0  # standard deviations
 def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
     """Returns the findings of all checks; an empty list if every check passes.
 
-    The findings are in the order of tracking, stereo, rectification and consistency.
+    The findings are in the order of tracking, navigation sensors, stereo, rectification and consistency.
 
     Args:
         result: output of the estimators.
@@ -39,7 +39,13 @@ def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
     """
     return [
         finding
-        for findings in (_tracking(result), _stereo(result), _rectification(result, rig), _consistency(result, rig))
+        for findings in (
+            _tracking(result),
+            _readings(result),
+            _stereo(result),
+            _rectification(result, rig),
+            _consistency(result, rig),
+        )
         for finding in findings
     ]
 
@@ -58,6 +64,14 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
     if failed > MAX_LINKS_FAILED:
         text = f"{quality.links_failed} of {quality.links_tried} links between keyframes failed"
         yield Finding("links_failed", failed, MAX_LINKS_FAILED, text)
+
+
+def _readings(result: SurveyResult) -> Iterator[Finding]:
+    """Yields a finding for each navigation sensor that contradicted the estimates for long."""
+    for sensor, count in result.quality.readings_disputed.items():
+        if count:
+            text = f"{sensor} readings contradicted the estimates for long, and {count} were believed in the end"
+            yield Finding(f"readings_{sensor}", count, 0, text)
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:

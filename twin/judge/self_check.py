@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from twin.core.records import SurveyResult
 from twin.judge.summary_statistics import percentile
 
 
-def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
+def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     """Returns `self_check.*` of metrics.json; a value that was not measured is None.
 
     frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`).
@@ -22,7 +24,7 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     imply (both are fractions of the focal length). sigma_max_m is the largest 3-D standard deviation (square root of
     the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D standard deviation of the position
     of a keyframe relative to the previous keyframe, by frame-to-frame motion alone: the 90th percentile over the
-    keyframes [m].
+    keyframes [m]. readings_rejected and readings_disputed are numbers of readings of each navigation sensor.
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
@@ -48,4 +50,6 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
         "disparity_offset": None if quality.disparity_offset is None else quality.disparity_offset.estimate,
         "sigma_max_m": float(np.sqrt(variances.max())) if len(variances) else None,
         "frame_sigma_m": quality.frame_sigma_m,
+        "readings_rejected": dict(quality.readings_rejected),
+        "readings_disputed": dict(quality.readings_disputed),
     }

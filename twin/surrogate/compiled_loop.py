@@ -80,13 +80,13 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
         a_from_b = sample_f2f_motion(
             errors, last, true[k], vision_normals[k], last_normals if k == 0 else vision_normals[k - 1]
         )
-        state, motion, cov = dead_reckon(state, aiding, a_from_b, errors.cov, height, angles, velocity)
-        geometry.copy_into(steps[k], geometry.log(motion))
-        geometry.copy_into(variances[k], np.diag(cov))
+        state, motion = dead_reckon(state, aiding, a_from_b, errors.cov, height, angles, velocity)
+        geometry.copy_into(steps[k], geometry.log(a_from_b))
+        geometry.copy_into(variances[k], np.diag(errors.cov))
         geometry.copy_into(f2f[k], state.f2f)
         geometry.copy_into(online[k], state.online)
         last = true[k]
-        twist = steps[k] * (1 / interval_s)  # bit-identical to `Navigator.update`
+        twist = geometry.log(motion) * (1 / interval_s)  # bit-identical to `Navigator.update`
         command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)
         if has_diverged(body):
