@@ -4,6 +4,7 @@ The pipeline is tested without images, on scripted measurements.
 """
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,12 +13,13 @@ import seafloor_scene as scene
 from scipy.stats import chi2
 
 from twin.core import geometry
-from twin.core.links import Link
-from twin.core.records import Frame, Readings, SensorNoise
+from twin.core.links import Link, Links
+from twin.core.records import ElevationMap, Frame, Readings, SensorNoise
 from twin.core.settings import EstimatorSettings
 from twin.estimate import link_selection, stereo_vision
 from twin.estimate.navigation.pose_filter import PoseFilter, fuse_pressure_ahrs
 from twin.estimate.pipeline import Navigator
+from twin.estimate.self_check import check_survey
 from twin.estimate.trajectory import interpolate_between_keyframes
 from twin.estimate.vision import matching, stereo
 from twin.estimate.vision.f2f import FrameToFrame, constant_velocity_motion
@@ -26,6 +28,7 @@ from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.two_view_motion import Motion
+from twin.judge.self_check import self_check_metrics
 
 PATCH_PX = 11
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)
@@ -677,6 +680,40 @@ def test_frame_to_frame_motion_bridges_a_failed_link():
     missing = [node.dvl_displacement is None for node in navigator.network.nodes]
     assert missing == [True, False, False, True, False, False]
     assert result.quality.nodes_bridged == 1
+
+
+class Isolated(Script):
+    """No link of keyframe 3 can be measured; records the keyframes of the map."""
+
+    def measure_motions(self, node, others):
+        motions = super().measure_motions(node, others)
+        return [None if 3 in (node.number, k.number) else m for k, m in zip(others, motions, strict=True)]
+
+    def build_map(self, result, grid, step_cov, progress):
+        self.mapped, self.steps = result.keyframe_rows.tolist(), step_cov
+        shape = grid.rows, grid.cols
+        return ElevationMap(grid, np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3), np.uint8))
+
+
+def test_a_keyframe_without_a_measured_link_is_not_in_the_map():
+    camera = Isolated(line(0.1 * np.arange(6)))
+    navigator = navigated(camera, [1] * 6)
+    result = navigator.finish()
+    assert result.unlinked.tolist() == [False, False, False, True, False, False]
+    navigator.build_map(result)
+    assert camera.mapped == [0, 1, 2, 4, 5]
+    np.testing.assert_allclose(camera.steps[3], result.step_cov[3] + result.step_cov[4])
+    assert "keyframes_unlinked" in {finding.check for finding in check_survey(result, RIG)}
+    assert self_check_metrics(result)["keyframes_unlinked"] == 1
+    sigma_m = np.sqrt(np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2))
+    assert sigma_m[3] > max(sigma_m[2], sigma_m[4])  # it keeps its own covariance
+
+
+def test_keyframes_that_follow_an_unlinked_node_are_unlinked_too_and_none_is_where_no_link_exists():
+    camera = Isolated(line(0.1 * np.arange(9)))
+    result = navigated(camera, [1] * 9, node_stride=3).finish()
+    assert np.flatnonzero(result.unlinked).tolist() == [3, 4, 5]
+    assert not replace(result, links=Links()).unlinked.any()
 
 
 def test_the_quality_reports_the_uncertainty_of_frames_relative_to_their_keyframe():

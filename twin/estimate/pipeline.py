@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -223,7 +224,7 @@ class Navigator:
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None
     ) -> ElevationMap | None:
-        """Builds the elevation map along the final trajectory.
+        """Builds the elevation map along the final trajectory, from all keyframes but `SurveyResult.unlinked`.
 
         Heights are measured along z of the world if the optical axis of the first keyframe is within 45 degrees of
         straight down, otherwise along this axis, towards the camera (`ElevationMap.map_from_world`).
@@ -239,17 +240,17 @@ class Navigator:
         Raises:
             OSError: an image could not be read.
         """
-        n_keyframes = len(result.keyframe_rows)
-        if n_keyframes == 0:
+        if not len(result.keyframe_rows):
             return None
-        turned, map_from_world = _in_map(result)
-        cells = grid or footprint_grid(turned, self.rig)
+        linked = np.flatnonzero(~result.unlinked)
+        turned, map_from_world = _in_map(_of_keyframes(result, linked))
+        cells, n_keyframes = grid or footprint_grid(turned, self.rig), len(linked)
 
         def report(n_done: int) -> None:
             if progress is not None:
                 progress(n_done / n_keyframes)
 
-        found = self.vision.build_map(turned, cells, result.step_cov, report)
+        found = self.vision.build_map(turned, cells, steps_between(result.step_cov, linked), report)
         return replace(found, map_from_world=map_from_world)
 
     def build_tiles(
@@ -273,17 +274,13 @@ class Navigator:
         """
         if not len(result.keyframe_rows):
             return
-        turned, map_from_world = _in_map(result)
+        linked = np.flatnonzero(~result.unlinked)
+        turned, map_from_world = _in_map(_of_keyframes(result, linked))
         tiles = footprint_tiles(turned, self.rig)
         for k, tile in enumerate(tiles):
-            chosen = tile.keyframes
-            part = replace(
-                turned,
-                keyframe_rows=turned.keyframe_rows[chosen],
-                node_cov=turned.node_cov[chosen],
-                keyframe_depth_m=turned.keyframe_depth_m[chosen],
-            )
-            steps, larger = steps_between(result.step_cov, chosen), with_margin(tile.grid, _TILE_MARGIN)
+            part = _of_keyframes(turned, tile.keyframes)
+            steps = steps_between(result.step_cov, linked[tile.keyframes])
+            larger = with_margin(tile.grid, _TILE_MARGIN)
             found = self.vision.build_map(part, larger, steps, lambda _: None)
             inner = np.s_[_TILE_MARGIN:-_TILE_MARGIN, _TILE_MARGIN:-_TILE_MARGIN]
             layers = found.height_m[inner], found.sigma_m[inner], found.mosaic[inner]
@@ -310,6 +307,7 @@ class Navigator:
         Raises:
             OSError: an image could not be read. The iterator raises it too.
         """
+        result = _of_keyframes(result, np.flatnonzero(~result.unlinked))
         rows = result.keyframe_rows
         if len(rows) == 0 or self.vision.left_image(int(rows[0])) is None:
             return None
@@ -534,6 +532,16 @@ def _in_map(result: SurveyResult) -> tuple[SurveyResult, Array]:
     map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
     turned = Trajectory(final.times_s, map_from_world @ final.world_from_camera)
     return replace(result, final=turned), map_from_world
+
+
+def _of_keyframes(result: SurveyResult, chosen: NDArray[np.int64]) -> SurveyResult:
+    """Returns a result with the chosen keyframes only; its links keep the numbers of all keyframes."""
+    return replace(
+        result,
+        keyframe_rows=result.keyframe_rows[chosen],
+        node_cov=result.node_cov[chosen],
+        keyframe_depth_m=result.keyframe_depth_m[chosen],
+    )
 
 
 def finish_in_stage(navigator: Navigator, guard: StageGuard) -> SurveyResult:

@@ -51,7 +51,7 @@ def check_survey(result: SurveyResult, rig: StereoRig) -> list[Finding]:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields findings for many lost frames, for nodes not linked to the previous node, and for many failed links."""
+    """Yields findings for many lost frames, for nodes without links to the previous node or to any, for failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
@@ -60,6 +60,11 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
     if quality.nodes_bridged:
         text = f"{quality.nodes_bridged} keyframes could not be linked to the keyframe before them"
         yield Finding("nodes_bridged", quality.nodes_bridged, 0, text)
+    if unlinked := int(result.unlinked.sum()):
+        text = (
+            f"{unlinked} keyframes are linked to no other; their poses are dead reckoning, and the map is without them"
+        )
+        yield Finding("keyframes_unlinked", unlinked, 0, text)
     failed = quality.links_failed / max(quality.links_tried, 1)
     if failed > MAX_LINKS_FAILED:
         text = f"{quality.links_failed} of {quality.links_tried} links between keyframes failed"

@@ -13,7 +13,8 @@ from twin.judge.summary_statistics import percentile
 def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     """Returns `self_check.*` of metrics.json; a value that was not measured is None.
 
-    frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`).
+    frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`),
+    keyframes_unlinked the number of keyframes that are not in the map (`SurveyResult.unlinked`).
     link_residual is the median over the links of the residuals of their points, divided by the expected residuals;
     link_chi2 is the mean chi-square of the links per degree of freedom. row_offset_px, row_spread_ratio and repetition
     are medians over the stereo pairs: of the row difference of the matched points (right minus left) [px], of the
@@ -36,6 +37,7 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     return {
         "frames_lost": quality.frames_lost / len(result.online) if len(result.online) else None,
         "nodes_bridged": quality.nodes_bridged,
+        "keyframes_unlinked": int(result.unlinked.sum()),
         "links_failed": quality.links_failed / quality.links_tried if quality.links_tried else None,
         "link_residual": quality.link_residual,
         "link_chi2": quality.link_chi2,
