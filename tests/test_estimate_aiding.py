@@ -9,8 +9,9 @@ from twin.core.links import Link
 from twin.core.records import BeaconDetection, Displacement, Readings, SensorNoise, StereoRig
 from twin.estimate.alignment import align
 from twin.estimate.navigation import aiding
+from twin.estimate.navigation.dead_reckoning import readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator, body_displacement, fuse_displacement, fuse_dvl
-from twin.estimate.navigation.pose_filter import PoseFilter
+from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, fuse_pressure_ahrs
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
@@ -97,7 +98,8 @@ def test_fusion_of_a_frame_motion_with_a_displacement_is_a_kalman_update():
     step = expected + [1e-3, -2e-3, 5e-4]
     jacobian = numeric(lambda m: body_displacement(motion.a_from_b @ geometry.exp(m), MOUNT)[0], np.zeros(6))
     moved, after = dense_update(motion.cov, jacobian, step_cov, step - expected)
-    fused, cov = fuse_displacement(motion.a_from_b, motion.cov, step, step_cov, MOUNT)
+    gates = PoseFilter(POSE, RIG, NOISE).gates
+    fused, cov, _ = fuse_displacement(motion.a_from_b, motion.cov, step, step_cov, MOUNT, gates)
     np.testing.assert_allclose(geometry.log(geometry.inverse(motion.a_from_b) @ fused), moved, atol=1e-9)
     np.testing.assert_allclose(cov, after, atol=1e-11)
 
@@ -105,7 +107,8 @@ def test_fusion_of_a_frame_motion_with_a_displacement_is_a_kalman_update():
 def fuse(dvl, motion, velocity):
     """Returns the motion of a frame fused with a velocity (None: no reading)."""
     reading = np.full(3, np.nan) if velocity is None else velocity
-    fused, cov = fuse_dvl(dvl.state, dvl.model(1 / RIG.frame_rate_hz), motion.a_from_b, motion.cov, reading)
+    gates = PoseFilter(POSE, RIG, NOISE).gates
+    fused, cov = fuse_dvl(dvl.state, dvl.model(1 / RIG.frame_rate_hz), motion.a_from_b, motion.cov, reading, gates)
     return motion._replace(a_from_b=fused, cov=cov)
 
 
@@ -178,7 +181,7 @@ def test_the_scale_error_accumulates_along_a_straight_path():
 
 
 def test_without_velocity_readings_the_motion_is_unchanged_and_there_is_no_displacement():
-    dvl, motion = DvlIntegrator(RIG, NOISE), Motion(geometry.exp(np.full(6, 0.01)), np.eye(6) * 1e-6, 100, 1.0)
+    dvl, motion = DvlIntegrator(RIG, NOISE), Motion(geometry.exp(np.full(6, 0.001)), np.eye(6) * 1e-6, 100, 1.0)
     dvl.displacement_at_node(0)
     unaided = fuse(dvl, motion, None)
     np.testing.assert_array_equal(unaided.a_from_b, motion.a_from_b)
@@ -281,6 +284,85 @@ def test_jacobians_of_displacement_factors_agree_with_finite_differences(scale):
     np.testing.assert_allclose(
         by_scale[0], numeric(lambda s: factors.residuals(motion[None], scale + s[0])[0], np.zeros(1))[:, 0], atol=1e-8
     )
+
+
+def outliers():
+    """Returns the readings of each sensor at POSE but for a gross error, by name."""
+    angles = geometry.rpy_from_rotation((POSE @ geometry.inverse(MOUNT))[:3, :3])
+    wrong_pixel = tuple(BeaconDetection(0, (float(u) + 20, float(v))) for u, v in pixels_of(POSE)[:1])
+    return {
+        "pressure": Readings(pressure_z_m=POSE[2, 3] + 0.3),
+        "ahrs": Readings(ahrs_rpy_rad=angles + [0, 0, 0.3]),
+        "usbl": Readings(usbl_m=POSE[:3, 3] + [3, 0, 0]),
+        "beacons": Readings(beacons=wrong_pixel),
+        "vertical": Readings(up=tilted_up([0.5, 0, 0])),
+    }
+
+
+def fused_with(pose_filter, readings):
+    """Fuses the readings of one frame at rest; returns those that were used."""
+    before, gates = pose_filter.rejected, pose_filter.gates
+    height, angles, _ = readings_as_arrays(readings)
+    pose_filter.world_from_camera, pose_filter.cov = fuse_pressure_ahrs(
+        pose_filter.world_from_camera, pose_filter.cov, pose_filter.pressure_ahrs, height, angles, gates
+    )
+    pose_filter.fuse_vertical(readings)
+    return pose_filter.fuse_position_fixes(pose_filter.without_rejected(readings, before))
+
+
+@pytest.mark.parametrize("sensor", ["pressure", "ahrs", "usbl", "beacons", "vertical"])
+def test_a_reading_beyond_its_gate_changes_nothing_and_is_no_factor(sensor):
+    pose_filter = PoseFilter(POSE, RIG, NOISE)
+    pose_filter.cov = np.diag([0.03**2] * 3 + [0.01**2] * 3) if sensor == "vertical" else np.eye(6) * 1e-6
+    cov = pose_filter.cov
+    used = fused_with(pose_filter, outliers()[sensor])
+    np.testing.assert_array_equal(pose_filter.world_from_camera, POSE)
+    np.testing.assert_array_equal(pose_filter.cov, cov)
+    assert pose_filter.rejected.tolist() == [name == sensor for name in SENSORS]
+    assert all(not len(factors.pose_index) for factors in aiding.unary_factors(keyframes([POSE], [used]), RIG, NOISE))
+
+
+@pytest.mark.parametrize("sensor", ["pressure", "ahrs", "usbl"])
+def test_a_sensor_that_contradicts_the_pose_for_long_is_believed(sensor):
+    """It agrees with itself, so the pose is taken to be wrong: the pose moves to the readings, which then pass."""
+    pose_filter, k = PoseFilter(POSE, RIG, NOISE), SENSORS.index(sensor)
+    pose_filter.cov = np.eye(6) * 1e-6
+    readings, residual = outliers()[sensor], {"pressure": 0.3, "ahrs": 0.3, "usbl": 3.0}[sensor]
+    for _ in range(400):
+        fused_with(pose_filter, readings)
+    assert 0 < pose_filter.rejected[k] < 400 and pose_filter.gates.counts[k].tolist()[::2] == [0, 1]
+    moved = geometry.log(geometry.inverse(POSE) @ pose_filter.world_from_camera)
+    assert max(np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])) == pytest.approx(residual, rel=0.02)
+
+
+def test_a_sensor_that_contradicts_itself_is_never_believed():
+    pose_filter, rng = PoseFilter(POSE, RIG, NOISE), np.random.default_rng(0)
+    for offset in rng.choice([-1, 1], 1000) * rng.uniform(0.3, 3.0, 1000):
+        fused_with(pose_filter, Readings(pressure_z_m=POSE[2, 3] + offset))
+    assert pose_filter.gates.counts[0, 1:].tolist() == [1000, 0]
+    np.testing.assert_array_equal(pose_filter.world_from_camera, POSE)
+
+
+def test_a_velocity_that_contradicts_vision_is_no_part_of_a_displacement_until_it_lasts():
+    """It is compared at every second frame, as it is not averaged with the reading before a rejected one."""
+    velocity, gates = np.array([0.3, 0.0, 0.0]), PoseFilter(POSE, RIG, NOISE).gates
+    dvl, model = DvlIntegrator(RIG, NOISE), DvlIntegrator(RIG, NOISE).model(1 / RIG.frame_rate_hz)
+    motion = geometry.inverse(MOUNT) @ geometry.pose(np.eye(3), velocity / RIG.frame_rate_hz) @ MOUNT
+    cov = np.eye(6) * 1e-8
+    fuse_dvl(dvl.state, model, motion, cov, velocity, gates)
+    dvl.displacement_at_node(0)
+    wrong = velocity + [1.0, 0.0, 0.0]
+    fused, fused_cov = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
+    np.testing.assert_array_equal(fused, motion)
+    np.testing.assert_array_equal(fused_cov, cov)
+    assert dvl.displacement_at_node(1) is None
+    for _ in range(14):
+        fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
+    assert gates.counts[2].tolist()[1:] == [8, 0]
+    for _ in range(60):
+        fused, _ = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
+    assert gates.counts[2, 2] > 0
+    np.testing.assert_allclose(body_displacement(fused, MOUNT)[0], wrong / RIG.frame_rate_hz, rtol=0.05, atol=1e-4)
 
 
 def tilted_up(tilt):

@@ -4,27 +4,31 @@ The pipeline is tested without images, on scripted measurements.
 """
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import seafloor_scene as scene
 from scipy.stats import chi2
 
 from twin.core import geometry
-from twin.core.links import Link
-from twin.core.records import Frame, Readings, SensorNoise
+from twin.core.links import Link, Links
+from twin.core.records import ElevationMap, Frame, Readings, SensorNoise
 from twin.core.settings import EstimatorSettings
 from twin.estimate import link_selection, stereo_vision
 from twin.estimate.navigation.pose_filter import PoseFilter, fuse_pressure_ahrs
 from twin.estimate.pipeline import Navigator
+from twin.estimate.self_check import check_survey
 from twin.estimate.trajectory import interpolate_between_keyframes
 from twin.estimate.vision import matching, stereo
-from twin.estimate.vision.f2f import FrameToFrame
+from twin.estimate.vision.f2f import FrameToFrame, constant_velocity_motion
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.two_view_motion import Motion
+from twin.judge.self_check import self_check_metrics
 
 PATCH_PX = 11
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)
@@ -463,7 +467,7 @@ def test_pressure_corrects_height_only_weighted_by_its_noise():
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([1.0, 2.0, 3.0]))
     believed = PoseFilter(pose, RIG, SensorNoise(0.01, 0.003, 0.01))
     believed.cov = np.diag([1e-8] * 3 + [1e-4] * 3)
-    after, _ = fuse_pressure_ahrs(pose, believed.cov, believed.pressure_ahrs, 3.02, np.full(3, np.nan))
+    after, _ = fuse_pressure_ahrs(pose, believed.cov, believed.pressure_ahrs, 3.02, np.full(3, np.nan), believed.gates)
     np.testing.assert_allclose(after[:3, 3], [1.0, 2.0, 3.01], atol=1e-6)  # equal variances: half way
 
 
@@ -501,16 +505,39 @@ def test_f2m_without_prior_knowledge_is_a_kalman_update():
 
 def test_interpolation_passes_through_the_keyframes_and_keeps_frame_to_frame_motion_between():
     rng = np.random.default_rng(0)
-    f2f = [np.eye(4)]
-    for _ in range(30):
-        f2f.append(f2f[-1] @ geometry.exp(rng.normal(size=6) * 0.01))
-    f2f = np.array(f2f)
+    steps, f2f = rng.normal(size=(31, 6)) * 0.01, [np.eye(4)]
+    for step in steps[1:]:
+        f2f.append(f2f[-1] @ geometry.exp(step))
+    f2f, variances = np.array(f2f), rng.uniform(1e-8, 1e-6, (31, 6))
     rows = np.array([0, 10, 25])
     keys = np.array([f2f[r] @ geometry.exp(rng.normal(size=6) * 0.02) for r in rows])
-    path = interpolate_between_keyframes(f2f, rows, keys)
+    path = interpolate_between_keyframes(steps, variances, rows, keys)
     np.testing.assert_allclose(path[rows], keys, atol=1e-9)
-    np.testing.assert_allclose(interpolate_between_keyframes(f2f, rows, f2f[rows]), f2f, atol=1e-9)
+    np.testing.assert_allclose(interpolate_between_keyframes(steps, variances, rows, f2f[rows]), f2f, atol=1e-9)
     np.testing.assert_allclose(geometry.inverse(path[25]) @ path[30], geometry.inverse(f2f[25]) @ f2f[30], atol=1e-9)
+
+
+def test_the_misclosure_between_keyframes_is_the_least_squares_correction_of_the_steps():
+    """No other corrections that close the chain have a smaller weighted sum of squares (1e-4 of it is second order)."""
+    rng = np.random.default_rng(3)
+    steps, variances = rng.normal(size=(6, 6)) * 0.2, rng.uniform(1e-7, 1e-5, (6, 6))
+    chain = functools.reduce(np.matmul, [geometry.exp(step) for step in steps[1:]])
+    keys = np.array([np.eye(4), chain @ geometry.exp(rng.normal(size=6) * 1e-3)])
+    path = interpolate_between_keyframes(steps, variances, np.array([0, 5]), keys)
+
+    def closed(corrections):
+        motions = [geometry.exp(s) @ geometry.exp(e) for s, e in zip(steps[1:], corrections, strict=True)]
+        return geometry.log(geometry.inverse(functools.reduce(np.matmul, motions)) @ keys[1])
+
+    found = np.array([
+        geometry.log(geometry.exp(-step) @ geometry.inverse(a) @ b)
+        for step, a, b in zip(steps[1:], path[:-1], path[1:], strict=True)
+    ])  # fmt: skip
+    np.testing.assert_allclose(closed(found), 0, atol=1e-12)
+    constraint = np.array([closed(found + d.reshape(5, 6)) for d in np.eye(30) * 1e-6]).T / 1e-6
+    weighted, root = found / np.sqrt(variances[1:]), np.sqrt(variances[1:]).ravel()
+    free = scipy.linalg.null_space(constraint * root)
+    assert np.abs(free.T @ weighted.ravel()).max() < 3e-3 * np.linalg.norm(weighted)
 
 
 LINK_COV = np.diag([0.002**2] * 3 + [0.01**2] * 3)
@@ -560,6 +587,41 @@ class Script:
         if self.rng is not None:
             true = [t @ geometry.exp(e) for t, e in zip(true, self.rng.normal(0, 1e-3, (len(true), 6)), strict=True)]
         return [None if node.number in self.blind else Motion(t, LINK_COV, 200, 1.0) for t in true]
+
+
+class Stumbling(Script):
+    """F2F fails at one frame: its motion is wrong by 30 degrees and 0.1 m."""
+
+    def __init__(self, poses, lost):
+        super().__init__(poses)
+        self.lost = lost
+
+    def track_frame(self, frame):
+        motion, status = super().track_frame(frame)
+        measured = motion._replace(cov=np.diag([1e-4**2] * 3 + [3e-4**2] * 3))
+        wrong = geometry.exp(np.array([0.0, 0.0, np.deg2rad(30), 0.1, 0.0, 0.0]))
+        if self.row != self.lost:
+            return measured, status
+        return constant_velocity_motion(motion.a_from_b @ wrong, "too few points matched")
+
+    def measure_motions(self, node, others):
+        return [Motion(geometry.inverse(self.poses[k.row]) @ self.poses[node.row], LINK_COV, 200, 1.0) for k in others]
+
+
+@pytest.mark.parametrize("lost", [4, 9, 10])  # between two keyframes, just before one, at one
+def test_a_failed_step_between_keyframes_takes_the_misclosure(lost):
+    poses = [scene.down_camera(0.01 * k, 0.0, 2.4) for k in range(21)]
+    image = np.zeros((1, 1, 3), np.uint8)
+    navigator = Navigator(RIG, EstimatorSettings(), poses[0], SensorNoise(), Stumbling(poses, lost))
+    for k in range(len(poses)):
+        navigator.update(Frame(k, k / 30, image, image, keyframe=k % 10 == 0))
+    result = navigator.finish()
+    online, final = (
+        np.linalg.norm(path.positions - np.array(poses)[:, :3, 3], axis=1) for path in (result.online, result.final)
+    )
+    assert lost % 10 == 0 or online.max() > 0.09
+    assert final.max() < 1e-3  # evenly: 47 mm
+    assert (final < online + 1e-3).all()
 
 
 def navigated(camera, tracks, readings=None, **settings):
@@ -618,6 +680,40 @@ def test_frame_to_frame_motion_bridges_a_failed_link():
     missing = [node.dvl_displacement is None for node in navigator.network.nodes]
     assert missing == [True, False, False, True, False, False]
     assert result.quality.nodes_bridged == 1
+
+
+class Isolated(Script):
+    """No link of keyframe 3 can be measured; records the keyframes of the map."""
+
+    def measure_motions(self, node, others):
+        motions = super().measure_motions(node, others)
+        return [None if 3 in (node.number, k.number) else m for k, m in zip(others, motions, strict=True)]
+
+    def build_map(self, result, grid, step_cov, progress):
+        self.mapped, self.steps = result.keyframe_rows.tolist(), step_cov
+        shape = grid.rows, grid.cols
+        return ElevationMap(grid, np.zeros(shape), np.zeros(shape), np.zeros((*shape, 3), np.uint8))
+
+
+def test_a_keyframe_without_a_measured_link_is_not_in_the_map():
+    camera = Isolated(line(0.1 * np.arange(6)))
+    navigator = navigated(camera, [1] * 6)
+    result = navigator.finish()
+    assert result.unlinked.tolist() == [False, False, False, True, False, False]
+    navigator.build_map(result)
+    assert camera.mapped == [0, 1, 2, 4, 5]
+    np.testing.assert_allclose(camera.steps[3], result.step_cov[3] + result.step_cov[4])
+    assert "keyframes_unlinked" in {finding.check for finding in check_survey(result, RIG)}
+    assert self_check_metrics(result)["keyframes_unlinked"] == 1
+    sigma_m = np.sqrt(np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2))
+    assert sigma_m[3] > max(sigma_m[2], sigma_m[4])  # it keeps its own covariance
+
+
+def test_keyframes_that_follow_an_unlinked_node_are_unlinked_too_and_none_is_where_no_link_exists():
+    camera = Isolated(line(0.1 * np.arange(9)))
+    result = navigated(camera, [1] * 9, node_stride=3).finish()
+    assert np.flatnonzero(result.unlinked).tolist() == [3, 4, 5]
+    assert not replace(result, links=Links()).unlinked.any()
 
 
 def test_the_quality_reports_the_uncertainty_of_frames_relative_to_their_keyframe():

@@ -78,6 +78,10 @@ class EstimationQuality(NamedTuple):
         repeats: rows of the frames at which a camera was frozen, by status ("the left camera repeats its image").
         independent_errors: number of independent errors to which the correlated position errors of the keyframes are
             equivalent, by their joint covariance; None without a final alignment.
+        readings_rejected: number of readings of each navigation sensor that were not used, because they contradicted
+            the estimates.
+        readings_disputed: number of readings of each navigation sensor that contradicted the estimates but were used,
+            because many before them had done so in the same way.
     """
 
     frames_lost: int = 0
@@ -94,6 +98,8 @@ class EstimationQuality(NamedTuple):
     length_scale: LengthScale | None = None
     depth_scale: LengthScale | None = None
     repeats: Mapping[str, Sequence[int]] = MappingProxyType({})
+    readings_rejected: Mapping[str, int] = MappingProxyType({})
+    readings_disputed: Mapping[str, int] = MappingProxyType({})
 
     @property
     def repeat_notes(self) -> list[str]:

@@ -384,6 +384,21 @@ class SurveyResult:
     quality: EstimationQuality = EstimationQuality()
 
     @property
+    def unlinked(self) -> NDArray[np.bool_]:
+        """Returns the mask (n_keyframes,) of the keyframes whose pose is dead reckoning from an earlier keyframe.
+
+        No measured link joins them, or the node whose pose they follow, to another node. If no link was measured at all
+        (a plug-in), there are none.
+        """
+        links, n = self.links, len(self.keyframe_rows)
+        measured = links.n_points > 0
+        if not measured.any():
+            return np.zeros(n, bool)
+        nodes = np.union1d([0], np.concatenate([links.i, links.j]))
+        linked = np.union1d([0], np.concatenate([links.i[measured], links.j[measured]]))
+        return ~np.isin(nodes[np.searchsorted(nodes, np.arange(n), side="right") - 1], linked)
+
+    @property
     def step_cov(self) -> Array:
         """Returns `Link.own_cov` (n_keyframes, 6, 6) of the link from the previous keyframe; zeros without a link."""
         cov = np.zeros((len(self.keyframe_rows), 6, 6))

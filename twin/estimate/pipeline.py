@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -42,7 +43,7 @@ from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_t
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator
-from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance
+from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, clip_covariance
 from twin.estimate.network import KeyframeNetwork
 from twin.estimate.pose_log import PoseLog
 from twin.estimate.stereo_vision import StereoVision
@@ -155,18 +156,22 @@ class Navigator:
         """
         interval_s = self._interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
-        self.log.n_lost += status not in ("ok", RIGHT_REPEATS)
-        aiding = readings_as_arrays(frame.readings)
-        state, moved = dead_reckon(self.dead_reckoning, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
+        is_measured = status in ("ok", RIGHT_REPEATS)
+        self.log.n_lost += not is_measured
+        aiding, rejected = readings_as_arrays(frame.readings), self.filter.rejected
+        last = self.dead_reckoning
+        state, moved = dead_reckon(last, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
         self.set_dead_reckoning(state)
         self.filter.fuse_vertical(frame.readings)
+        frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
+        step = motion.a_from_b if is_measured else geometry.inverse(last.online) @ self.filter.world_from_camera
         if status in REPEATS:
             self.log.repeats.setdefault(status, []).append(len(self.log))
             self.filter.fuse_position_fixes(frame.readings)
         elif self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
-        self.log.append(frame.time_s, f2f, online)
+        self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
@@ -202,8 +207,8 @@ class Navigator:
         aligned_cov = self.network.align_all()
         rows = np.array([k.row for k in keyframes], dtype=np.int64)
         final = log.online
-        if self.settings.use_ga:
-            final = interpolate_between_keyframes(log.f2f, rows, self.network.poses)
+        if self.settings.use_ga and len(rows):
+            final = interpolate_between_keyframes(log.steps, log.variances, rows, self.network.poses)
         return SurveyResult(
             f2f=Trajectory(log.times_s, log.f2f),
             online=Trajectory(log.times_s, log.online),
@@ -227,7 +232,7 @@ class Navigator:
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None
     ) -> ElevationMap | None:
-        """Builds the elevation map along the final trajectory.
+        """Builds the elevation map along the final trajectory, from all keyframes but `SurveyResult.unlinked`.
 
         Heights are measured along z of the world if the optical axis of the first keyframe is within 45 degrees of
         straight down, otherwise along this axis, towards the camera (`ElevationMap.map_from_world`).
@@ -243,17 +248,17 @@ class Navigator:
         Raises:
             OSError: an image could not be read.
         """
-        n_keyframes = len(result.keyframe_rows)
-        if n_keyframes == 0:
+        if not len(result.keyframe_rows):
             return None
-        turned, map_from_world = _in_map(result)
-        cells = grid or footprint_grid(turned, self.rig)
+        linked = np.flatnonzero(~result.unlinked)
+        turned, map_from_world = _in_map(_of_keyframes(result, linked))
+        cells, n_keyframes = grid or footprint_grid(turned, self.rig), len(linked)
 
         def report(n_done: int) -> None:
             if progress is not None:
                 progress(n_done / n_keyframes)
 
-        found = self.vision.build_map(turned, cells, result.step_cov, report)
+        found = self.vision.build_map(turned, cells, steps_between(result.step_cov, linked), report)
         return replace(found, map_from_world=map_from_world)
 
     def build_tiles(
@@ -277,17 +282,13 @@ class Navigator:
         """
         if not len(result.keyframe_rows):
             return
-        turned, map_from_world = _in_map(result)
+        linked = np.flatnonzero(~result.unlinked)
+        turned, map_from_world = _in_map(_of_keyframes(result, linked))
         tiles = footprint_tiles(turned, self.rig)
         for k, tile in enumerate(tiles):
-            chosen = tile.keyframes
-            part = replace(
-                turned,
-                keyframe_rows=turned.keyframe_rows[chosen],
-                node_cov=turned.node_cov[chosen],
-                keyframe_depth_m=turned.keyframe_depth_m[chosen],
-            )
-            steps, larger = steps_between(result.step_cov, chosen), with_margin(tile.grid, _TILE_MARGIN)
+            part = _of_keyframes(turned, tile.keyframes)
+            steps = steps_between(result.step_cov, linked[tile.keyframes])
+            larger = with_margin(tile.grid, _TILE_MARGIN)
             found = self.vision.build_map(part, larger, steps, lambda _: None)
             inner = np.s_[_TILE_MARGIN:-_TILE_MARGIN, _TILE_MARGIN:-_TILE_MARGIN]
             layers = found.height_m[inner], found.sigma_m[inner], found.mosaic[inner]
@@ -314,6 +315,7 @@ class Navigator:
         Raises:
             OSError: an image could not be read. The iterator raises it too.
         """
+        result = _of_keyframes(result, np.flatnonzero(~result.unlinked))
         rows = result.keyframe_rows
         if len(rows) == 0 or self.vision.left_image(int(rows[0])) is None:
             return None
@@ -354,6 +356,8 @@ class Navigator:
             independent_errors=history.independent_errors,
             length_scale=across,
             depth_scale=along,
+            readings_rejected=dict(zip(SENSORS, self.filter.gates.counts[:, 1].tolist(), strict=True)),
+            readings_disputed=dict(zip(SENSORS, self.filter.gates.counts[:, 2].tolist(), strict=True)),
         )
 
     @property
@@ -364,7 +368,7 @@ class Navigator:
 
     def aiding(self, interval_s: float) -> FrameAiding:
         """Returns the sensors' error models for the interval since the last frame [s], and the DVL state."""
-        return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state)
+        return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.filter.gates)
 
     def set_dead_reckoning(self, state: DeadReckoningState) -> None:
         """Replaces the F2F pose, the online pose and the motion since the last node by those of a given state."""
@@ -445,7 +449,9 @@ class Navigator:
         chain = self._follow_chain(keyframe) if is_node else None
         if chain is not None and status != "ok" and self.settings.wide_search:
             self.log.n_lost, status = self.log.n_lost - 1, "ok"  # the motion was measured after all
-        self.filter.fuse_position_fixes(frame.readings)  # after `_follow_chain`, to correct its error too
+        keyframe.readings = self.filter.fuse_position_fixes(
+            frame.readings
+        )  # after `_follow_chain`, to correct its error too
         with self.stopwatch("f2m"):
             self._register_with_mosaic(keyframe, chain)
             keyframe.world_from_camera = self.filter.world_from_camera
@@ -539,6 +545,16 @@ def _in_map(result: SurveyResult) -> tuple[SurveyResult, Array]:
     map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
     turned = Trajectory(final.times_s, map_from_world @ final.world_from_camera)
     return replace(result, final=turned), map_from_world
+
+
+def _of_keyframes(result: SurveyResult, chosen: NDArray[np.int64]) -> SurveyResult:
+    """Returns a result with the chosen keyframes only; its links keep the numbers of all keyframes."""
+    return replace(
+        result,
+        keyframe_rows=result.keyframe_rows[chosen],
+        node_cov=result.node_cov[chosen],
+        keyframe_depth_m=result.keyframe_depth_m[chosen],
+    )
 
 
 def finish_in_stage(navigator: Navigator, guard: StageGuard) -> SurveyResult:

@@ -7,7 +7,7 @@ from twin.core.growing_array import GrowingArray
 
 
 class PoseLog:
-    """Times and estimated poses of all frames; each frame takes 264 bytes of memory.
+    """Times and estimated poses of all frames; each frame takes 360 bytes of memory.
 
     Attributes:
         n_lost: number of frames whose motion was not measured but predicted.
@@ -18,6 +18,7 @@ class PoseLog:
         self.n_lost = 0
         self.repeats: dict[str, list[int]] = {}
         self._times_s, self._f2f, self._online = GrowingArray(), GrowingArray(4, 4), GrowingArray(4, 4)
+        self._steps, self._variances = GrowingArray(6), GrowingArray(6)
 
     def __len__(self) -> int:
         return len(self._times_s)
@@ -37,8 +38,23 @@ class PoseLog:
         """Returns the world_from_camera (n, 4, 4) as estimated online."""
         return self._online.array
 
-    def append(self, times_s: float | Array, f2f: Array, online: Array) -> None:
-        """Appends one frame, with a time [s] and poses (4, 4), or n frames, with times (n,) and poses (n, 4, 4)."""
+    @property
+    def steps(self) -> Array:
+        """Returns the twists (n, 6) from frame to frame: those of vision, or of the online pose where vision failed.
+
+        The online pose also has the noise of the navigation sensors, but where vision fails they determine it.
+        """
+        return self._steps.array
+
+    @property
+    def variances(self) -> Array:
+        """Returns the variances (n, 6) of `steps` [rad^2, m^2], in the axes of the later frame."""
+        return self._variances.array
+
+    def append(self, times_s: float | Array, f2f: Array, online: Array, steps: Array, variances: Array) -> None:
+        """Appends one frame, with a time [s], poses (4, 4) and `steps` (6,), or n frames, with a leading axis n."""
         self._times_s.append(times_s)
         self._f2f.append(f2f)
         self._online.append(online)
+        self._steps.append(steps)
+        self._variances.append(variances)

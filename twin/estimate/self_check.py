@@ -43,7 +43,7 @@ class _Effect(NamedTuple):
 def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None = None) -> list[Finding]:
     """Returns the findings of all checks; an empty list if every check passes.
 
-    The findings are in the order of tracking, stereo, rectification and consistency.
+    The findings are in the order of tracking, navigation sensors, stereo, rectification and consistency.
 
     Args:
         result: output of the estimators.
@@ -51,10 +51,15 @@ def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
         elevation: map of the survey; None if none was built.
     """
     return [
-        *_tracking(result),
-        *_stereo(result),
-        *_rectification(result, rig, elevation),
-        *_consistency(result, rig, elevation),
+        finding
+        for findings in (
+            _tracking(result),
+            _readings(result),
+            _stereo(result),
+            _rectification(result, rig, elevation),
+            _consistency(result, rig, elevation),
+        )
+        for finding in findings
     ]
 
 
@@ -89,7 +94,7 @@ def _effect(name: str, error_m: float, sigma_m: float, where: str) -> _Effect:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields findings for many lost frames, for nodes not linked to the previous node, and for many failed links."""
+    """Yields findings for lost frames, for nodes without links to the previous node or to any, for failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
@@ -102,10 +107,23 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
     if quality.nodes_bridged:
         text = f"{quality.nodes_bridged} keyframes could not be linked to the keyframe before them"
         yield Finding("nodes_bridged", quality.nodes_bridged, 0, text)
+    if unlinked := int(result.unlinked.sum()):
+        text = (
+            f"{unlinked} keyframes are linked to no other; their poses are dead reckoning, and the map is without them"
+        )
+        yield Finding("keyframes_unlinked", unlinked, 0, text)
     failed = quality.links_failed / max(quality.links_tried, 1)
     if failed > MAX_LINKS_FAILED:
         text = f"{quality.links_failed} of {quality.links_tried} links between keyframes failed"
         yield Finding("links_failed", failed, MAX_LINKS_FAILED, text)
+
+
+def _readings(result: SurveyResult) -> Iterator[Finding]:
+    """Yields a finding for each navigation sensor that contradicted the estimates for long."""
+    for sensor, count in result.quality.readings_disputed.items():
+        if count:
+            text = f"{sensor} readings contradicted the estimates for long, and {count} were believed in the end"
+            yield Finding(f"readings_{sensor}", count, 0, text)
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:

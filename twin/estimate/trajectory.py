@@ -9,45 +9,78 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.kernels import kernel
 
+_LEAST_VARIANCE = 1e-12  # of a component of a step [rad^2, m^2]
+_MAX_ITERATIONS = 10  # of the closure, which converges quadratically
 
-def interpolate_between_keyframes(f2f: Array, rows: NDArray[np.int64], keyframe_poses: Array) -> Array:
-    """Interpolates the poses of keyframes to all frames along the frame-to-frame motion.
 
-    From each keyframe, the poses follow the frame-to-frame motion to the next keyframe. The misclosure, i.e. the motion
-    from the pose so reached to the given pose of the next keyframe, is distributed linearly over the frames in between.
+def interpolate_between_keyframes(
+    steps: Array, variances: Array, rows: NDArray[np.int64], keyframe_poses: Array
+) -> Array:
+    """Interpolates the poses of keyframes to all frames along the dead-reckoned steps from frame to frame.
+
+    Between two keyframes, the misclosure of the steps is distributed over them by least squares, weighted by their
+    variances: a step that failed takes nearly all of it.
 
     Args:
-        f2f: (n, 4, 4) poses from frame-to-frame motion alone.
-        rows: (m,) indices of the frames that are keyframes, ascending.
+        steps: (n, 6) twist of the camera from the previous frame to each frame [rad, m]; the first is not used.
+        variances: (n, 6) variance of each component of the steps, in the axes of the later frame [rad^2, m^2].
+        rows: (m,) indices of the frames that are keyframes, ascending; m > 0.
         keyframe_poses: (m, 4, 4) aligned poses of these keyframes.
 
     Returns:
         (n, 4, 4) poses of all frames, equal to `keyframe_poses` at the keyframes. Frames before the first and after the
-        last keyframe follow the frame-to-frame motion without correction. Without keyframes, a copy of `f2f`.
+        last keyframe follow the steps without correction.
     """
-    if len(rows) == 0:
-        return f2f.copy()
-    result = np.empty_like(f2f)
-    world_from_start = keyframe_poses[0] @ geometry.inverse(f2f[rows[0]])
-    result[: rows[0]] = world_from_start @ f2f[: rows[0]]
-    for k, row in enumerate(rows):
-        end = rows[k + 1] if k + 1 < len(rows) else len(f2f)
-        world_from_start = keyframe_poses[k] @ geometry.inverse(f2f[row])
-        if k + 1 < len(rows):
-            misclosure = geometry.log(geometry.inverse(world_from_start @ f2f[end]) @ keyframe_poses[k + 1])
-            _distribute(world_from_start, f2f[row:end], misclosure, result[row:end])
-        else:
-            result[row:] = world_from_start @ f2f[row:]
-    return result
+    motions, variances = _motions(steps), np.maximum(variances, _LEAST_VARIANCE)
+    between = zip(rows, rows[1:], keyframe_poses, keyframe_poses[1:], strict=False)
+    for row, next_row, pose, next_pose in between:
+        inner = slice(row + 1, next_row + 1)
+        _close(geometry.inverse(pose) @ next_pose, motions[inner], variances[inner])
+    return _follow(motions, rows, keyframe_poses)
 
 
 @kernel
-def _distribute(world_from_start, f2f, misclosure, out):
-    """Writes the poses `world_from_start` @ `f2f`, corrected for the twist `misclosure` (6,), to `out` (n, 4, 4).
+def _motions(twists):
+    """Returns the motions (n, 4, 4) of twists (n, 6)."""
+    motions = np.empty((len(twists), 4, 4))
+    for k in range(len(twists)):
+        geometry.copy_into(motions[k], geometry.exp(twists[k]))
+    return motions
 
-    Pose k of the n poses is moved by the fraction k / n of the misclosure; pose n would be that of the next keyframe.
+
+@kernel
+def _close(target, motions, variances):
+    """Corrects motions (n, 4, 4), in place, so that their product is the motion `target` (4, 4).
+
+    With the covariances C_k of the motions and the adjoint A_k from the axes after motion k to those at the end, the
+    corrections are C_k A_k' (sum of A C A')^-1 times the misclosure.
     """
-    step = 1 / len(f2f)
-    for k in range(len(f2f)):
-        pose = geometry.compose(world_from_start, f2f[k])
-        geometry.copy_into(out[k], geometry.compose(pose, geometry.exp(misclosure * (k * step))))
+    n = len(motions)
+    adjoints = np.empty((n, 6, 6))
+    for _ in range(_MAX_ITERATIONS):
+        end_from_frame, cov = np.eye(4), np.zeros((6, 6))
+        for k in range(n - 1, -1, -1):
+            geometry.copy_into(adjoints[k], geometry.adjoint(end_from_frame))
+            cov += geometry.product(adjoints[k] * variances[k], adjoints[k].T)
+            end_from_frame = geometry.compose(end_from_frame, geometry.inverse(motions[k]))
+        misclosure = geometry.log(geometry.compose(end_from_frame, target))
+        share = np.linalg.solve(cov, misclosure)
+        for k in range(n):
+            correction = geometry.exp(variances[k] * (adjoints[k].T @ share))
+            geometry.copy_into(motions[k], geometry.compose(motions[k], correction))
+        if np.abs(misclosure).max() < 1e-9:
+            break
+
+
+@kernel
+def _follow(motions, rows, keyframe_poses):
+    """Returns the poses (n, 4, 4) that follow the motions (n, 4, 4) from each keyframe to the next one."""
+    path = np.empty_like(motions)
+    for k in range(len(rows)):
+        geometry.copy_into(path[rows[k]], keyframe_poses[k])
+        end = rows[k + 1] if k + 1 < len(rows) else len(motions)
+        for row in range(rows[k] + 1, end):
+            geometry.copy_into(path[row], geometry.compose(path[row - 1], motions[row]))
+    for row in range(rows[0], 0, -1):
+        geometry.copy_into(path[row - 1], geometry.compose(path[row], geometry.inverse(motions[row])))
+    return path

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from twin.core.records import SurveyResult
 from twin.judge.summary_statistics import percentile
 
 
-def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
+def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     """Returns `self_check.*` of metrics.json; a value that was not measured is None.
 
-    frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`).
+    frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`),
+    keyframes_unlinked the number of keyframes that are not in the map (`SurveyResult.unlinked`).
     link_residual is the median over the links of the residuals of their points, divided by the expected residuals;
     link_chi2 is the mean chi-square of the links per degree of freedom. row_offset_px, row_spread_ratio and repetition
     are medians over the stereo pairs: of the row difference of the matched points (right minus left) [px], of the
@@ -23,7 +26,8 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D standard deviation of the position
     of a keyframe relative to the previous keyframe, by frame-to-frame motion alone: the 90th percentile over the
     keyframes [m]. length_scale and depth_scale are the lengths from the images across and along the optical axis,
-    divided by those of DVL, USBL and pressure; None where these do not determine them.
+    divided by those of DVL, USBL and pressure; None where these do not determine them. readings_rejected and
+    readings_disputed are numbers of readings of each navigation sensor.
     """
     quality, pairs = result.quality, result.stereo_observations
     offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
@@ -36,6 +40,7 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
     return {
         "frames_lost": quality.frames_lost / len(result.online) if len(result.online) else None,
         "nodes_bridged": quality.nodes_bridged,
+        "keyframes_unlinked": int(result.unlinked.sum()),
         "links_failed": quality.links_failed / quality.links_tried if quality.links_tried else None,
         "link_residual": quality.link_residual,
         "link_chi2": quality.link_chi2,
@@ -54,4 +59,6 @@ def self_check_metrics(result: SurveyResult) -> dict[str, float | None]:
         "length_scale_sigma": None if across is None else across.sigma,
         "depth_scale": None if along is None else along.estimate,
         "depth_scale_sigma": None if along is None else along.sigma,
+        "readings_rejected": dict(quality.readings_rejected),
+        "readings_disputed": dict(quality.readings_disputed),
     }

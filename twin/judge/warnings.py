@@ -1,4 +1,4 @@
-"""Warnings that follow from the metrics of a survey: consistency, sigma calibration and saturated images."""
+"""Warnings that follow from the metrics of a survey: consistency, sigma calibration, images, readings."""
 
 from __future__ import annotations
 
@@ -16,7 +16,10 @@ MOST_SATURATED = 0.01
 
 
 def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
-    """Returns a sentence for each metric that is out of its bounds: NEES, sigma ratio, and saturation of the images."""
+    """Returns a sentence for each metric that is out of its bounds: NEES, sigma ratio, saturation of the images.
+
+    One more reports rejected readings of navigation sensors.
+    """
     found = (
         _out_of_bounds(
             metrics["consistency"]["nees_position_mean"], nees_bounds(metrics["consistency"]),
@@ -29,6 +32,7 @@ def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
             "{:g} to {:g} accepted.",
         ),
         _saturation(metrics["vision"]["saturated_median"]),
+        _rejected(metrics["self_check"]["readings_rejected"]),
     )  # fmt: skip
     return [sentence for sentence in found if sentence]
 
@@ -54,3 +58,9 @@ def _saturation(fraction: float | None) -> str:
         return ""
     share, limit = 100 * fraction, 100 * MOST_SATURATED
     return f"The images are saturated: the median share of saturated values is {share:.3g} % (more than {limit:g} %)."
+
+
+def _rejected(counts: Mapping[str, int]) -> str:
+    """Returns a warning with the number of rejected readings of each sensor that had any, else ""."""
+    found = ", ".join(f"{sensor} {count}" for sensor, count in counts.items() if count)
+    return f"Readings that contradicted the estimates were not used: {found}." if found else ""

@@ -92,8 +92,9 @@ class PluginNavigator(Navigator):
             self.network.add(keyframe)
             self._node_covs.append(self._cov)
         moved = geometry.inverse(last) @ self._pose if len(self.log) else np.eye(4)
-        self.log.append(frame.time_s, self._pose, self._pose)
-        self._twist, sigma_m = geometry.log(moved) / interval_s, float(np.sqrt(np.trace(self._cov[3:, 3:])))
+        step = geometry.log(moved)
+        self.log.append(frame.time_s, self._pose, self._pose, step, np.zeros(6))
+        self._twist, sigma_m = step / interval_s, float(np.sqrt(np.trace(self._cov[3:, 3:])))
         status = status if frozen == "ok" else frozen
         return Estimate(frame.time_s, self._pose.copy(), self._pose.copy(), self._twist, sigma_m, status)
 

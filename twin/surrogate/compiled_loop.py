@@ -41,7 +41,7 @@ def compiled_loop(
         n, reference = end - first, tuple(np.asarray(part)[first:end] for part in sequence.reference)
         numbers = vision.draw_normals(n), *world.sensors.draw_noise(n)
         with world.stopwatch("physics"):
-            n, state, true, f2f, online = _fly(
+            n, state, true, f2f, online, steps, variances = _fly(
                 vision.last_pose, vision.last_normals, vehicle.state, sensors, errors,
                 navigator.dead_reckoning, navigator.aiding(interval_s), pilot.state, reference, numbers, n_steps,
                 interval_s,
@@ -50,7 +50,7 @@ def compiled_loop(
         world.record(true[:n])
         vision.last_pose, vision.last_normals = true[n - 1], numbers[0][n - 1]
         navigator.set_dead_reckoning(state)
-        navigator.log.append(times_s, f2f[:n], online[:n])
+        navigator.log.append(times_s, f2f[:n], online[:n], steps[:n], variances[:n])
         vehicle.advance_clock(n / rate_hz)
         return first + n
 
@@ -63,13 +63,15 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
 
     Returns:
         Number of simulated frames (the last one is that after which the flight ended, `has_ended`),
-        dead-reckoning state after the last frame, and three arrays of poses (n, 4, 4): true poses, poses accumulated
-        from F2F alone, and online estimates; only the simulated frames are set.
+        dead-reckoning state after the last frame, three arrays of poses (n, 4, 4): true poses, poses accumulated
+        from F2F alone, and online estimates, and `PoseLog.steps` with their variances (n, 6); only the simulated frames
+        are set.
     """
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals
     n = len(positions)
     true, f2f, online = np.empty((n, 4, 4)), np.empty((n, 4, 4)), np.empty((n, 4, 4))
+    steps, variances = np.empty((n, 6)), np.empty((n, 6))
     for k in range(n):
         geometry.copy_into(true[k], geometry.compose(body.pose, sensors.body_from_camera))
         height, angles, velocity = read_per_frame_sensors(
@@ -79,6 +81,8 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
             errors, last, true[k], vision_normals[k], last_normals if k == 0 else vision_normals[k - 1]
         )
         state, motion = dead_reckon(state, aiding, a_from_b, errors.cov, height, angles, velocity)
+        geometry.copy_into(steps[k], geometry.log(a_from_b))
+        geometry.copy_into(variances[k], np.diag(errors.cov))
         geometry.copy_into(f2f[k], state.f2f)
         geometry.copy_into(online[k], state.online)
         last = true[k]
@@ -86,5 +90,5 @@ def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, refere
         command = steer(pilot, state.online, twist, positions[k], velocities[k], accelerations[k], yaws[k])
         advance(body, command, n_steps)
         if has_ended(body):
-            return k + 1, state, true, f2f, online
-    return n, state, true, f2f, online
+            return k + 1, state, true, f2f, online, steps, variances
+    return n, state, true, f2f, online, steps, variances

@@ -169,6 +169,7 @@ class SurrogateVision:
         self.last_normals = np.zeros(6)
         self._tracking_cov: Array | None = None
         self._poses: dict[int, Array] = {}  # true poses of all keyframes
+        self._pose_at: dict[int, Array] = {}  # the same, by the row of the frame
         self._keyframes: dict[int, _KeyframeTruth] = {}  # keyframes that may still be linked
         self._latest: _KeyframeTruth | None = None
         self.stereo_observations: list[StereoObservation] = []
@@ -292,6 +293,7 @@ class SurrogateVision:
             if self._rows is not None:
                 observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px))
             self.stereo_observations.append(observation)
+            self._pose_at[row] = pose
             self._latest = _KeyframeTruth(
                 pose, points, hits, noise, bound_px, unevenness_px, stereo_parallax_px, n_points, *unit, cells,
                 true_measured, clear_share, noise_ratio,
@@ -489,11 +491,12 @@ class SurrogateVision:
         model, mapper, map_model = self.model, elevation.ElevationMapper(grid), self.scene.map_model
         errors = self._cell_errors(model, (grid.rows, grid.cols))
         estimated = result.final.world_from_camera[result.keyframe_rows]
+        true = [self._pose_at[row] for row in result.keyframe_rows.tolist()]
         following = None
         for k, pose in enumerate(estimated):
-            observed = map_model.observe(self._poses[k], pose) if following is None else following
+            observed = map_model.observe(true[k], pose) if following is None else following
             is_last = k == len(estimated) - 1
-            following = None if is_last else map_model.observe(self._poses[k + 1], estimated[k + 1])
+            following = None if is_last else map_model.observe(true[k + 1], estimated[k + 1])
             patch = map_model.sample_patch(observed, following, result.node_cov[k], errors, self._rng)
             if patch is not None:
                 mapper.fuse(patch)

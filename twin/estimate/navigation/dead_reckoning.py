@@ -10,7 +10,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Readings
 from twin.estimate.navigation.dvl import DvlModel, DvlState, fuse_dvl
-from twin.estimate.navigation.pose_filter import PressureAhrsModel, fuse_pressure_ahrs, predict
+from twin.estimate.navigation.pose_filter import PressureAhrsModel, ReadingGates, fuse_pressure_ahrs, predict
 from twin.kernels import kernel
 
 
@@ -39,11 +39,13 @@ class FrameAiding(NamedTuple):
         pressure_ahrs: error model of the pressure sensor and the AHRS.
         dvl: error model of the DVL.
         dvl_state: state of the DVL integration; its arrays are modified in place.
+        gates: states of the gates that reject readings; their arrays are modified in place.
     """
 
     pressure_ahrs: PressureAhrsModel
     dvl: DvlModel
     dvl_state: DvlState
+    gates: ReadingGates
 
 
 def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
@@ -71,7 +73,7 @@ def dead_reckon(
 
     Args:
         last: state at the previous frame.
-        aiding: error models of the sensors, and the state of the DVL integration, which is modified in place.
+        aiding: error models of the sensors, and the states of the DVL integration and of the gates, modified in place.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
         height_m: height measured by the pressure sensor at this frame [m]; NaN if there is no reading.
         rpy_rad: (3,) roll, pitch and yaw measured by the AHRS [rad]; NaN if there is no reading.
@@ -80,9 +82,9 @@ def dead_reckon(
     Returns:
         The new state, and the motion (4, 4) of this frame after fusion with the DVL.
     """
-    motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps)
+    motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)
     online, online_cov = predict(last.online, last.cov, motion, motion_cov)
-    online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding.pressure_ahrs, height_m, rpy_rad)
+    online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding.pressure_ahrs, height_m, rpy_rad, aiding.gates)
     since_node, since_node_cov = predict(last.since_node, last.since_node_cov, motion, motion_cov)
     f2f = geometry.compose(last.f2f, a_from_b)
     return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Displacement, SensorNoise, StereoRig
-from twin.estimate.navigation.pose_filter import kalman_update
+from twin.estimate.navigation.pose_filter import DVL, fuse_reading
 from twin.kernels import kernel
 
 
@@ -126,7 +126,7 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
 
 @kernel
-def fuse_dvl(state, model, a_from_b, cov, velocity):
+def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
     """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
     Args:
@@ -134,10 +134,12 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
         model: `DvlModel`.
         a_from_b, cov: (4, 4), (6, 6) visual motion of the camera and its covariance.
         velocity: (3,) reading of this frame, in body axes [m/s]; NaN if there is none.
+        gates: `ReadingGates`, modified in place.
 
     Returns:
         The fused motion (4, 4) and its covariance (6, 6). If the reading of this frame or of the previous one is
-        missing, these are `a_from_b` and `cov` unchanged, and the integration becomes incomplete.
+        missing, or if they contradict the visual motion, these are `a_from_b` and `cov` unchanged, and the integration
+        becomes incomplete.
     """
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
@@ -148,7 +150,11 @@ def fuse_dvl(state, model, a_from_b, cov, velocity):
     for i in range(3):
         now = rotation[i, 0] * velocity[0] + rotation[i, 1] * velocity[1] + rotation[i, 2] * velocity[2]
         step[i] = (last[i] + now) / 2 * model.step_s
-    fused, fused_cov = fuse_displacement(a_from_b, cov, step, _step_cov(state, model, step), model.body_from_camera)
+    step_cov = _step_cov(state, model, step)
+    fused, fused_cov, used = fuse_displacement(a_from_b, cov, step, step_cov, model.body_from_camera, gates)
+    if not used:
+        state.velocity[:], state.complete[0] = np.nan, False
+        return a_from_b, cov
     _accumulate(state, model, step, fused, fused_cov)
     return fused, fused_cov
 
@@ -221,16 +227,17 @@ def _restart(state):
 
 
 @kernel
-def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera):
+def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera, gates):
     """Updates a camera motion with a measured displacement of the body's origin (Kalman update).
 
     Args:
         a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
         step, step_cov: (3,), (3, 3) displacement [m] in the axes of the body before the motion, and its covariance.
         body_from_camera: (4, 4) pose of the camera in the body.
+        gates: `ReadingGates`, modified in place.
 
     Returns:
-        Motion (4, 4) and covariance (6, 6) after the update.
+        Motion (4, 4) and covariance (6, 6) after the update, and whether the displacement was used.
     """
     expected, by_motion = body_displacement(a_from_b, body_from_camera)
-    return kalman_update(a_from_b, cov, step - expected, by_motion, step_cov)
+    return fuse_reading(a_from_b, cov, step - expected, by_motion, step_cov, gates, DVL)

@@ -6,9 +6,11 @@ covariances of poses and motions refer to [rotation, translation] (rad, m) in ca
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -16,6 +18,13 @@ from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.kernels import kernel
 
 _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a pose in `correct_pose`; above it, the pose is rejected
+SENSORS = ("pressure", "ahrs", "dvl", "usbl", "beacons", "vertical")  # navigation sensors, in the order of their gates
+PRESSURE, AHRS, DVL, USBL, BEACONS, VERTICAL = range(6)
+#: Largest chi2 of a reading with 1, 2 and 3 components; one in 1e9 exceeds it.
+_READING_GATES = (37.3, 41.4, 44.8)
+#: Number of consecutive readings of each sensor that are rejected before it is believed: 10 s at 30 frames per second,
+#: for the DVL, whose readings contradict each motion of vision anew, 2 s.
+_PATIENCE = (300, 300, 30, 5, 20, 300)
 
 
 class PoseFilter:
@@ -32,14 +41,16 @@ class PoseFilter:
         world_from_camera: (4, 4) estimated pose.
         cov: (6, 6) covariance of the error of this pose.
         pressure_ahrs: error model of the pressure sensor and the AHRS.
+        gates: states of the gates of all sensors.
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
-        self.world_from_camera = world_from_camera
-        self.cov = np.diag([1e-8] * 3 + [1e-8] * 3)
+        self.world_from_camera: Array = world_from_camera
+        self.cov: Array = np.diag([1e-8] * 3 + [1e-8] * 3)
         self.rig, self.noise = rig, noise
         camera_from_body = geometry.inverse(rig.body_from_camera)
         self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
+        self.gates = ReadingGates(np.zeros((len(SENSORS), 3), np.int64), np.zeros((len(SENSORS), 3)))
 
     def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
         """Fuses a pose measured relative to an earlier pose, such as the result of a registration with the mosaic.
@@ -64,17 +75,39 @@ class PoseFilter:
         self.reset(pose, self.cov - decrease)
         return decrease
 
-    def fuse_position_fixes(self, readings: Readings) -> None:
-        """Fuses the readings that are taken only at keyframes: an acoustic position fix, and the beacons detected."""
+    def fuse_position_fixes(self, readings: Readings) -> Readings:
+        """Fuses the readings that are taken only at keyframes: an acoustic position fix, and the beacons detected.
+
+        Returns:
+            The readings without the position fix and the beacons that were rejected.
+        """
+        counts, beacons = self.rejected, []
         if readings.usbl_m is not None:
             rotation = self.world_from_camera[:3, :3]
             residual = readings.usbl_m - self.world_from_camera[:3, 3]
-            self._update(residual, np.hstack([np.zeros((3, 3)), rotation]), np.eye(3) * self.noise.usbl_m**2)
+            self._update(USBL, residual, np.hstack([np.zeros((3, 3)), rotation]), np.eye(3) * self.noise.usbl_m**2)
         for sighting in readings.beacons or ():
             beacon = np.array(self.noise.beacons_m[sighting.beacon])
             expected, jacobian = project_beacon(self.world_from_camera, beacon, self.rig)
+            before = self.rejected[BEACONS]
             if np.isfinite(expected).all():
-                self._update(np.array(sighting.pixel) - expected, jacobian, np.eye(2) * self.noise.beacon_px**2)
+                residual = np.array(sighting.pixel) - expected
+                self._update(BEACONS, residual, jacobian, np.eye(2) * self.noise.beacon_px**2)
+            if self.rejected[BEACONS] == before:
+                beacons.append(sighting)
+        used = self.without_rejected(readings, counts)
+        return used if used.beacons is None else replace(used, beacons=tuple(beacons))
+
+    @property
+    def rejected(self) -> NDArray[np.int64]:
+        """Returns the number (6,) of rejected readings of each sensor in `SENSORS`."""
+        return self.gates.counts[:, 1].copy()
+
+    def without_rejected(self, readings: Readings, counts: NDArray[np.int64]) -> Readings:
+        """Returns readings without those, except beacons, of sensors with rejections since `rejected` was `counts`."""
+        names = ("pressure_z_m", "ahrs_rpy_rad", "dvl_mps", "usbl_m", None, "up")
+        changed = zip(names, self.rejected > counts, strict=True)
+        return replace(readings, **{name: None for name, is_rejected in changed if name and is_rejected})
 
     def fuse_vertical(self, readings: Readings) -> None:
         """Fuses the direction of the vertical, if it was measured, as far as it is more precise than the pose.
@@ -94,14 +127,15 @@ class PoseFilter:
         if above.any():
             known = axes[:, above].T
             noise = self.noise.up_rad**2 / (1 - self.noise.up_rad**2 / variances[above])
-            self._update(-known @ across @ predicted, known @ jacobian, np.diag(noise))
+            self._update(VERTICAL, -known @ across @ predicted, known @ jacobian, np.diag(noise))
 
     def reset(self, world_from_camera: Array, cov: Array) -> None:
         """Replaces pose and covariance, for example by those of a global alignment."""
         self.world_from_camera, self.cov = geometry.nearest_rigid(world_from_camera), cov
 
-    def _update(self, residual: Array, jacobian: Array, cov: Array) -> None:
-        self.world_from_camera, self.cov = kalman_update(self.world_from_camera, self.cov, residual, jacobian, cov)
+    def _update(self, sensor: int, residual: Array, jacobian: Array, cov: Array) -> None:
+        pose = self.world_from_camera, self.cov
+        self.world_from_camera, self.cov, _ = fuse_reading(*pose, residual, jacobian, cov, self.gates, sensor)
 
 
 def perpendicular_axes(direction: Array) -> Array:
@@ -125,6 +159,19 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
     return rig.project(point)[0], by_point @ np.hstack([geometry.skew(point[0]), -np.eye(3)])
 
 
+class ReadingGates(NamedTuple):
+    """States of the gates that reject readings, one row for each sensor in `SENSORS`. The arrays are modified in place.
+
+    Args:
+        counts: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used
+            although they contradict the pose.
+        residuals: (6, 3) residual of the last reading that contradicted the pose.
+    """
+
+    counts: NDArray[np.int64]
+    residuals: Array
+
+
 class PressureAhrsModel(NamedTuple):
     """Error model of the pressure sensor and the AHRS.
 
@@ -140,7 +187,7 @@ class PressureAhrsModel(NamedTuple):
 
 
 @kernel
-def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
+def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad, gates):
     """Updates a pose with readings of height and attitude (Kalman update).
 
     Args:
@@ -148,6 +195,7 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
         model: `PressureAhrsModel`.
         height_m, rpy_rad: readings of the height of the left camera in the world [m], and of roll, pitch and yaw (3,)
             of the body in the world [rad]; NaN where there is no reading.
+        gates: `ReadingGates`, modified in place.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -157,11 +205,11 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad):
         by_pose, residual, height_cov = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
         geometry.copy_into(by_pose[0, 3:], pose[2, :3])
         residual[0], height_cov[0, 0] = height_m - pose[2, 3], model.pressure_m2
-        pose, cov = kalman_update(pose, cov, residual, by_pose, height_cov)
+        pose, cov, _ = fuse_reading(pose, cov, residual, by_pose, height_cov, gates, PRESSURE)
     if not np.isnan(rpy_rad[0]):
         measured, attitude_cov = _camera_attitude(rpy_rad, model.camera_from_body[:3, :3], model.attitude_sigmas_rad)
         residual = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
-        pose, cov = kalman_update(pose, cov, residual, np.eye(3, 6), attitude_cov)
+        pose, cov, _ = fuse_reading(pose, cov, residual, np.eye(3, 6), attitude_cov, gates, AHRS)
     return pose, cov
 
 
@@ -188,6 +236,45 @@ def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: flo
     values, axes = np.linalg.eigh(inverse_root @ cov @ inverse_root.T)
     axes = root @ axes
     return axes * np.minimum(np.maximum(values, lower), upper) @ axes.T
+
+
+@kernel
+def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
+    """Updates a pose with a reading (Kalman update), unless the reading contradicts the pose.
+
+    It does if the chi-square of its residual is above the limit. If many readings in succession contradict the pose in
+    the same way, the pose is taken to be wrong: its covariance is increased by that of the error they imply.
+
+    Args:
+        world_from_camera, prior, residual, jacobian, cov: see `kalman_update`.
+        gates: `ReadingGates`, modified in place.
+        sensor: index of the sensor in `SENSORS`.
+
+    Returns:
+        Pose (4, 4) and covariance (6, 6) after the update, and whether the reading was used.
+    """
+    counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
+    innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov
+    if _chi2(residual, innovation_cov) > _READING_GATES[n - 1]:
+        as_before = _chi2(residual - last[:n], innovation_cov) <= _READING_GATES[n - 1]
+        counts[0] = counts[0] + 1 if as_before else 1
+        geometry.copy_into(last[:n], residual)
+        if counts[0] <= _PATIENCE[sensor]:
+            counts[1] += 1
+            return world_from_camera, prior, False
+        counts[2] += 1
+        error = jacobian.T @ np.linalg.solve(geometry.product(jacobian, jacobian.T), residual)
+        prior = prior + np.outer(error, error)
+    else:
+        counts[0] = 0
+    pose, cov = kalman_update(world_from_camera, prior, residual, jacobian, cov)
+    return pose, cov, True
+
+
+@kernel
+def _chi2(residual, cov):
+    """Returns the chi-square of a residual (k,) with covariance (k, k)."""
+    return np.sum(residual * np.linalg.solve(cov, residual))
 
 
 @kernel
