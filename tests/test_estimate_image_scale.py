@@ -98,10 +98,11 @@ def test_where_corners_are_many_they_are_not_on_a_grid():
 
 
 def test_the_first_textured_pair_sets_the_scale_and_tracking_fails_until_then(tmp_path):
-    dark, coarse, fine = (np.full((240, 320, 3), 90, np.uint8),) * 2, stereo_pair(12.0, 4.0), stereo_pair(2.0, 12.0)
+    dark, darker = ((np.full((240, 320, 3), grey, np.uint8),) * 2 for grey in (90, 80))
+    coarse, fine = stereo_pair(12.0, 4.0), stereo_pair(2.0, 12.0)
     results = []
     with StereoVision(RIG, EstimatorSettings(), tmp_path, cell_m=0.01) as vision:
-        for k, (left, right) in enumerate((dark, dark, coarse, fine)):
+        for k, (left, right) in enumerate((dark, darker, coarse, fine)):
             frame = Frame(k, k / 30, left, right)
             status = vision.track_frame(frame)[1]
             results.append((status, vision.observe_stereo(frame, k) is not None, vision.binning))

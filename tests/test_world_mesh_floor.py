@@ -306,14 +306,14 @@ def bad_meshes(folder: Path) -> None:
     ("file", "overrides", "problem"),
     [
         ("no.ply", [], "terrain.mesh_file: no such file"),
-        ("empty.ply", [], "terrain.mesh_file: 'empty.ply' has no PLY header"),
+        ("empty.ply", [], "terrain.mesh_file: 'empty.ply' cannot be read: has no PLY header"),
         ("huge.ply", [], "terrain.mesh_file: 'huge.ply' has 100000000 triangles (allowed: at most 2000000 triangles)"),
         ("nan.ply", [], "terrain.mesh_file: 'nan.ply' has corners that are not finite"),
         ("grey.ply", [], "terrain.mesh_file: 'grey.ply' has no colours"),
         (
             "large.obj",
             [],
-            "terrain.mesh_file: 'large.obj' has textures of 128000 texels (allowed: at most 100000 texels)",
+            "terrain.mesh_file: 'large.obj' cannot be read: a texture is a PNG of 400 x 320 pixels",
         ),
         ("wall.ply", [], "terrain.mesh_file: 'wall.ply' has no surface that faces up"),
         ("small.ply", [], "plan.area_m: 1 x 0.5 m is larger than the terrain"),

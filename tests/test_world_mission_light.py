@@ -22,7 +22,7 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
         (["water.mean_cosine=1.0"], r"water\.mean_cosine: 1\.0: not allowed"),
         (["water.phase_function=mie"], r"water\.phase_function: 'mie': not allowed"),
         (["imaging.forward_scatter=true"], r"imaging\.forward_scatter: renamed to imaging\.scattering"),
-        (["water.spectrum_file=none.csv"], r"water\.spectrum_file: .*none\.csv cannot be read"),
+        (["water.spectrum_file=none.csv"], r"water\.spectrum_file: no such file .*none\.csv"),
         (["snow.junge_exponent=0.5"], r"snow\.junge_exponent: 0\.5: not allowed .*greater than 1"),
         (["snow.diameter_max_m=0.02"], r"snow\.diameter_max_m: is unused: .* \(allowed: with snow\.junge_exponent\)"),
         (
