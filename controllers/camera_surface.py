@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter1d
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.kernels import kernel
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.survey_plan import SurveyPlan
+from twin.controllers.survey_plan import SurveyPlan
 
 Array = NDArray[np.float64]
 

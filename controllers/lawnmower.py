@@ -14,10 +14,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from controllers.profile import SpeedProfile
-from controllers.segments import Point, Segment, Turn, line
-from controllers.survey_area import SurveyArea
-from controllers.survey_plan import (
+from twin.controllers.profile import SpeedProfile
+from twin.controllers.segments import Point, Segment, Turn, line
+from twin.controllers.survey_area import SurveyArea
+from twin.controllers.survey_plan import (
     TURN_ACCELERATION,
     TURN_RATE,
     SurveyPlan,

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.profile import SpeedProfile
+from twin.controllers.profile import SpeedProfile
 
 Array = NDArray[np.float64]
 Point = tuple[float, float, float]

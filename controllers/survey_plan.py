@@ -9,9 +9,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from controllers.camera_surface import CameraSurface
-from controllers.segments import Circle, Reference, Segment, Turn
-from controllers.survey_area import SurveyArea
+from twin.controllers.camera_surface import CameraSurface
+from twin.controllers.segments import Circle, Reference, Segment, Turn
+from twin.controllers.survey_area import SurveyArea
 from twin.errors import TwinError
 
 Array = NDArray[np.float64]

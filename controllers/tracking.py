@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.allocation import ThrustAllocation, allocate_wrench
-from controllers.segments import Reference
+from twin.controllers.allocation import ThrustAllocation, allocate_wrench
+from twin.controllers.segments import Reference
 from twin.kernels import kernel
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.gl import MjSpec, mujoco
-from terrains import Terrain
 from twin.core.grid_triangles import grid_triangles
+from twin.scenes.gl import MjSpec, mujoco
+from twin.terrains import Terrain
 
 TILE_CELLS = 48  #: cells along a tile's side: a compromise between OpenGL state changes and vertices outside the view
 MAX_TILES = 900  #: MuJoCo supports at most 1000 textures

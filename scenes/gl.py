@@ -1,4 +1,4 @@
-"""MuJoCo, configured for offscreen rendering. All modules import it from here: ``from scenes.gl import mujoco``.
+"""MuJoCo, configured for offscreen rendering. All modules import it from here: ``from twin.scenes.gl import mujoco``.
 
 MuJoCo imports PyOpenGL, so the OpenGL backend must be chosen before MuJoCo is imported. Both happen at the first use.
 """

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.terrain import MAX_NODES, MAX_TEXELS
 from twin.core.raster_files import IMAGE_DRIVERS, open_raster
 from twin.errors import TwinError
+from twin.terrains.terrain import MAX_NODES, MAX_TEXELS
 
 HEIGHT_FIELD = "terrain.height_file"
 HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height per cell"

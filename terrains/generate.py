@@ -8,12 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.ground_cover import DEFAULT_COVERS
-from terrains.noise import fractal_field
-from terrains.terrain import Terrain, texture_shape
-from terrains.textures import TextureSource, generate_texture
-from terrains.wall_texture import walls_of
 from twin.errors import TwinError
+from twin.terrains.ground_cover import DEFAULT_COVERS
+from twin.terrains.noise import fractal_field
+from twin.terrains.terrain import Terrain, texture_shape
+from twin.terrains.textures import TextureSource, generate_texture
+from twin.terrains.wall_texture import walls_of
 
 Heights = NDArray[np.float32]
 MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: limit of the slope (rise over run) of a reef, see `_limit_slope`

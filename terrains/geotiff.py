@@ -14,12 +14,12 @@ from rasterio.crs import CRS
 from rasterio.enums import ColorInterp
 from rasterio.warp import transform
 
-from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count
-from terrains.holes import check_no_undeclared_holes
-from terrains.vertical import VerticalAxis, cf_direction, unit_length_m
 from twin.core.georeference import Georeference
 from twin.core.raster_files import open_raster
 from twin.errors import TwinError
+from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count
+from twin.terrains.holes import check_no_undeclared_holes
+from twin.terrains.vertical import VerticalAxis, cf_direction, unit_length_m
 
 _LEAST_CELL, _MOST_CELL, _MOST_COORDINATE = 1e-4, 1e5, 1e9  # of a plausible grid, in units of its CRS
 #: Tags of a raster band that may name the quantity of its values, e.g. depth.

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.lattice_noise import Table, cells, fractal_noise, lattice_table, value_noise
 from twin.kernels import kernel
+from twin.terrains.lattice_noise import Table, cells, fractal_noise, lattice_table, value_noise
 
 GRAINS, STONES, CRACKS, POLYPS, BLADES, BURROWS, SHELLS = range(7)
 Colour = tuple[int, int, int]

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.file_header import HEIGHT_FIELD
 from twin.errors import TwinError
+from twin.terrains.file_header import HEIGHT_FIELD
 
 #: Values that programs write in cells without a height.
 _NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 65535.0)

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count, image_size
-from terrains.ground_cover import DEFAULT_COVERS
-from terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
-from terrains.terrain import Terrain, texture_shape
-from terrains.textures import TextureSource, generate_texture, texture_from_photo
-from terrains.vertical import Direction, VerticalAxis, upward_sign
-from terrains.wall_texture import walls_of
 from twin.core.georeference import Georeference
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, reading
 from twin.errors import TwinError
+from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count, image_size
+from twin.terrains.ground_cover import DEFAULT_COVERS
+from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
+from twin.terrains.terrain import Terrain, texture_shape
+from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
+from twin.terrains.vertical import Direction, VerticalAxis, upward_sign
+from twin.terrains.wall_texture import walls_of
 
 _MOST_HEIGHT_M = 20_000.0
 
@@ -83,7 +83,7 @@ def load(
     covered = None
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
-        from terrains.orthophoto import lay_orthophoto
+        from twin.terrains.orthophoto import lay_orthophoto
 
         covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
     walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
@@ -107,7 +107,7 @@ def read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> 
     named = VerticalAxis(texts=(file.stem,))
     if suffix in (".tif", ".tiff"):
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
-        from terrains.geotiff import read_geotiff
+        from twin.terrains.geotiff import read_geotiff
 
         grid = HeightGrid(*read_geotiff(file, height_spacing_m))
     elif suffix == ".png":

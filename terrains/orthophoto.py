@@ -13,10 +13,10 @@ from rasterio.transform import Affine, array_bounds
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
-from terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count, eight_bits
 from twin.core.georeference import Georeference
 from twin.core.raster_files import open_raster
 from twin.errors import TwinError
+from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count, eight_bits
 
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
 _NO_PALETTE = "a GeoTIFF with bands of colour: gdal_translate -expand rgb writes one"

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrains.walls import Walls
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
+from twin.terrains.walls import Walls
 
 #: Limits set by memory: the model for rendering takes about 400 bytes per node and 9 bytes per texel.
 MAX_NODES = 6_000_000

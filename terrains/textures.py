@@ -10,12 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.file_header import TEXTURE_FIELD, check_texel_count, eight_bits, image_size
-from terrains.ground_cover import COVERS, paint
-from terrains.noise import fractal_field, pink_noise
-from terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, reading
 from twin.errors import TwinError
+from twin.terrains.file_header import TEXTURE_FIELD, check_texel_count, eight_bits, image_size
+from twin.terrains.ground_cover import COVERS, paint
+from twin.terrains.noise import fractal_field, pink_noise
+from twin.terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
 
 _PHOTOS = "a PNG, JPEG, TIFF, BMP or WebP image"
 COARSEN_TEXELS = 40_000_000  #: largest number of texels of a floor with `TextureSource.coarsen`

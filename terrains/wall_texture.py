@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.textures import TextureSource, generate_wall_texture, texture_from_photo
-from terrains.walls import Walls, wall_weights
+from twin.terrains.textures import TextureSource, generate_wall_texture, texture_from_photo
+from twin.terrains.walls import Walls, wall_weights
 
 WALL_TEXELS = 10_000_000  #: largest number of texels of the texture of walls
 

@@ -161,7 +161,7 @@ def write_inline(folder: Path, changes: list[tuple[str, str]]) -> tuple[Path, li
 
 def attempt(file: Path, overrides: list[str]) -> str:
     """Loads and plans a scenario; returns "accepted" or the text of the TwinError. Any other exception is raised."""
-    from twin.app.plan_summary import summarise
+    from twin.planning.summary import summarise
     from twin.scenario.file import dump_toml, load_scenario
     from twin.world.mission import prepare
 
@@ -176,7 +176,7 @@ def attempt(file: Path, overrides: list[str]) -> str:
 
 def _work(cases: list[list[tuple[str, str]]], first: int, step: int, pipe: Any) -> None:
     """Attempts the cases first, first + step, ... and sends (number, None) before and (number, outcome) after each."""
-    from twin.app.plan_summary import summarise  # noqa: F401 (imported before memory is limited)
+    from twin.planning.summary import summarise  # noqa: F401 (imported before memory is limited)
     from twin.world import mission  # noqa: F401
 
     with tempfile.TemporaryDirectory() as folder, open("/proc/self/statm") as statm:

@@ -12,9 +12,9 @@ from study_surveys import SerialEngine, study_of
 
 from twin.app import study_command
 from twin.errors import ScenarioError
-from twin.study import runner, wording
-from twin.study.flight import row_of
-from twin.study.progress import StudyProgress
+from twin.studies import runner, wording
+from twin.studies.flight import row_of
+from twin.studies.progress import StudyProgress
 
 STUDY = """
 scenario = "reef"

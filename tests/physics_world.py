@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from scenes.bluerov2 import BLUEROV2_HEAVY
-from scenes.gl import MjModel, mujoco
 from twin.scenario.model import VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 
 STILL = np.zeros(3)

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtri
 
-from twin.app import expected_error, plan_summary
-from twin.app.expected_error import ExpectedError
+from twin.planning import expected_error
+from twin.planning import summary as plan_summary
+from twin.planning.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
 from twin.surrogate.error_model import BinnedDepthLaw, ScatterLaw

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 import twin
-from scenes.gl import INSTALL_LINE
 from twin import cli
 from twin.app import console, doctor
 from twin.errors import TwinError
+from twin.scenes.gl import INSTALL_LINE
 
 ROOT = Path(__file__).parent.parent
 NUMBERS = dict.fromkeys(

@@ -9,10 +9,8 @@ import sys
 import pytest
 from numba.core.registry import CPUDispatcher
 
-import controllers
-import scenes
-import terrains
 import twin
+from twin import controllers, scenes, terrains
 
 
 def compiled_functions():
@@ -48,8 +46,8 @@ def test_fastmath_functions_that_others_call_are_inlined():
     last bit of an image and, by its effect on control, by 0.6 mm in a path. An inlined function has no separate copy.
     """
     found = {name: (inlined, callers) for name, inlined, callers in fastmath_functions(compiled_functions())}
-    assert found["twin.imaging.shading._illuminate"] == (True, ["twin.imaging.shading.shade"])
-    assert found["twin.imaging.shading.shade"] == (False, [])
+    assert found["twin.imaging.light.shading._illuminate"] == (True, ["twin.imaging.light.shading.shade"])
+    assert found["twin.imaging.light.shading.shade"] == (False, [])
     wrong = [name for name, (inlined, callers) in found.items() if callers and not inlined]
     assert not wrong, f"called by others, so forceinline=True is required: {', '.join(wrong)}"
 

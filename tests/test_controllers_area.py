@@ -5,11 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controllers import lawnmower, loops
-from controllers.forecast import least_clearance
-from controllers.segments import Turn
-from controllers.survey_area import SurveyArea, polygon_area
-from controllers.survey_plan import TURN_PER_KEYFRAME, TURN_RATE, SurveyRequest
+from twin.controllers import lawnmower, loops
+from twin.controllers.forecast import least_clearance
+from twin.controllers.segments import Turn
+from twin.controllers.survey_area import SurveyArea, polygon_area
+from twin.controllers.survey_plan import TURN_PER_KEYFRAME, TURN_RATE, SurveyRequest
 from twin.errors import TwinError
 
 REQUEST = {

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from controllers import lawnmower, loops
-from controllers.survey_plan import SurveyRequest
+from twin.controllers import lawnmower, loops
+from twin.controllers.survey_plan import SurveyRequest
 from twin.scenario.file import load_scenario
 from twin.world.mission import prepare
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.integrate import cumulative_trapezoid
 
-from controllers import loops
-from controllers.forecast import forecast, least_clearance
-from controllers.survey_plan import SurveyRequest
+from twin.controllers import loops
+from twin.controllers.forecast import forecast, least_clearance
+from twin.controllers.survey_plan import SurveyRequest
 from twin.errors import TwinError
 
 REQUEST = {

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from physics_world import bare_model
 
-from controllers.allocation import pseudo_inverse_allocation
-from controllers.lawnmower import plan
-from controllers.segments import Reference
-from controllers.survey_plan import SurveyRequest
-from controllers.tracking import body_reference, commanded_velocity
-from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
+from twin.controllers.allocation import pseudo_inverse_allocation
+from twin.controllers.lawnmower import plan
+from twin.controllers.segments import Reference
+from twin.controllers.survey_plan import SurveyRequest
+from twin.controllers.tracking import body_reference, commanded_velocity
 from twin.core import geometry
 from twin.scenario.model import VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.simulate.autopilot import nominal_controller, top_speed_mps
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from terrains import Terrain
 from twin.core import geometry
 from twin.core.floor_rays import cast_pixels, height_field, map_height_field, ray_grid
 from twin.core.image_overlap import image_overlap
 from twin.core.records import MapGrid, StereoRig
+from twin.terrains import Terrain
 
 RIG = StereoRig(320, 240, 277.0, 0.15)
 

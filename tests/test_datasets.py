@@ -18,19 +18,20 @@ from recorded_datasets import RIG
 from twin.app.outputs import new_folder, writing
 from twin.core import geometry
 from twin.core.records import Frame, Trajectory
-from twin.datasets import image_files, replay
+from twin.datasets import image_files
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
-from twin.datasets.frames import RecordedFrames, increasing
 from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.readers import read_dataset
-from twin.datasets.rectification import rectification
-from twin.datasets.replay import ReplayOptions, open_dataset
 from twin.datasets.truth_files import read_truth
 from twin.errors import TwinError
 from twin.exchange.euroc import EurocWriter
 from twin.plugin import loading
+from twin.recordings import replay
+from twin.recordings.frames import RecordedFrames, increasing
+from twin.recordings.rectification import rectification
+from twin.recordings.replay import ReplayOptions, open_dataset
 from twin.report.run_folder import load_run
 
 RNG = np.random.default_rng(1)

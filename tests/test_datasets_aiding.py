@@ -15,10 +15,10 @@ from twin.core import geometry
 from twin.core.records import ImuReadings, Readings
 from twin.datasets.bag_reader import BagReader
 from twin.datasets.readings import read_folder
-from twin.datasets.replay import ReplayOptions, open_dataset
 from twin.errors import TwinError
 from twin.exchange import euroc, ros2
 from twin.exchange.run_contents import ImuNoise, RecordedImu
+from twin.recordings.replay import ReplayOptions, open_dataset
 
 pytestmark = pytest.mark.long
 

@@ -7,8 +7,8 @@ from recorded_datasets import RIG
 from twin.core import geometry
 from twin.core.records import Trajectory
 from twin.core.settings import EstimatorSettings
-from twin.datasets.aiding import Aiding, Opening
 from twin.datasets.readings import RecordedReadings, SensorSeries
+from twin.recordings.aiding import Aiding, Opening
 
 START_S, RATE_HZ = 5.0, 10.0  # time of the first frame in the clock of the data set, rate of frames and readings
 BODY_FROM_LEFT = geometry.pose(geometry.rotation_from_rpy(np.pi, 0.1, 0.7), np.array([0.2, 0.1, -0.3]))

@@ -22,11 +22,11 @@ from twin.datasets.bag_calibration import stereo_calibration
 from twin.datasets.bag_images import raw_pixels
 from twin.datasets.bag_reader import BagReader, BagTopics
 from twin.datasets.bag_topics import image_topics, stereo_topics
-from twin.datasets.frames import RecordedFrames
 from twin.datasets.image_files import UnreadableImage
-from twin.datasets.replay import ReplayOptions, open_dataset
-from twin.datasets.replay import image_topics as named_topics
 from twin.errors import TwinError
+from twin.recordings.frames import RecordedFrames
+from twin.recordings.replay import ReplayOptions, open_dataset
+from twin.recordings.replay import image_topics as named_topics
 
 PATH = recorded.poses(5)
 FILE = Path("survey.mcap")

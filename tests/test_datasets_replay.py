@@ -18,14 +18,15 @@ from recorded_datasets import RIG
 import twin
 from twin.core import geometry
 from twin.core.records import MapGrid, Trajectory
-from twin.datasets import preview, readers, replay
-from twin.datasets.frames import RecordedFrames
-from twin.datasets.replay import ReplayOptions, alignment_name, bayer_pattern, open_dataset
+from twin.datasets import readers
 from twin.errors import TwinError
 from twin.estimate.first_pair import floor_plane, inspect_pair
 from twin.exchange.euroc import EurocWriter
 from twin.exchange.geotiff import write_elevations
 from twin.plugin import loading
+from twin.recordings import preview, replay
+from twin.recordings.frames import RecordedFrames
+from twin.recordings.replay import ReplayOptions, alignment_name, bayer_pattern, open_dataset
 from twin.report import recording, survey_page
 from twin.report.run_folder import load_run
 

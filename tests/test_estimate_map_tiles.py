@@ -11,9 +11,9 @@ import seafloor_scene as scene
 import twin
 from twin.core import geometry
 from twin.core.records import StereoRig, SurveyResult, Trajectory
-from twin.datasets.replay import ReplayOptions
 from twin.estimate import EstimatorSettings, Navigator, pipeline
 from twin.estimate.mapping.footprint import footprint_grid, footprint_tiles, steps_between
+from twin.recordings.replay import ReplayOptions
 
 RIG = StereoRig(320, 240, 277.0, 0.15, 5.0)
 

@@ -13,7 +13,6 @@ from ifdo import iFDO
 from physics_world import vehicle
 from scipy.spatial.transform import Rotation
 
-from twin.app.camera_models import believed_calibration, true_calibration
 from twin.core import geometry
 from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, ImuReadings, MapGrid, Readings, StereoRig, Trajectory
@@ -24,6 +23,7 @@ from twin.exchange import camera_files, colmap, euroc, geotiff, ifdo, kitti, met
 from twin.exchange.attitude import yaw_pitch_roll_deg
 from twin.exchange.formats import FORMATS, check_needs, chosen_formats
 from twin.exchange.run_contents import ImuNoise, RecordedFrame, RecordedImu, RunContents, project
+from twin.exports.camera_models import believed_calibration, true_calibration
 from twin.scenario.model import Scenario
 
 N = 5

@@ -14,12 +14,12 @@ import twin
 from twin.core import geometry
 from twin.core.records import ImuReadings, Readings
 from twin.datasets.bag_reader import BagReader, BagTopics
-from twin.datasets.frames import RecordedFrames
-from twin.datasets.replay import ReplayOptions
 from twin.exchange import euroc, ros2
 from twin.exchange.euroc import timestamp_ns
 from twin.exchange.formats import FORMATS
 from twin.exchange.run_contents import ImuNoise, RecordedImu
+from twin.recordings.frames import RecordedFrames
+from twin.recordings.replay import ReplayOptions
 
 N = 4
 ANGLES = np.array([0.05, -0.1, 2.0])

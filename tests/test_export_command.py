@@ -11,17 +11,17 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from terrains.terrain import Terrain
-from twin.app.export_command import ExportOptions, export, run_contents
-from twin.app.true_layers import floor_normals, optical_flow
 from twin.core import geometry
 from twin.core.records import Frame, ImuReadings, Readings, StereoRig, Trajectory
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import geotiff
+from twin.exports.command import ExportOptions, export, run_contents
+from twin.exports.true_layers import floor_normals, optical_flow
 from twin.report.frame_recorder import IMU_COLUMNS, FrameRecorder, remove_keyframe_images
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
+from twin.terrains.terrain import Terrain
 
 RIG = StereoRig(40, 30, 35.0, 0.1)
 SCENARIO = {
@@ -317,7 +317,7 @@ def test_the_world_rendered_again_gives_the_recorded_images_and_their_truth(reco
 @pytest.mark.parametrize(("jpeg_quality", "limit_m"), [(None, 0.001), (90, 0.003)])
 def test_an_exported_survey_is_replayed_to_the_same_path(flown, jpeg_quality, limit_m, tmp_path):
     import twin
-    from twin.datasets.replay import ReplayOptions
+    from twin.recordings.replay import ReplayOptions
 
     export(flown, ["euroc"], tmp_path, ExportOptions(jpeg_quality=jpeg_quality))
     replayed = twin.replay(tmp_path / "euroc", tmp_path / "run", ReplayOptions(outputs=()))
@@ -350,7 +350,7 @@ def test_a_survey_with_an_imu_and_without_attitude_is_replayed_level_within_its_
     """
     import twin
     from twin import survey
-    from twin.datasets.replay import ReplayOptions
+    from twin.recordings.replay import ReplayOptions
     from twin.scenario.file import load_scenario
 
     keys = ["plan.area_m=[2.0,1.0]", "rig.frame_rate_hz=10", "record=all", 'navigation.aiding=["pressure"]', "imu={}"]

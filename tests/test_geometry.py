@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from scenes.gl import mujoco
 from twin.core import geometry as g
+from twin.scenes.gl import mujoco
 
 settings.register_profile("compiling", deadline=None)  # the first call of a kernel includes its compilation
 settings.load_profile("compiling")

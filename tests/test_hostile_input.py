@@ -23,7 +23,7 @@ from twin.report.run_folder import load_run
 from twin.report.survey_page import write_report
 from twin.scenario.file import load_scenario
 from twin.scenario.toml_lines import key_lines
-from twin.study.study_file import load_study
+from twin.studies.study_file import load_study
 from twin.world import limits
 
 LIMIT_S = 15.0
@@ -195,7 +195,7 @@ def test_the_name_of_a_file_contains_no_separator_and_at_most_100_bytes():
 
 
 def test_a_bug_still_shows_its_traceback(command, monkeypatch):
-    monkeypatch.setattr("twin.app.plan_summary.summarise", lambda _: 1 / 0)
+    monkeypatch.setattr("twin.planning.summary.summarise", lambda _: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         command("plan", "reef", *SMALL, "--out", "x.png")
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from twin.imaging.true_cameras import make_true_cameras
+from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.scenario.model import Scenario
 
 POINTS = np.array([[0.0, 0.0, 2.0], [0.6, 0.4, 2.0], [-0.5, 0.3, 1.5], [0.3, -0.45, 3.0]])

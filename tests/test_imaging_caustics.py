@@ -8,14 +8,14 @@ import pytest
 
 from twin.core import geometry
 from twin.errors import TwinError
-from twin.imaging import caustics as caustics_module
-from twin.imaging.caustics import CELLS, TILE_DEPTHS, Caustics, scattering_blur
-from twin.imaging.illumination import Daylight, Illumination, daylight_at, illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.phase_function import petzold, tabulate
-from twin.imaging.sun_sky import SunSky
-from twin.imaging.water import Medium, medium
-from twin.imaging.waves import GRAVITY_MPS2, slope_variance
+from twin.imaging.light import caustics as caustics_module
+from twin.imaging.light.caustics import CELLS, TILE_DEPTHS, Caustics, scattering_blur
+from twin.imaging.light.illumination import Daylight, Illumination, daylight_at, illumination_of
+from twin.imaging.light.phase_function import petzold, tabulate
+from twin.imaging.light.sun_sky import SunSky
+from twin.imaging.light.water import Medium, medium
+from twin.imaging.light.waves import GRAVITY_MPS2, slope_variance
 from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig
 
 CLEAR = medium(WaterConfig(jerlov="clear"))

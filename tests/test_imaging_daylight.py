@@ -6,14 +6,18 @@ import numpy as np
 import pytest
 
 from twin.core.records import StereoRig
-from twin.imaging.bands import band_weights
-from twin.imaging.daylight import DaylightVeil, floor_daylight
-from twin.imaging.illumination import Illumination, daylight_at, illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.light_field import BandOptics, LightField
-from twin.imaging.light_spectra import spectrum_of
-from twin.imaging.optics import Optics, WaterSurface
-from twin.imaging.phase_function import henyey_greenstein, petzold, table_of, tabulate
+from twin.imaging.light.bands import band_weights
+from twin.imaging.light.daylight import DaylightVeil, floor_daylight
+from twin.imaging.light.illumination import Illumination, daylight_at, illumination_of
+from twin.imaging.light.light_field import BandOptics, LightField
+from twin.imaging.light.light_spectra import spectrum_of
+from twin.imaging.light.optics import Optics, WaterSurface
+from twin.imaging.light.phase_function import henyey_greenstein, petzold, table_of, tabulate
+from twin.imaging.light.shadows import Shadows
+from twin.imaging.light.sun_sky import CRITICAL_COSINE, SunSky, direction_to_sun, sky_radiance
+from twin.imaging.light.water import downwelling_per_m, medium
+from twin.imaging.light.water_tables import water_spectrum
 from twin.imaging.reference.pixel_light import (
     BandWater,
     Effort,
@@ -23,10 +27,6 @@ from twin.imaging.reference.pixel_light import (
     pixel_light,
     plane_light,
 )
-from twin.imaging.shadows import Shadows
-from twin.imaging.sun_sky import CRITICAL_COSINE, SunSky, direction_to_sun, sky_radiance
-from twin.imaging.water import downwelling_per_m, medium
-from twin.imaging.water_tables import water_spectrum
 from twin.reproduce.light_cell import green_of, looking_down
 from twin.scenario.file import load_scenario
 from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig

@@ -8,14 +8,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from terrains import Terrain
 from twin.core import geometry
 from twin.core.floor_rays import cast_pixels, height_field
 from twin.core.geometry import Array
-from twin.imaging.facets import UNIT, Facets
-from twin.imaging.illumination import illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.scene.facets import UNIT, Facets
 from twin.scenario.model import Scenario
+from twin.terrains import Terrain
 
 SCENARIO = Scenario.model_validate(
     {

@@ -5,14 +5,14 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.imaging.forward_scatter import ForwardScatter, _add_upsampled, level_sigma_px, place_of
-from twin.imaging.illumination import Illumination, daylight_at
-from twin.imaging.lamp_light import LampLight
-from twin.imaging.lamps import light_sources_in_camera
-from twin.imaging.optics import FloorView, Optics
-from twin.imaging.phase_function import Scatterer, phase_of, table_of
-from twin.imaging.spread import LAMP_SIGMA_RAD, Absorbed, camera_mixture, lamp_mixture
-from twin.imaging.water import Medium, medium
+from twin.imaging.light.forward_scatter import ForwardScatter, _add_upsampled, level_sigma_px, place_of
+from twin.imaging.light.illumination import Illumination, daylight_at
+from twin.imaging.light.lamp_light import LampLight
+from twin.imaging.light.lamps import light_sources_in_camera
+from twin.imaging.light.optics import FloorView, Optics
+from twin.imaging.light.phase_function import Scatterer, phase_of, table_of
+from twin.imaging.light.spread import LAMP_SIGMA_RAD, Absorbed, camera_mixture, lamp_mixture
+from twin.imaging.light.water import Medium, medium
 from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
 
 RIG = Scenario.model_validate({"rig": {"image_width_px": 160, "image_height_px": 120}}).believed_rig()

@@ -11,12 +11,12 @@ from scipy.ndimage import map_coordinates
 
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
-from twin.imaging.camera import StereoCamera
-from twin.imaging.illumination import illumination_of
+from twin.imaging.camera.lens import Distortion, distort, fold, undistort
+from twin.imaging.camera.resample import interpolate, sample
+from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.imaging.image_formation import ImageFormation
-from twin.imaging.lens import Distortion, distort, fold, undistort
-from twin.imaging.resample import interpolate, sample
-from twin.imaging.true_cameras import make_true_cameras
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.stereo_camera import StereoCamera
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 from twin.world.mission import prepare

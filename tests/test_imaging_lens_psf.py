@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.imaging.lens_psf import LensPsf, defocus_of, diffraction_mtf, mtf
+from twin.imaging.camera.lens_psf import LensPsf, defocus_of, diffraction_mtf, mtf
 from twin.scenario.model import Scenario
 
 WIDTH, HEIGHT = 200, 150

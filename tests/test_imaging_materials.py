@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from numba import njit
 
-from terrains import TextureSource, generate
 from twin.core import geometry
-from twin.imaging.illumination import illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.materials import material_of, reflectance
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.scene.materials import material_of, reflectance
 from twin.scenario.model import Scenario, TerrainConfig
+from twin.terrains import TextureSource, generate
 
 MATERIALS = {
     "lambert": TerrainConfig(),

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrains.objects.mesh import Mesh, mesh_of
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.parts import PART_FACES, UNKNOWN, Parts, parts_of
-from terrains.objects.primitives import box
-from terrains.objects.shapes import SHAPES, build_shape
-from twin.core import geometry
-from twin.imaging import mesh_raster, row_parallel
-from twin.imaging.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
-from twin.imaging.sway import swayed
+from twin.core import geometry, row_parallel
+from twin.imaging.scene import mesh_raster
+from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.imaging.scene.sway import swayed
+from twin.terrains.objects.mesh import Mesh, mesh_of
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.parts import PART_FACES, UNKNOWN, Parts, parts_of
+from twin.terrains.objects.primitives import box
+from twin.terrains.objects.shapes import SHAPES, build_shape
 
 W, H = 96, 80
 FAR = 1_000_000  #: beyond all images [px]

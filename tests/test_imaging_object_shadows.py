@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrains.objects.mesh import mesh_of
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.primitives import sphere
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging.mesh_raster import ObjectView
-from twin.imaging.object_shadows import ObjectShadows
-from twin.imaging.object_view import ObjectRenderer, Objects
-from twin.imaging.shadows import Shadows
+from twin.imaging.light.shadows import Shadows
+from twin.imaging.scene.mesh_raster import ObjectView
+from twin.imaging.scene.object_shadows import ObjectShadows
+from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.terrains.objects.mesh import mesh_of
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.primitives import sphere
 
 W, H, FOCAL = 160, 120, 150.0
 RIG = StereoRig(W, H, FOCAL, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))

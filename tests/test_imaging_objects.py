@@ -5,16 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scenes.gl import mujoco
-from terrains.objects.mesh import Mesh, mesh_of
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.primitives import box, sphere
-from terrains.objects.shapes import SHAPES, build_shape
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging import object_view
-from twin.imaging.mesh_raster import DrawnMesh, ObjectView, Projection, Target, draw_meshes
-from twin.imaging.object_view import ObjectRenderer, Objects
+from twin.imaging.scene import object_view
+from twin.imaging.scene.mesh_raster import DrawnMesh, ObjectView, Projection, Target, draw_meshes
+from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.scenes.gl import mujoco
+from twin.terrains.objects.mesh import Mesh, mesh_of
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.primitives import box, sphere
+from twin.terrains.objects.shapes import SHAPES, build_shape
 
 W, H, FOCAL = 160, 120, 150.0
 RIG = StereoRig(W, H, FOCAL, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.imaging.phase_function import (
+from twin.imaging.light.phase_function import (
     CELLS,
     fournier_forand,
     henyey_greenstein,
@@ -15,8 +15,8 @@ from twin.imaging.phase_function import (
     table_of,
     tabulate,
 )
+from twin.imaging.light.water import scatterers
 from twin.imaging.reference.sampling import density_at, sample_angle, sample_cosine
-from twin.imaging.water import scatterers
 from twin.scenario.model import WaterConfig
 
 FORMULAS = {

@@ -7,9 +7,9 @@ import pytest
 from scipy.optimize import brentq, root
 
 from twin.errors import ScenarioError
-from twin.imaging.port import air_coordinates, pinhole, refract, water_rays
-from twin.imaging.ray_sampling import intersect
-from twin.imaging.true_cameras import make_true_cameras
+from twin.imaging.camera.port import air_coordinates, pinhole, refract, water_rays
+from twin.imaging.camera.ray_sampling import intersect
+from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.scenario.file import load_scenario
 from twin.scenario.model import PortConfig, Scenario
 from twin.world.mission import prepare

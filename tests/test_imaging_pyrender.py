@@ -10,16 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import terrains
-from scenes.builder import CameraPair, build
-from terrains import TextureSource
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.shapes import build_shape
+from twin import terrains
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging import object_view
-from twin.imaging.object_view import ObjectRenderer, Objects
-from twin.imaging.renderer import Renderer
+from twin.imaging.scene import object_view
+from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.renderer import Renderer
+from twin.scenes.builder import CameraPair, build
+from twin.terrains import TextureSource
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.shapes import build_shape
 
 W, H, VFOV = 160, 120, 45.0
 #: Runs in a separate process, as pyrender closes the display of MuJoCo. Without multisampling, which biases the depth.

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.imaging.ray_sampling import RowMotion, intersect, sample_rays
-from twin.imaging.resample import sample
-from twin.imaging.shutter import ExposureMotion
-from twin.imaging.true_cameras import make_true_cameras
+from twin.imaging.camera.ray_sampling import RowMotion, intersect, sample_rays
+from twin.imaging.camera.resample import sample
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.scenario.model import Scenario
 
 FLAT = {"kind": "flat", "thickness_m": 0.012, "distance_m": 0.03}

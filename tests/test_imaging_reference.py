@@ -11,8 +11,8 @@ from scipy.integrate import quad
 from twin.core.floor_rays import height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
-from twin.imaging.lamps import LED_BEAM, beam_share
-from twin.imaging.phase_function import henyey_greenstein, molecular, petzold
+from twin.imaging.light.lamps import LED_BEAM, beam_share
+from twin.imaging.light.phase_function import henyey_greenstein, molecular, petzold
 from twin.imaging.reference.pixel_light import (
     BandWater,
     Effort,

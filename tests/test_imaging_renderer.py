@@ -10,15 +10,13 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-import scenes.floor
-import scenes.gl
-import terrains
-from scenes.builder import CameraPair, SceneModel, build
-from scenes.gl import mujoco
-from terrains import Terrain, TextureSource
+from twin import scenes, terrains
 from twin.core import geometry
 from twin.errors import TwinError
-from twin.imaging.renderer import Renderer, linear_depth, visible_tiles
+from twin.imaging.scene.renderer import Renderer, linear_depth, visible_tiles
+from twin.scenes.builder import CameraPair, SceneModel, build
+from twin.scenes.gl import mujoco
+from twin.terrains import Terrain, TextureSource
 
 W, H, VFOV = 160, 120, 45.0
 POSES = [
@@ -222,7 +220,7 @@ def test_without_egl_mujoco_loads_and_rendering_reports_the_reason() -> None:
     code = """
 import sys
 sys.modules["OpenGL.EGL"] = None
-from scenes.gl import mujoco, offscreen_context
+from twin.scenes.gl import mujoco, offscreen_context
 from twin.errors import TwinError
 model = mujoco.MjModel.from_xml_string("<mujoco/>")
 try:

@@ -5,10 +5,9 @@ import types
 import numpy as np
 import pytest
 
-from twin.core import geometry
-from twin.imaging import row_parallel
-from twin.imaging.illumination import illumination_of
+from twin.core import geometry, row_parallel
 from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.light.illumination import illumination_of
 from twin.scenario.model import Scenario
 
 SCENARIO = Scenario.model_validate(

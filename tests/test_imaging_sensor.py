@@ -5,14 +5,13 @@ import types
 import numpy as np
 import pytest
 
-from twin.core import geometry
+from twin.core import geometry, row_parallel
 from twin.core.timing import Stopwatch
-from twin.imaging import row_parallel
-from twin.imaging.camera import AT_REST, StereoCamera
-from twin.imaging.illumination import illumination_of
+from twin.imaging.camera.photo_sensor import sensor_of
+from twin.imaging.camera.sensor import AutoExposure, ExposureSetting, _mean, expose
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.photo_sensor import sensor_of
-from twin.imaging.sensor import AutoExposure, ExposureSetting, _mean, expose
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.stereo_camera import AT_REST, StereoCamera
 from twin.scenario.model import ImagingConfig, Scenario
 
 PHYSICAL = {"bits": 12, "bayer": True, "readout_ms": 10.0}

@@ -8,19 +8,19 @@ import types
 import numpy as np
 import pytest
 
-import terrains
-from scenes.builder import CameraPair, SceneModel, build
-from scenes.floor import FLOOR_GROUP
-from scenes.gl import mujoco
-from terrains import TextureSource
+from twin import terrains
 from twin.core import geometry
 from twin.core.floor_rays import cast_pixels, height_field
-from twin.imaging import shadows
-from twin.imaging.illumination import illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.renderer import Renderer
-from twin.imaging.shadows import BLOCK_CELLS, Shadows
+from twin.imaging.light import shadows
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.light.shadows import BLOCK_CELLS, Shadows
+from twin.imaging.scene.renderer import Renderer
 from twin.scenario.model import LampConfig, Scenario
+from twin.scenes.builder import CameraPair, SceneModel, build
+from twin.scenes.floor import FLOOR_GROUP
+from twin.scenes.gl import mujoco
+from twin.terrains import TextureSource
 
 LAMPS = [{"position_m": (0.25, 0.6, -0.05), "pan_deg": -15.0}, {"position_m": (0.25, -0.6, -0.05), "pan_deg": 15.0}]
 SCENARIO = Scenario.model_validate(

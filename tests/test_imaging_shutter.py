@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.imaging.shutter import apply_rolling_shutter, blur_by_motion
+from twin.imaging.camera.shutter import apply_rolling_shutter, blur_by_motion
 
 H, W, FOCAL = 90, 120, 110.0
 V, U = np.mgrid[:H, :W].astype(float)

@@ -5,14 +5,14 @@ import pytest
 from scipy.optimize import brentq
 
 from twin.core import geometry
-from twin.imaging.illumination import daylight_at
-from twin.imaging.lamp_light import LampLight
-from twin.imaging.lamps import light_sources_in_camera
-from twin.imaging.lens_psf import Defocus
-from twin.imaging.ray_sampling import RowMotion, sample_rays
-from twin.imaging.shutter import ExposureMotion
+from twin.imaging.camera.lens_psf import Defocus
+from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.imaging.light.illumination import daylight_at
+from twin.imaging.light.lamp_light import LampLight
+from twin.imaging.light.lamps import light_sources_in_camera
+from twin.imaging.light.water import medium
 from twin.imaging.snow import APERTURE_M, BOX_M, MarineSnow, diameters
-from twin.imaging.water import medium
 from twin.scenario.model import LampConfig, Scenario, SnowConfig, SunConfig, WaterConfig
 
 RIG = Scenario.model_validate({"rig": {"image_width_px": 320, "image_height_px": 240}}).believed_rig()
@@ -280,7 +280,7 @@ def test_drawing_does_not_depend_on_the_number_of_bands(monkeypatch):
     snow, motion = marine_snow(density=200.0), ExposureMotion(np.array([0, 0.2, 0, 0.5, 0.3, 0]), 0.02, 0.01)
     images = []
     for threads in (1, 2):
-        monkeypatch.setattr("twin.imaging.row_parallel._n_processors", lambda n=threads: n)
+        monkeypatch.setattr("twin.core.row_parallel._n_processors", lambda n=threads: n)
         light = np.zeros((*SHAPE, 3), np.float32)
         snow.draw(light, np.full(SHAPE, 2.0, np.float32), POSE, 0, 0.0, motion)
         images.append(light)

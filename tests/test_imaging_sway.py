@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.shapes import build_shape
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging import object_view, sway
-from twin.imaging.object_view import ObjectRenderer, Objects
-from twin.imaging.sway import largest_displacement_m, swayed
+from twin.imaging.scene import object_view, sway
+from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.sway import largest_displacement_m, swayed
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.shapes import build_shape
 
 #: A narrow view, so that a plane of its frustum is nearly vertical.
 RIG = StereoRig(64, 48, 600.0, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from twin.imaging.bands import band_weights
-from twin.imaging.lamps import colour
-from twin.imaging.light_spectra import spectrum_of
-from twin.imaging.photo_sensor import PhotoSensor
-from twin.imaging.photons import electrons_per_cd
-from twin.imaging.tone import LOG_STOPS, linear_of, tone
-from twin.imaging.water import downwelling_per_m, medium
-from twin.imaging.water_tables import water_spectrum
-from twin.imaging.white_balance import MOST, WhiteBalance
+from twin.imaging.camera.photo_sensor import PhotoSensor
+from twin.imaging.camera.photons import electrons_per_cd
+from twin.imaging.camera.tone import LOG_STOPS, linear_of, tone
+from twin.imaging.camera.white_balance import MOST, WhiteBalance
+from twin.imaging.light.bands import band_weights
+from twin.imaging.light.lamps import colour
+from twin.imaging.light.light_spectra import spectrum_of
+from twin.imaging.light.water import downwelling_per_m, medium
+from twin.imaging.light.water_tables import water_spectrum
 from twin.scenario.model import Scenario
 
 GREY = np.full((30, 40, 3), 20.0, np.float32)

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pytest
 
-import terrains
-from scenes.builder import CameraPair, build
-from terrains import Terrain, TextureSource
-from terrains.walls import wall_weights
+from twin import terrains
 from twin.core import geometry
 from twin.core.records import MapGrid
-from twin.imaging.renderer import Renderer
-from twin.imaging.triplanar import paint_walls, wall_surface
+from twin.imaging.scene.renderer import Renderer
+from twin.imaging.scene.triplanar import paint_walls, wall_surface
+from twin.scenes.builder import CameraPair, build
+from twin.terrains import Terrain, TextureSource
+from twin.terrains.walls import wall_weights
 from twin.world.true_albedo import true_albedo
 
 W, H, VFOV = 320, 240, 45.0
@@ -233,7 +233,7 @@ def test_the_result_does_not_depend_on_the_number_of_bands(monkeypatch: pytest.M
     assert surface is not None
     results = []
     for processors in (1, 2):
-        monkeypatch.setattr("twin.imaging.row_parallel._n_processors", lambda n=processors: n)
+        monkeypatch.setattr("twin.core.row_parallel._n_processors", lambda n=processors: n)
         albedo = draped.copy()
         paint_walls(surface, albedo, depth, pose, float(FOCAL_PX))
         results.append(albedo)

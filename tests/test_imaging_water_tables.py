@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from twin.errors import ScenarioError, TwinError
-from twin.imaging import water_tables
-from twin.imaging.bands import CENTRE_NM, NM, WIDTH_NM, band_weights, effective_per_m, sensitivity
-from twin.imaging.illumination import illumination_of
-from twin.imaging.light_spectra import LED_B5, spectrum_of
-from twin.imaging.water import Medium, downwelling_per_m, medium
-from twin.imaging.water_tables import provenance_of, water_spectrum
+from twin.imaging.light import water_tables
+from twin.imaging.light.bands import CENTRE_NM, NM, WIDTH_NM, band_weights, effective_per_m, sensitivity
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.light.light_spectra import LED_B5, spectrum_of
+from twin.imaging.light.water import Medium, downwelling_per_m, medium
+from twin.imaging.light.water_tables import provenance_of, water_spectrum
 from twin.scenario.file import load_scenario
 from twin.scenario.model import WaterConfig
 from twin.scenario.water_sources import WATER_SOURCES
@@ -188,7 +188,7 @@ def test_a_type_that_the_source_does_not_have_is_rejected_when_the_scenario_is_l
 
 def test_the_tables_load_without_data_frames_and_colour_libraries():
     code = (
-        "import sys; from twin.imaging.water_tables import water_spectrum; water_spectrum('II'); "
+        "import sys; from twin.imaging.light.water_tables import water_spectrum; water_spectrum('II'); "
         "sys.exit(bool({'pandas', 'colour', 'matplotlib'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

@@ -28,6 +28,8 @@ def tree_of(path):
 
 def dotted(path):
     parts = path.relative_to(ROOT).with_suffix("").parts
+    if parts[0] != "twin":  # twin/terrains, twin/scenes and twin/controllers are links to these folders
+        parts = ("twin", *parts)
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
@@ -71,7 +73,7 @@ def imports(tree, module=""):
 
 def is_forbidden(module, imported):
     """Returns whether the table does not allow this import."""
-    if not any(within(imported, package) for package in OURS):
+    if not within(imported, "twin"):
         return False
     room, target = room_of(module), room_of(imported)
     return room != target and (target is None or short(target) not in ROOMS[room])
@@ -125,21 +127,21 @@ def test_every_import_is_in_the_table(path):
 @pytest.mark.parametrize(
     ("module", "line"),
     [
-        ("terrains.generate", "from twin.scenario import model"),
-        ("controllers.tracking", "import scenes"),
-        ("scenes.builder", "from twin.scenario import model"),
+        ("twin.terrains.generate", "from twin.scenario import model"),
+        ("twin.controllers.tracking", "from twin import scenes"),
+        ("twin.scenes.builder", "from twin.scenario import model"),
         ("twin.core.links", "from twin.estimate import network"),
         ("twin.estimate.vision.f2f", "from twin.world import world"),
-        ("twin.estimate.vision.f2f", "import twin.imaging.optics"),
+        ("twin.estimate.vision.f2f", "import twin.imaging.light.optics"),
         ("twin.estimate.vision.f2f", "from twin.estimate import network"),
-        ("twin.estimate.pipeline", "def f():\n    from scenes.gl import mujoco"),
+        ("twin.estimate.pipeline", "def f():\n    from twin.scenes.gl import mujoco"),
         ("twin.estimate.pipeline", "from twin.scenario.model import Scenario"),
         ("twin.judge.metrics", "from twin.estimate import network"),
         ("twin.judge.metrics", "from twin.report import wording"),
-        ("twin.imaging.optics", "from twin.simulate import mujoco_vehicle"),
-        ("twin.surrogate.vision", "from twin.study import search"),
+        ("twin.imaging.light.optics", "from twin.simulate import mujoco_vehicle"),
+        ("twin.surrogate.vision", "from twin.studies import search"),
         ("twin.surrogate.vision", "from twin.surrogate_fit import fit"),
-        ("twin.study.search", "from twin.app import console"),
+        ("twin.studies.search", "from twin.app import console"),
         ("twin.scenario.file", "from twin import survey"),
     ],
 )
@@ -178,7 +180,16 @@ def test_estimators_do_not_use_the_truth():
 def test_the_estimators_load_neither_simulator_nor_scenario():
     code = "import sys, twin.estimate; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
-    forbidden = ("mujoco", "OpenGL", "pydantic", "scenes", "terrains", "controllers", "twin.world", "twin.scenario")
+    forbidden = (
+        "mujoco",
+        "OpenGL",
+        "pydantic",
+        "twin.scenes",
+        "twin.terrains",
+        "twin.controllers",
+        "twin.world",
+        "twin.scenario",
+    )
     assert [name for name in loaded if any(within(name, package) for package in forbidden)] == []
 
 
@@ -190,7 +201,7 @@ def test_an_import_changes_no_setting_of_the_process():
     code = f"""
 import os, sys
 sys.modules["resource"] = None
-import scenes.builder, twin.estimate, twin.imaging.renderer
+import twin.scenes.builder, twin.estimate, twin.imaging.scene.renderer
 assert "mujoco" not in sys.modules and "OpenGL" not in sys.modules
 assert not os.environ.keys() & {set(SETTINGS)}
 """

@@ -11,9 +11,9 @@ from twin import cli
 from twin.app import look_sheet
 from twin.app.look import image_quality, noise_image, parse_position, parse_twist, quality_rows, render_view
 from twin.errors import TwinError
-from twin.imaging.optics import range_of
-from twin.imaging.photo_sensor import PhotoSensor
-from twin.imaging.photons import electrons_per_cd
+from twin.imaging.camera.photo_sensor import PhotoSensor
+from twin.imaging.camera.photons import electrons_per_cd
+from twin.imaging.light.optics import range_of
 from twin.scenario.file import load_scenario
 from twin.world.mission import prepare
 

@@ -8,7 +8,7 @@ import pytest
 import rasterio
 from rasterio.enums import ColorInterp
 
-import terrains
+from twin import terrains
 from twin.core import geometry
 from twin.core.georeference import Georeference
 from twin.core.orthomosaic import OrthoTile, finer_grid, mean_colours, window
@@ -19,9 +19,9 @@ from twin.estimate.mapping import orthomosaic as estimate
 from twin.estimate.mapping.orthomosaic import Views, heights_of, ortho_grid
 from twin.estimate.mapping.orthophoto import footprint
 from twin.exchange.geotiff import OrthomosaicFile
-from twin.imaging.illumination import illumination_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.optics import Optics
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.light.optics import Optics
 from twin.imaging.restoration import Restoration, estimated_floor, linear_signal
 from twin.judge.colour_difference import ciede2000, lab_of
 from twin.judge.orthomosaic import OrthomosaicJudge

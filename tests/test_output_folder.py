@@ -13,7 +13,7 @@ import pytest
 import twin
 from twin.core.output_folder import LOCK_FILE, sole_writer
 from twin.errors import TwinError
-from twin.study.runner import open_folder
+from twin.studies.runner import open_folder
 
 HOLDER = """
 import sys

@@ -9,8 +9,8 @@ from twin import cli
 from twin.errors import ScenarioError, TwinError, described
 from twin.plugin import loading
 from twin.scenario.file import load_scenario
-from twin.study.study_file import load_study
-from twin.study.surveys import surveys
+from twin.studies.study_file import load_study
+from twin.studies.surveys import surveys
 
 
 @pytest.fixture

@@ -9,14 +9,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.bands import NM
-from twin.imaging.water import read_spectrum
+from twin.imaging.light.bands import NM
+from twin.imaging.light.water import read_spectrum
 from twin.scenario.file import dump_toml, load_scenario
 from twin.scenario.model import EstimateConfig, Scenario
 from twin.scenario.toml_lines import key_lines
 from twin.scenario.toml_text import value_errors
-from twin.study.study_file import load_study
-from twin.study.surveys import surveys
+from twin.studies.study_file import load_study
+from twin.studies.surveys import surveys
 
 PLAN_KEYS = (
     "pattern, area_m, centre_m, centre_crs, heading_deg, polygon, turns, altitude_m, speed_mps, overlap_along, "

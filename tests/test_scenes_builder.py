@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-import terrains
-from scenes.bluerov2 import BLUEROV2_HEAVY
-from scenes.builder import CameraPair, SceneModel, build
-from scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
-from scenes.gl import mujoco
-from terrains import TextureSource
+from twin import terrains
 from twin.core import geometry
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.scenes.builder import CameraPair, SceneModel, build
+from twin.scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
+from twin.scenes.gl import mujoco
+from twin.terrains import TextureSource
 
 BODY_FROM_LEFT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.02, 0.1, -0.15]))
 LAMPS = [[0.25, 0.35, -0.05], [0.25, -0.35, -0.05]]

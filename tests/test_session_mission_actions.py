@@ -5,8 +5,8 @@ import functools
 import numpy as np
 import pytest
 
-from controllers.segments import Reference
 from twin import survey
+from twin.controllers.segments import Reference
 from twin.core import geometry
 from twin.core.braking import BLIND_S, BRAKING_S
 from twin.core.quality import ActionTimes

@@ -6,10 +6,6 @@ import numpy as np
 import pytest
 
 import twin
-from terrains import Terrain
-from terrains.objects.mesh import mesh_of
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.primitives import sphere
 from twin import survey
 from twin.core import geometry
 from twin.errors import SurveyAborted
@@ -18,6 +14,10 @@ from twin.scenario.model import VehicleConfig
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.contact import CENTRE_M, HALF_M, floor_field, touches_floor
 from twin.surrogate import surrogate_world
+from twin.terrains import Terrain
+from twin.terrains.objects.mesh import mesh_of
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.primitives import sphere
 from twin.world.mission import prepare
 from twin.world.obstacles import Obstacles
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from physics_world import IDLE, bare_model, vehicle
 
-from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from physics_world import IDLE, STILL, vehicle
 
-from scenes.bluerov2 import BLUEROV2_HEAVY
-from scenes.gl import mujoco
 from twin.core import geometry
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import load_scenario
 from twin.scenario.model import ImuConfig, VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.scenes.gl import mujoco
 from twin.simulate.inertial_sensor import InertialSensor
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.core import geometry
 from twin.core.records import SensorNoise, StereoRig
 from twin.scenario.model import NavigationConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.simulate.sensors import (
     AcousticPositioning,
     DopplerVelocityLog,

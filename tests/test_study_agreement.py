@@ -5,13 +5,13 @@ import pytest
 from study_surveys import study_of
 
 from twin.errors import ScenarioError
-from twin.study.agreement import agreement, values_of_pairs
-from twin.study.agreement_report import HEADER, table, write_document
-from twin.study.analysis import StudyAnalysis
-from twin.study.flight import row_of
-from twin.study.results_log import ResultsLog
-from twin.study.summary import summary
-from twin.study.surveys import surveys
+from twin.studies.agreement import agreement, values_of_pairs
+from twin.studies.agreement_report import HEADER, table, write_document
+from twin.studies.analysis import StudyAnalysis
+from twin.studies.flight import row_of
+from twin.studies.results_log import ResultsLog
+from twin.studies.summary import summary
+from twin.studies.surveys import surveys
 
 GATE = """
 scenario = "reef"

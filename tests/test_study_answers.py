@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from twin.study.answers import PassRecord, answers_of_ranges, answers_of_values, pass_bins, value_bins
-from twin.study.statistics import wilson_interval
+from twin.studies.answers import PassRecord, answers_of_ranges, answers_of_values, pass_bins, value_bins
+from twin.studies.statistics import wilson_interval
 
 
 def answers(x, passed, required=0.9):

@@ -5,8 +5,8 @@ from study_surveys import STUDY, study_of
 
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
-from twin.study.study_file import load_study
-from twin.study.surveys import refusals, surveys
+from twin.studies.study_file import load_study
+from twin.studies.surveys import refusals, surveys
 
 TURBIDITY = "water.turbidity = { log_uniform = [1.0, 40.0] }"
 

@@ -3,8 +3,8 @@
 import odd_studies
 import pytest
 
-from twin.study import runner
-from twin.study.summary import summary
+from twin.studies import runner
+from twin.studies.summary import summary
 
 
 @pytest.fixture(autouse=True)

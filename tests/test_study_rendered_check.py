@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from study_surveys import study_of
 
-from twin.study.analysis import StudyAnalysis
-from twin.study.engine import Outcome
-from twin.study.flight import row_of
-from twin.study.progress import StudyProgress
-from twin.study.rendered_check import FOLDER, RenderedCheck, check, nearest_surveys, summary
-from twin.study.results_log import ResultsLog
-from twin.study.surveys import refusals, surveys
+from twin.studies.analysis import StudyAnalysis
+from twin.studies.engine import Outcome
+from twin.studies.flight import row_of
+from twin.studies.progress import StudyProgress
+from twin.studies.rendered_check import FOLDER, RenderedCheck, check, nearest_surveys, summary
+from twin.studies.results_log import ResultsLog
+from twin.studies.surveys import refusals, surveys
 
 STUDY = """
 scenario = "reef"

@@ -10,14 +10,14 @@ from study_surveys import LOST, STUDY, fail, fly, study_of
 
 from twin import survey as survey_module
 from twin.errors import ScenarioError, UnmodelledError
-from twin.study import flight, wording
-from twin.study.analysis import StudyAnalysis, mask_numbers
-from twin.study.flight import row_of
-from twin.study.report import write_report
-from twin.study.results_log import ResultsLog
-from twin.study.statistics import wilson_interval
-from twin.study.summary import summary as summary_of
-from twin.study.surveys import survey_keys, surveys
+from twin.studies import flight, wording
+from twin.studies.analysis import StudyAnalysis, mask_numbers
+from twin.studies.flight import row_of
+from twin.studies.report import write_report
+from twin.studies.results_log import ResultsLog
+from twin.studies.statistics import wilson_interval
+from twin.studies.summary import summary as summary_of
+from twin.studies.surveys import survey_keys, surveys
 
 
 def analyse(study, folder, function=fly):

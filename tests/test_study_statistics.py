@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from twin.study import statistics
-from twin.study.design import design_points
+from twin.studies import statistics
+from twin.studies.design import design_points
 
 
 @pytest.mark.parametrize(("passed", "count"), [(0, 10), (3, 10), (10, 10), (86, 100), (1, 1)])

@@ -12,17 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import scenes
-from terrains import Terrain
-from twin import survey
+from twin import scenes, survey
 from twin.core import geometry
 from twin.core.floor_rays import height_field
 from twin.core.records import MapGrid
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.estimate.vision import matching
+from twin.imaging.camera.photo_sensor import sensor_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.photo_sensor import sensor_of
 from twin.scenario.file import load_scenario
 from twin.session.assembly import navigator_with, open_world
 from twin.surrogate import error_model_file
@@ -63,6 +61,7 @@ from twin.surrogate.window_texture import EVEN_TEXTURE, window_texture
 from twin.surrogate_fit import fit, rendered_surveys
 from twin.surrogate_fit.comparison import UNIT_PX, ComparisonVision, single_error_models
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
+from twin.terrains import Terrain
 from twin.world.mission import prepare
 from twin.world.pilot import make_pilot
 

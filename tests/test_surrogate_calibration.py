@@ -11,10 +11,10 @@ from twin.core import geometry
 from twin.core.records import StereoObservation
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.true_cameras import make_true_cameras
+from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.scenario.file import load_scenario
-from twin.study.flight import fly
-from twin.study.surveys import Survey, surveys
+from twin.studies.flight import fly
+from twin.studies.surveys import Survey, surveys
 from twin.surrogate import error_model_file
 from twin.surrogate.coverage import QUANTITIES, quantities_outside_fit
 from twin.surrogate.error_model import ErrorModel

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-import terrains
-from terrains import Terrain, TextureSource
-from terrains.ground_cover import COVERS, GRAINS, Cover, paint
-from terrains.textures import COARSEN_TEXELS
+from twin import terrains
 from twin.errors import TwinError
+from twin.terrains import Terrain, TextureSource
+from twin.terrains.ground_cover import COVERS, GRAINS, Cover, paint
+from twin.terrains.textures import COARSEN_TEXELS
 
 KINDS = ("ripples", "fractal", "reef", "cliffs")
 

@@ -11,10 +11,10 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-import terrains
-from terrains import Terrain
+from twin import terrains
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
+from twin.terrains import Terrain
 
 HEIGHTS = np.array([[-2.0, -3.0, -4.0], [-1.5, -2.0, -3.0], [-1.0, -1.0, -2.0]], np.float32)
 UTM = "EPSG:32755"  # WGS 84 / UTM zone 55S

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-import terrains
-from terrains.holes import known_nodes
+from twin import terrains
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.session.assembly import open_world
 from twin.survey import run
+from twin.terrains.holes import known_nodes
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import Mission, prepare
 

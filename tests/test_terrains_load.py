@@ -10,9 +10,9 @@ import pytest
 import rasterio
 from rasterio.transform import from_origin
 
-import terrains
-from terrains import Terrain
+from twin import terrains
 from twin.errors import TwinError
+from twin.terrains import Terrain
 
 #: row 0 = north; the north-east corner is the highest, the south-west corner the lowest
 HEIGHTS = np.array([[2.0, 3.0, 4.0], [1.5, 2.0, 3.0], [1.0, 1.0, 2.0]], np.float32)

@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 import trimesh
 
-import terrains
-from terrains.ground_cover import COVERS
-from terrains.objects import mesh_file, placement
-from terrains.objects.detail import levels_of
-from terrains.objects.floor_mesh import tiles_of
-from terrains.objects.mesh import Mesh
-from terrains.objects.mesh_header import face_count
-from terrains.objects.model import model_of
-from terrains.objects.shapes import SHAPES, build_shape
+from twin import terrains
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario, TerrainConfig
+from twin.terrains.ground_cover import COVERS
+from twin.terrains.objects import mesh_file, placement
+from twin.terrains.objects.detail import levels_of
+from twin.terrains.objects.floor_mesh import tiles_of
+from twin.terrains.objects.mesh import Mesh
+from twin.terrains.objects.mesh_header import face_count
+from twin.terrains.objects.model import model_of
+from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world.objects import load_objects
 
 FIELD = "objects.0.mesh_file"

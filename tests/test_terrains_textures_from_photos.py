@@ -14,10 +14,10 @@ from rasterio.enums import ColorInterp
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
-import terrains
-from terrains.quilting import even_lighting, quilt
-from terrains.textures import texture_from_photo, tile_image
+from twin import terrains
 from twin.errors import TwinError
+from twin.terrains.quilting import even_lighting, quilt
+from twin.terrains.textures import texture_from_photo, tile_image
 
 CRS = "EPSG:32755"
 WEST, NORTH = 330_000.0, 8_370_000.0
@@ -86,7 +86,7 @@ def test_pebbles_of_a_photo_have_the_same_size_on_a_floor_with_coarser_texels(
     pebbles: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, size_m: tuple[float, float]
 ) -> None:
     """The distance at which the autocorrelation falls to one half is that of the photo: 4 mm per pixel."""
-    monkeypatch.setattr("terrains.textures.COARSEN_TEXELS", 250_000)
+    monkeypatch.setattr("twin.terrains.textures.COARSEN_TEXELS", 250_000)
     photo = tmp_path / "photo.png"
     cv2.imwrite(str(photo), pebbles)
     source = terrains.TextureSource(0.004, photo, coarsen=True)

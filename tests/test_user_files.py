@@ -18,14 +18,14 @@ import rasterio.shutil
 import trimesh
 from rasterio.transform import from_origin
 
-import terrains
-from terrains.objects.mesh_file import read_mesh
+from twin import terrains
 from twin.core.user_files import read_bytes, read_json, read_text
 from twin.datasets.text_files import read_yaml
 from twin.errors import TwinError
 from twin.report.comparison import load_runs
 from twin.report.run_folder import read_raster
 from twin.scenario.file import load_scenario
+from twin.terrains.objects.mesh_file import read_mesh
 from twin.world.placement import read_geojson
 
 ROOT = Path(__file__).parent.parent

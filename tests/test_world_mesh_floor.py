@@ -10,20 +10,19 @@ import pytest
 import trimesh
 from PIL import Image
 
-import terrains
-from scenes.gl import mujoco
-from terrains.objects import mesh_file
-from terrains.objects.floor_mesh import divided, levelled, tiles_of
-from terrains.objects.mesh import Mesh, joined
-from terrains.objects.mesh_file import TexturedMesh
-from twin import survey
+from twin import survey, terrains
 from twin.core import geometry
 from twin.core.grid_triangles import grid_triangles
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.scenario.file import find_scene, load_scenario
+from twin.scenes.gl import mujoco
 from twin.surrogate import matchability
+from twin.terrains.objects import mesh_file
+from twin.terrains.objects.floor_mesh import divided, levelled, tiles_of
+from twin.terrains.objects.mesh import Mesh, joined
+from twin.terrains.objects.mesh_file import TexturedMesh
 from twin.world import mesh_floor
 from twin.world.coverage import true_heights
 from twin.world.mesh_floor import floor_surface
@@ -337,7 +336,7 @@ def test_the_tiling_of_a_photo_has_no_effect_on_a_mesh_and_is_an_error(tmp_path)
 
 
 def test_slivers_are_not_divided_without_bound(monkeypatch):
-    monkeypatch.setattr("terrains.objects.floor_mesh.MAX_DIVIDED", 300)
+    monkeypatch.setattr("twin.terrains.objects.floor_mesh.MAX_DIVIDED", 300)
     corners = np.array([[0, 0, 0], [40, 0, 0], [0, 0.01, 0]], np.float32)
     sliver = Mesh(corners, np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.uint8))
     whole = TexturedMesh(sliver, np.zeros((3, 2), np.float32), np.full(1, -1, np.int32), ())

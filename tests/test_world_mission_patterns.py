@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import scenes
-from twin import survey
+from twin import scenes, survey
 from twin.core.records import Trajectory
 from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.scenario.file import load_scenario

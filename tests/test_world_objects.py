@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrains.objects.mesh import mesh_of
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.primitives import sphere
-from terrains.objects.shapes import build_shape
 from twin.core import geometry
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError
 from twin.scenario.file import dump_toml, load_scenario
+from twin.terrains.objects.mesh import mesh_of
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.primitives import sphere
+from twin.terrains.objects.shapes import build_shape
 from twin.world.coverage import Coverage
 from twin.world.mission import prepare
 from twin.world.top_surface import top_surface

@@ -5,17 +5,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-import terrains
-from terrains import Terrain, TextureSource
-from terrains.objects.mesh import mesh_of
-from terrains.objects.model import PlacedObject, model_of
-from terrains.objects.primitives import box
+from twin import terrains
 from twin.core.floor_rays import ray_grid
 from twin.core.image_overlap import RAY_COLUMNS, image_overlap
 from twin.core.timing import Stopwatch
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
 from twin.surrogate.surrogate_world import SurrogateWorld
+from twin.terrains import Terrain, TextureSource
+from twin.terrains.objects.mesh import mesh_of
+from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.primitives import box
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
 from twin.world.planned_images import floor_of

@@ -5,14 +5,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-import terrains
-from controllers.camera_surface import surface_above_floor
-from terrains import Terrain, TextureSource
+from twin import terrains
+from twin.controllers.camera_surface import surface_above_floor
 from twin.core.records import SurveyResult, Trajectory, Truth
 from twin.errors import ScenarioError, TwinError
 from twin.judge.overlap import overlap_metrics
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
+from twin.terrains import Terrain, TextureSource
 from twin.world.clearance import path_points
 from twin.world.coverage import true_heights
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from twin.datasets.replay import ReplayOptions, ReplayResult
+    from twin.recordings.replay import ReplayOptions, ReplayResult
     from twin.scenario.model import Scenario
     from twin.session.conclusion import RunResult
     from twin.session.stepped_world import SteppedWorld as World
@@ -72,7 +72,7 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
     Args:
         dataset: folder or ROS 2 bag of the data set.
         out: run folder to write, new or empty.
-        options: calibration, truth, alignment and settings (`twin.datasets.replay.ReplayOptions`).
+        options: calibration, truth, alignment and settings (`twin.recordings.replay.ReplayOptions`).
 
     Returns:
         Status, metrics and run folder of the replay, the trajectories and the map.
@@ -81,6 +81,6 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
         TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder is not
             empty, is written by another process, or cannot be written.
     """
-    from twin.datasets import replay as recorded
+    from twin.recordings import replay as recorded
 
     return recorded.replay(Path(dataset), Path(out), options)

@@ -23,7 +23,7 @@ from twin.core.output_folder import sole_writer
 from twin.errors import TwinError
 
 if TYPE_CHECKING:
-    from twin.datasets.replay import ReplayResult
+    from twin.recordings.replay import ReplayResult
     from twin.scenario.model import Scenario
     from twin.session.conclusion import RunResult
 
@@ -273,8 +273,8 @@ def plan(
     allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Print the predicted properties of a survey plan over its floor and draw the plan, without simulation."""
-    from twin.app import plan as drawing
-    from twin.app import plan_summary
+    from twin.planning import drawing
+    from twin.planning import summary as plan_summary
     from twin.scenario.file import load_scenario
     from twin.world.mission import prepare
 
@@ -524,8 +524,8 @@ def replay(
     allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
-    from twin.datasets import preview as previewing
-    from twin.datasets import replay as recorded
+    from twin.recordings import preview as previewing
+    from twin.recordings import replay as recorded
     from twin.scenario.file import plugin_error
 
     if estimator is not None and ":" in estimator and not allow_plugins:
@@ -619,7 +619,7 @@ def export(
     allow_plugins: AllowPluginsOption = False,
 ) -> None:
     """Write a run in the formats of other programs: data sets, camera models, truth, maps."""
-    from twin.app import export_command
+    from twin.exports import command as export_command
 
     if show_list:
         console.print_table("Formats of twin export", export_command.format_rows())

@@ -11,7 +11,7 @@ from typing import Any, Literal, SupportsFloat
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.core import geometry
 from twin.core.records import Array, Frame
 from twin.errors import SurveyAborted, TwinError

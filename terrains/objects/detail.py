@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.mesh import Mesh, median_edge_m
-from terrains.objects.parts import Parts, parts_of
+from twin.terrains.objects.mesh import Mesh, median_edge_m
+from twin.terrains.objects.parts import Parts, parts_of
 
 FEWEST_FACES = 64  #: a level with at most this many triangles is the last one
 

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.file_header import eight_bits
-from terrains.objects.mesh import Mesh, joined, welded_faces
-from terrains.objects.mesh_header import FORMATS, face_count
 from twin.core.user_files import IMAGE_FORMATS, reading
 from twin.errors import TwinError
+from twin.terrains.file_header import eight_bits
+from twin.terrains.objects.mesh import Mesh, joined, welded_faces
+from twin.terrains.objects.mesh_header import FORMATS, face_count
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
 MAX_BYTES = 500_000_000  #: size of the largest file that is read

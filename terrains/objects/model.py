@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.detail import Level, levels_of
-from terrains.objects.mesh import Mesh, extent, is_closed, standing
+from twin.terrains.objects.detail import Level, levels_of
+from twin.terrains.objects.mesh import Mesh, extent, is_closed, standing
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrains.objects.mesh import Mesh, joined, mesh_of
-from terrains.objects.primitives import Array, mottled, noise, resampled, sphere, tube, turned
+from twin.terrains.objects.mesh import Mesh, joined, mesh_of
+from twin.terrains.objects.primitives import Array, mottled, noise, resampled, sphere, tube, turned
 
 
 def brain_coral(albedo: Array, rng: np.random.Generator) -> Mesh:

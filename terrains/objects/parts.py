@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.mesh import Mesh
 from twin.kernels import kernel
+from twin.terrains.objects.mesh import Mesh
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.model import ObjectModel, PlacedObject
-from terrains.terrain import Terrain
 from twin.errors import TwinError
+from twin.terrains.objects.model import ObjectModel, PlacedObject
+from twin.terrains.terrain import Terrain
 
 Array = NDArray[np.float64]
 

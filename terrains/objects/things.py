@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrains.objects.mesh import Mesh, mesh_of
-from terrains.objects.primitives import Array, box, mottled, noise, resampled, sphere, turned
+from twin.terrains.objects.mesh import Mesh, mesh_of
+from twin.terrains.objects.primitives import Array, box, mottled, noise, resampled, sphere, turned
 
 
 def boulder(albedo: Array, rng: np.random.Generator) -> Mesh:

@@ -15,7 +15,7 @@ from rich.progress import Progress as Bar
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from twin.app.plan_summary import PlanSummary
+    from twin.planning.summary import PlanSummary
     from twin.session.monitor import SurveyProgress
 
 
@@ -89,7 +89,7 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
 
 def print_plan(summary: PlanSummary) -> None:
     """Prints the tables of a plan on stdout, and its warnings on stderr."""
-    from twin.app import plan_summary
+    from twin.planning import summary as plan_summary
     from twin.report.wording import plain
 
     print_table(f"Plan of {summary.mission.scenario.name}", plan_summary.rows(summary))

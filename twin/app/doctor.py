@@ -69,7 +69,7 @@ def check_rendering() -> Check:
 
 
 def _gl_remedy() -> str:
-    from scenes.gl import INSTALL_LINE
+    from twin.scenes.gl import INSTALL_LINE
 
     return INSTALL_LINE if os.geteuid() == 0 else f"sudo {INSTALL_LINE}"
 
@@ -105,7 +105,7 @@ def render_test_image() -> str:
         TwinError: OpenGL is missing.
         RuntimeError: the rendered image is black.
     """
-    from scenes.gl import mujoco, offscreen_context
+    from twin.scenes.gl import mujoco, offscreen_context
 
     context = offscreen_context(64, 48)
     context.free()

@@ -11,8 +11,8 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
-from twin.imaging.camera import AT_REST, DecomposedImage, StereoCapture
-from twin.imaging.renderer import NEAR_M
+from twin.imaging.scene.renderer import NEAR_M
+from twin.imaging.stereo_camera import AT_REST, DecomposedImage, StereoCapture
 from twin.report.wording import DASH, percent
 from twin.world.mission import Mission
 from twin.world.rendered_world import RenderedWorld

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from twin.app.look import ViewLayers, noise_image
-from twin.imaging.optics import range_of
+from twin.imaging.light.optics import range_of
 from twin.report.style import FIGURE_STYLE
 from twin.report.wording import DASH
 from twin.scenario.model import Scenario

@@ -13,13 +13,13 @@ from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.core.output_folder import sole_writer
 from twin.errors import TwinError
-from twin.study import agreement, agreement_report, rendered_check, summary, tuning, tuning_report, wording
-from twin.study.candidates import tuning_config
-from twin.study.engine import Engine
-from twin.study.local_engine import LocalEngine, default_jobs
-from twin.study.progress import study_progress
-from twin.study.runner import StudyResult, run_study
-from twin.study.study_file import Study, load_study
+from twin.studies import agreement, agreement_report, rendered_check, summary, tuning, tuning_report, wording
+from twin.studies.candidates import tuning_config
+from twin.studies.engine import Engine
+from twin.studies.local_engine import LocalEngine, default_jobs
+from twin.studies.progress import study_progress
+from twin.studies.runner import StudyResult, run_study
+from twin.studies.study_file import Study, load_study
 
 SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
@@ -71,7 +71,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
     if scheduler:
         if find_spec("distributed") is None:
             raise TwinError("--scheduler", "Dask is not installed", "pip install 'seabed-twin[cluster]'")
-        from twin.study import dask_engine
+        from twin.studies import dask_engine
 
         is_slurm = scheduler == SLURM
         with dask_engine.start_slurm_jobs(jobs) if is_slurm else dask_engine.connect_scheduler(scheduler) as engine:

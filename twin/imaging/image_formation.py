@@ -8,17 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Image, StereoRig
-from twin.imaging.caustics import Caustics
-from twin.imaging.facets import Facets, Heights
-from twin.imaging.illumination import Illumination
-from twin.imaging.lens_psf import defocus_of
-from twin.imaging.materials import material_of
-from twin.imaging.mesh_raster import ObjectView
-from twin.imaging.object_shadows import ObjectShadows
-from twin.imaging.object_view import ObjectRenderer, Objects
-from twin.imaging.optics import Depth, FloorView, Optics, Radiance, WaterSurface, calm_surface
-from twin.imaging.shadows import Shadows, direction_to_casting_sun
-from twin.imaging.shutter import ExposureMotion
+from twin.imaging.camera.lens_psf import defocus_of
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.imaging.light.caustics import Caustics
+from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.optics import Depth, FloorView, Optics, Radiance, WaterSurface, calm_surface
+from twin.imaging.light.shadows import Shadows, direction_to_casting_sun
+from twin.imaging.scene.facets import Facets, Heights
+from twin.imaging.scene.materials import material_of
+from twin.imaging.scene.mesh_raster import ObjectView
+from twin.imaging.scene.object_shadows import ObjectShadows
+from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.imaging.snow import MarineSnow
 from twin.scenario.model import Scenario
 

@@ -25,17 +25,17 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.load import fill_holes
 from twin.core import floor_rays, geometry
 from twin.core.records import ElevationMap, Exposure, Image, StereoRig
 from twin.errors import TwinError
-from twin.imaging.facets import Facets
-from twin.imaging.illumination import Illumination
-from twin.imaging.optics import Depth, FloorView, Optics, Radiance, calm_surface
-from twin.imaging.photons import vignetting
-from twin.imaging.shadows import Shadows, direction_to_casting_sun
-from twin.imaging.tone import linear_of
+from twin.imaging.camera.photons import vignetting
+from twin.imaging.camera.tone import linear_of
+from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.optics import Depth, FloorView, Optics, Radiance, calm_surface
+from twin.imaging.light.shadows import Shadows, direction_to_casting_sun
+from twin.imaging.scene.facets import Facets
 from twin.scenario.model import Scenario
+from twin.terrains.load import fill_holes
 
 Array = NDArray[np.float64]
 

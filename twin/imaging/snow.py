@@ -24,13 +24,13 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging.lamp_light import LampLight
-from twin.imaging.lens_psf import Defocus
-from twin.imaging.optics import Depth, Radiance
-from twin.imaging.row_parallel import in_row_bands
-from twin.imaging.shading import FAR_M
-from twin.imaging.shutter import ExposureMotion
-from twin.imaging.water import Medium
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.camera.lens_psf import Defocus
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.imaging.light.lamp_light import LampLight
+from twin.imaging.light.optics import Depth, Radiance
+from twin.imaging.light.shading import FAR_M
+from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 from twin.scenario.model import SnowConfig
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from controllers.allocation import ThrustAllocation
-from controllers.segments import Reference
-from controllers.tracking import HullModel
+from twin.controllers.allocation import ThrustAllocation
+from twin.controllers.segments import Reference
+from twin.controllers.tracking import HullModel
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame, SensorNoise, StereoRig
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains import Terrain
-from terrains.noise import fractal_field
+from twin.terrains import Terrain
+from twin.terrains.noise import fractal_field
 
 Array = NDArray[np.float64]
 

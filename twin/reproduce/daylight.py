@@ -17,9 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
-from twin.imaging.daylight import DaylightVeil, floor_daylight
-from twin.imaging.illumination import Daylight, Illumination, daylight_at
-from twin.imaging.optics import Optics
+from twin.imaging.light.daylight import DaylightVeil, floor_daylight
+from twin.imaging.light.illumination import Daylight, Illumination, daylight_at
+from twin.imaging.light.optics import Optics
+from twin.imaging.light.sun_sky import sky_radiance
+from twin.imaging.light.water import Medium, medium
 from twin.imaging.reference.pixel_light import (
     BatchMean,
     Effort,
@@ -32,8 +34,6 @@ from twin.imaging.reference.pixel_light import (
     plane_light,
     refined,
 )
-from twin.imaging.sun_sky import sky_radiance
-from twin.imaging.water import Medium, medium
 from twin.reproduce.light_cell import ALBEDO, GREEN, green_of, looking_down
 from twin.scenario.model import SEA_WATER_INDEX, SunConfig, WaterConfig
 

@@ -15,10 +15,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.imaging.forward_scatter import ForwardScatter
-from twin.imaging.illumination import illumination_of
-from twin.imaging.lamps import light_sources_in_camera
-from twin.imaging.optics import Optics, range_of
+from twin.imaging.light.forward_scatter import ForwardScatter
+from twin.imaging.light.illumination import illumination_of
+from twin.imaging.light.lamps import light_sources_in_camera
+from twin.imaging.light.optics import Optics, range_of
 from twin.imaging.reference.pixel_light import (
     BatchMean,
     Effort,

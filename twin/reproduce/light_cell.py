@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.imaging.phase_function import phase_of
+from twin.imaging.light.phase_function import phase_of
+from twin.imaging.light.water import Medium
 from twin.imaging.reference.pixel_light import BandWater, BatchMean
-from twin.imaging.water import Medium
 
 GREEN, ALBEDO = 1, 128  # band that is compared, and albedo of the floor; 255 = white
 

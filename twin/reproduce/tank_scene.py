@@ -13,8 +13,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains import Terrain
-from terrains.noise import fractal_field
+from twin.terrains import Terrain
+from twin.terrains.noise import fractal_field
 
 Array = NDArray[np.float64]
 

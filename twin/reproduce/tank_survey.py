@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.core import geometry
 from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, MapGrid, SurveyResult, Trajectory, Truth

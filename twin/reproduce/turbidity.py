@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from twin.app.look import image_quality, render_view
 from twin.core.records import StereoRig
-from twin.imaging.illumination import Illumination
-from twin.imaging.optics import Optics
+from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.optics import Optics
 from twin.reproduce import turbidity_sheet
 from twin.reproduce.block import block_on_sand
 from twin.reproduce.turbidity_level import TurbidityLevel

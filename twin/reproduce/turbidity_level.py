@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Image
-from twin.imaging.water import Medium
+from twin.imaging.light.water import Medium
 from twin.scenario.model import Scenario
 
 Array = NDArray[np.float64]

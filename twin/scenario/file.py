@@ -180,7 +180,7 @@ def find_scene(path: str | Path) -> Path:
 
 def _built_in_scenes() -> dict[str, Path]:
     """Returns the scenario files in scenes/ by name, in alphabetical order."""
-    import scenes
+    from twin import scenes
 
     return {file.stem: file for file in sorted(Path(scenes.__file__).parent.glob("*.toml"))}
 

@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame, Image, StereoRig, Truth
 from twin.core.threads import one_blas_thread

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.allocation import pseudo_inverse_allocation
-from controllers.tracking import HullModel, PoseController, feedforward_wrench
-from scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.controllers.allocation import pseudo_inverse_allocation
+from twin.controllers.tracking import HullModel, PoseController, feedforward_wrench
 from twin.scenario.model import VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n

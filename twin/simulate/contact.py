@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.kernels import kernel
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 
 HALF_M, CENTRE_M = BLUEROV2_HEAVY.size_m / 2, BLUEROV2_HEAVY.hull_centre_m  # of the box, in the axes of the body
 _REACH_M = float(np.linalg.norm(HALF_M))

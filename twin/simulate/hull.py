@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenario.model import VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hydrodynamics import Hull, angular_first
 
 MAX_TIMESTEP_S = 1 / 120

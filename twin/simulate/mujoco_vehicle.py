@@ -8,11 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scenes.bluerov2 import BLUEROV2_HEAVY
-from scenes.gl import MjModel, mujoco
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
+from twin.scenes.bluerov2 import BLUEROV2_HEAVY
+from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.contact import contact_error
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint

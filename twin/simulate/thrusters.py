@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from scenes.bluerov2 import VehicleParameters
 from twin.core import geometry
 from twin.kernels import kernel
+from twin.scenes.bluerov2 import VehicleParameters
 from twin.simulate.hydrodynamics import angular_first
 
 Array = NDArray[np.float64]

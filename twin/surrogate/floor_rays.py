@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains import Terrain
 from twin.core.floor_rays import cast_pixels, height_field
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
+from twin.terrains import Terrain
 
 Depth = NDArray[np.float32]
 

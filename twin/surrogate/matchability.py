@@ -28,22 +28,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import terrains
-from terrains.ground_cover import DEFAULT_COVERS
-from terrains.terrain import texture_shape
-from terrains.textures import generate_texture
+from twin import terrains
 from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
 from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.image_scale import BINNINGS
-from twin.imaging.camera import Depth
-from twin.imaging.illumination import Illumination
+from twin.imaging.camera.photo_sensor import sensor_of
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.optics import Radiance
-from twin.imaging.photo_sensor import sensor_of
+from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.optics import Radiance
+from twin.imaging.stereo_camera import Depth
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
 from twin.surrogate.window_texture import window_texture
+from twin.terrains.ground_cover import DEFAULT_COVERS
+from twin.terrains.terrain import texture_shape
+from twin.terrains.textures import generate_texture
 
 #: Bound above which fewer than two thirds of the corners are matched, so that the estimators bin the images [px]. In
 #: rendered surveys they binned at 0.111 px (full image) and 0.13 px (binned by 2), and did not at 0.108 and 0.101 px.

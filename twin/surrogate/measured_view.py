@@ -19,7 +19,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.estimate.vision.epipolar_calibration import CORRECTED, NOTICEABLE_PX, row_jacobian
-from twin.imaging.true_cameras import TrueCameras
+from twin.imaging.camera.true_cameras import TrueCameras
 from twin.kernels import kernel
 
 _SHAPE = (5, 31, 41)  # grid points along disparity, y and x

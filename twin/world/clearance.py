@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import maximum_filter
 
-from controllers.forecast import Clearance, least_clearance
-from controllers.survey_plan import SurveyPlan
-from terrains import Terrain
+from twin.controllers.forecast import Clearance, least_clearance
+from twin.controllers.survey_plan import SurveyPlan
 from twin.core.geometry import Array
+from twin.terrains import Terrain
 
 
 def path_points(plan: SurveyPlan) -> Array:

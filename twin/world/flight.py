@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.core.geometry import Array
 from twin.core.records import Frame
 from twin.world.mission import FrameSequence, Mission, Step

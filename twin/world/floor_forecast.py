@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from terrains import Terrain
 from twin.core.floor_rays import HeightField, cast_pixels, ray_grid
 from twin.core.geometry import Array
 from twin.core.image_overlap import RAY_COLUMNS, image_overlap
 from twin.core.records import MapGrid, StereoRig
 from twin.judge.overlap import KeyframePoses
+from twin.terrains import Terrain
 from twin.world.coverage import Coverage
 from twin.world.mission import Mission
 from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned

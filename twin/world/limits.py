@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from controllers.survey_plan import SurveyPlan
+from twin.controllers.survey_plan import SurveyPlan
 from twin.core.records import MapGrid
 from twin.errors import TwinError
 from twin.scenario.model import Scenario

@@ -17,17 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, minimum_filter
 
-import terrains
-from terrains.holes import known_nodes
-from terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
-from terrains.objects.mesh import Mesh, extent, median_edge_m
-from terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
-from terrains.terrain import texture_shape
+from twin import terrains
 from twin.core.records import Array, Image, MapGrid
 from twin.errors import TwinError
-from twin.imaging.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
-from twin.imaging.object_view import Objects, draw_objects
+from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.imaging.scene.object_view import Objects, draw_objects
 from twin.scenario.model import Scenario, TerrainConfig
+from twin.terrains.holes import known_nodes
+from twin.terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
+from twin.terrains.objects.mesh import Mesh, extent, median_edge_m
+from twin.terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
+from twin.terrains.terrain import texture_shape
 from twin.world.coverage import true_heights
 from twin.world.top_surface import FROM_ABOVE, FROM_BELOW, OVERHANG_M
 

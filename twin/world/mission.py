@@ -9,20 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-import terrains
-from controllers import segments
-from controllers.survey_plan import SurveyPlan
-from controllers.tracking import rotate_lever_arm
-from terrains.objects.model import PlacedObject
+from twin import terrains
+from twin.controllers import segments
+from twin.controllers.survey_plan import SurveyPlan
+from twin.controllers.tracking import rotate_lever_arm
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.illumination import Illumination, illumination_of
-from twin.imaging.lamps import light_sources_in_camera
-from twin.imaging.lens_psf import NEAREST_FOCUS_M
-from twin.imaging.object_view import Objects
-from twin.imaging.true_cameras import TrueCameras, make_true_cameras
+from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
+from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
+from twin.imaging.light.illumination import Illumination, illumination_of
+from twin.imaging.light.lamps import light_sources_in_camera
+from twin.imaging.scene.object_view import Objects
 from twin.judge.metrics import check_require
 from twin.plugin.guard import check_loadable, terrain_heights
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
@@ -30,6 +29,7 @@ from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig
 from twin.simulate.autopilot import top_speed_mps
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import imu_rate_hz
+from twin.terrains.objects.model import PlacedObject
 from twin.world.clearance import path_points, planned_clearance
 from twin.world.limits import check_map_size
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor

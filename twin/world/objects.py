@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-import terrains
-from controllers.survey_plan import SurveyPlan
-from terrains.objects.mesh_file import read_mesh
-from terrains.objects.model import ObjectModel, PlacedObject, model_of
-from terrains.objects.placement import disc_of, place
-from terrains.objects.shapes import SHAPES, build_shape
+from twin import terrains
+from twin.controllers.survey_plan import SurveyPlan
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario
+from twin.terrains.objects.mesh_file import read_mesh
+from twin.terrains.objects.model import ObjectModel, PlacedObject, model_of
+from twin.terrains.objects.placement import disc_of, place
+from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world.clearance import path_points
 
 GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.core.geometry import Array
 
 SAME_TIME_S = 1e-9  #: times that differ by less are treated as equal

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controllers.segments import Reference
-from controllers.tracking import ControllerState, commanded_velocity, control_thrusters, rotate_lever_arm
+from twin.controllers.segments import Reference
+from twin.controllers.tracking import ControllerState, commanded_velocity, control_thrusters, rotate_lever_arm
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Readings

@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from controllers.survey_area import Corner, SurveyArea, polygon_area
-from terrains import Terrain
+from twin.controllers.survey_area import Corner, SurveyArea, polygon_area
 from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.core.user_files import read_json, reading
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig
+from twin.terrains import Terrain
 
 _MAX_GEOJSON_BYTES = 10_000_000
 _ONE_POLYGON = "GeoJSON with one Polygon without holes"

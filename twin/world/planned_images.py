@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from controllers.survey_plan import SurveyPlan
-from terrains import Terrain
+from twin.controllers.survey_plan import SurveyPlan
 from twin.core import geometry
 from twin.core.floor_rays import HeightField, height_field
 from twin.core.geometry import Array
@@ -13,6 +12,7 @@ from twin.core.image_overlap import image_overlap
 from twin.core.records import StereoRig
 from twin.judge.overlap import ImagePairs, KeyframePoses, across_pairs, along_pairs
 from twin.judge.swaths import is_turning, leg_numbers, travel_direction
+from twin.terrains import Terrain
 
 
 def floor_of(terrain: Terrain) -> HeightField:

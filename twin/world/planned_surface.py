@@ -8,9 +8,9 @@ from math import ceil
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains import Terrain
-from terrains.terrain import MAX_NODES
 from twin.core.records import MapGrid
+from twin.terrains import Terrain
+from twin.terrains.terrain import MAX_NODES
 from twin.world.coverage import true_heights
 from twin.world.mission import Mission
 from twin.world.top_surface import top_surface

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from controllers import lawnmower, loops
-from controllers.camera_surface import CameraSurface, surface_above_floor
-from controllers.survey_plan import SurveyPlan, SurveyRequest
-from terrains import Terrain
+from twin.controllers import lawnmower, loops
+from twin.controllers.camera_surface import CameraSurface, surface_above_floor
+from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
 from twin.core.floor_rays import HeightField
 from twin.core.records import StereoRig
 from twin.errors import TwinError
 from twin.scenario.model import Scenario
+from twin.terrains import Terrain
 from twin.world.limits import check_plan_size
 from twin.world.placement import survey_area
 from twin.world.planned_images import floor_of, level_floor, overlaps, planned_keyframes, planned_pairs, thinned

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from controllers.segments import Reference
+from twin.controllers.segments import Reference
 from twin.core.geometry import Array
 from twin.core.records import Estimate
 from twin.plugin.guard import GuardedPlugin

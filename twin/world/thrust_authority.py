@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.optimize import root_scalar
 
-from controllers.survey_plan import SurveyPlan
+from twin.controllers.survey_plan import SurveyPlan
 from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import Scenario

@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from terrains.objects.model import PlacedObject
 from twin.core.records import Array, MapGrid
-from twin.imaging.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.terrains.objects.model import PlacedObject
 
 OVERHANG_M = 0.01  #: least gap between the floor and an object that overhangs it
 _ROWS_PER_BLOCK = 256  # normals and colours, which are not kept, take 15 bytes per cell

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-import terrains
+from twin import terrains
 from twin.core.records import Image, MapGrid
-from twin.imaging.triplanar import paint_walls_from_above, wall_surface
+from twin.imaging.scene.triplanar import paint_walls_from_above, wall_surface
 
 Layer = NDArray[np.float32]
 

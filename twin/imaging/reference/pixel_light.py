@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from twin.core.floor_rays import HeightField, height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
-from twin.imaging.lamp_light import LAMP_RADIUS_M
-from twin.imaging.lamps import LightSources, beam_share
-from twin.imaging.phase_function import PhaseFunction, petzold, tabulate
+from twin.imaging.light.lamp_light import LAMP_RADIUS_M
+from twin.imaging.light.lamps import LightSources, beam_share
+from twin.imaging.light.phase_function import PhaseFunction, petzold, tabulate
 from twin.imaging.reference.walk import (
     DIRECT,
     FIRST_BIN,

@@ -1,0 +1,1 @@
+"""What `twin export` does: contents of a run folder, and exact truth rendered again at its poses."""

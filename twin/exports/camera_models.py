@@ -1,0 +1,87 @@
+"""Believed and true calibration of the images of a scenario, as camera models of OpenCV."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.records import StereoRig
+from twin.exchange.run_contents import CameraIntrinsics, RigCalibration, project
+from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
+from twin.scenario.model import Scenario
+
+_N_COLUMNS = 13  # columns, and rows, of the grid of pixels for the fit
+_RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as multiples of the planned altitude
+
+
+def believed_calibration(rig: StereoRig) -> RigCalibration:
+    """Returns the believed calibration of rectified images: two equal pinhole cameras without distortion."""
+    camera = CameraIntrinsics((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
+    return RigCalibration(camera, camera, rig.left_from_right, rig.body_from_camera)
+
+
+def true_calibration(scenario: Scenario) -> RigCalibration:
+    """Returns the true calibration of the delivered images, which are rectified with the believed calibration.
+
+    The true pixel of a point is computed by `TrueCameras.project`, which models port, lens and rectification. Camera
+    matrix, distortion (k1, k2, p1, p2, k3) and, for the right camera, its rotation are fitted to the images of points
+    at depths of 0.6, 1 and 1.4 times the planned altitude by least squares; `residual_px` is the RMS distance that
+    remains. For cameras without lens distortion, port and calibration errors (except that of the baseline), the result
+    is exact, and `residual_px` is zero.
+
+    Raises:
+        TwinError: the cameras of the scenario are invalid, see `make_true_cameras`.
+    """
+    cameras = make_true_cameras(scenario)
+    rig = scenario.believed_rig()
+    left_from_right = cameras.rendered_rig.left_from_right
+    if cameras.sampling is None:
+        exact = believed_calibration(rig)
+        return exact._replace(left_from_right=left_from_right)
+    points_m = _points(rig, scenario.plan.altitude_m)
+    left, _, left_px = _fitted(cameras, 0, points_m, rig)
+    right, rotation, right_px = _fitted(cameras, 1, points_m, rig)
+    residual_px = float(np.sqrt(np.mean(np.concatenate([left_px, right_px]) ** 2) * 2))
+    pose = left_from_right @ geometry.inverse(geometry.pose(rotation, np.zeros(3)))
+    return RigCalibration(left, right, pose, rig.body_from_camera, residual_px)
+
+
+def _points(rig: StereoRig, altitude_m: float) -> Array:
+    """Returns points (n, 3) [m] in camera axes that fill the image at depths of `_RANGES` times the altitude."""
+    columns = np.linspace(0, rig.width_px - 1, _N_COLUMNS)
+    rows = np.linspace(0, rig.height_px - 1, _N_COLUMNS)
+    pixels = np.stack(np.meshgrid(columns, rows), -1).reshape(-1, 2)
+    directions = np.column_stack([rig.normalised(pixels), np.ones(len(pixels))])
+    return np.concatenate([directions * (share * altitude_m) for share in _RANGES])
+
+
+def _fitted(
+    cameras: TrueCameras, camera: int, points_m: Array, rig: StereoRig
+) -> tuple[CameraIntrinsics, Array, Array]:
+    """Returns the model fitted to one camera, its rotation (3, 3) camera_from_rendered, and the residuals (2 n,) [px].
+
+    The rotation of the left camera is the identity: its axes are those of the true poses.
+
+    Args:
+        cameras: the true cameras.
+        camera: 0 left, 1 right.
+        points_m: (n, 3) points in the axes of the rendered camera [m]; those without an image are left out.
+        rig: believed calibration; it has the image size and is the start of the fit.
+    """
+    seen = cameras.project(points_m, camera)
+    known = np.isfinite(seen).all(axis=1)
+    points_m, seen = points_m[known], seen[known]
+
+    def residuals(p: Array) -> Array:
+        matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
+        rotation = geometry.so3_exp(p[9:]) if camera else np.eye(3)
+        camera_model = CameraIntrinsics((rig.width_px, rig.height_px), matrix, p[4:9])
+        return (project(points_m @ rotation.T, camera_model) - seen).ravel()
+
+    start = np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, *np.zeros(5 + 3 * camera)])
+    p = least_squares(residuals, start, x_scale=np.r_[np.full(4, 1.0), np.full(5 + 3 * camera, 1e-3)]).x
+    matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
+    rotation = geometry.so3_exp(p[9:]) if camera else np.eye(3)
+    return CameraIntrinsics((rig.width_px, rig.height_px), matrix, p[4:9]), rotation, residuals(p)

@@ -1,0 +1,262 @@
+"""The command `twin export`: reads a run from its folder and writes it in the formats of other programs."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.app.outputs import new_folder
+from twin.core.georeference import Georeference
+from twin.core.output_folder import sole_writer
+from twin.core.records import ElevationMap, Image
+from twin.errors import TwinError
+from twin.exchange import geotiff
+from twin.exchange.formats import FORMATS, check_needs, chosen_formats
+from twin.exchange.run_contents import POSES, RecordedFrame, RunContents, TrueLayers
+from twin.exports.camera_models import believed_calibration, true_calibration
+from twin.exports.recorded_frames import missing_files, recorded_frames, recorded_imu
+from twin.report.replay_description import replayed_rig
+from twin.report.run_folder import SCENARIO_FILE, Raster, Run, load_run
+from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
+
+
+class ExportOptions(NamedTuple):
+    """Options of an export.
+
+    Args:
+        crs: CRS of the exported coordinates, such as EPSG:32633; None: that of the run.
+        origin: easting, northing and elevation of the scene origin as text, E,N or E,N,H; None: that of the run.
+        jpeg_quality: quality of exported images as JPEG, 1 to 100; None: PNG.
+        allow_plugins: run plug-ins that the scenario of the run names as module:Class, for the true layers.
+    """
+
+    crs: str | None = None
+    origin: str | None = None
+    jpeg_quality: int | None = None
+    allow_plugins: bool = False
+
+
+def export(
+    folder: Path,
+    names: Sequence[str],
+    out: Path,
+    options: ExportOptions = ExportOptions(),  # noqa: B008 (immutable)
+    progress: Callable[[str, float], None] = lambda _, __: None,
+    warn: Callable[[str], None] = lambda _: None,
+) -> dict[str, list[Path]]:
+    """Writes a run in several formats, each into the subfolder of `out` with the name of the format.
+
+    A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`
+    in `out`, which an error or an interrupt removes.
+
+    Args:
+        folder: the run folder.
+        names: names of formats (`formats.chosen_formats`).
+        out: folder of the exported files.
+        options: CRS, origin and compression.
+        progress: called with the name of a format and the completed fraction of it, 0 to 1.
+        warn: called with each sentence on a file that is missing in the run folder (`RunContents.notes`).
+
+    Returns:
+        The files or folders written, by format.
+
+    Raises:
+        TwinError: a format is unknown, an option is not valid, the folder is not that of a run, the run lacks contents
+            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or a package is
+            not installed, an image or the true poses of the run are damaged, or a file has the name of the hidden
+            folder; the formats before the affected one were written.
+        OSError: a file cannot be written.
+    """
+    chosen = chosen_formats(names)
+    contents = run_contents(folder, options)
+    for name in chosen:
+        check_needs(name, contents)
+        new_folder(out / name)
+    written = {}
+    with sole_writer(out, used=True):
+        for name in chosen:
+            with _completed(out / name) as unfinished:
+                files = FORMATS[name].write(replace(contents, progress=partial(progress, name)), unfinished)
+            written[name] = [out / name / file.relative_to(unfinished) for file in files]
+    for note in contents.notes:
+        warn(note)
+    return written
+
+
+@contextmanager
+def _completed(folder: Path) -> Iterator[Path]:
+    """Yields a hidden folder next to `folder`, which is renamed to `folder` at the end, or removed after an exception.
+
+    A hidden folder that a killed export has left is removed first.
+
+    Args:
+        folder: new or empty folder.
+
+    Raises:
+        TwinError: a file has the name of the hidden folder.
+        OSError: a folder cannot be created, removed or renamed.
+    """
+    unfinished = folder.with_name(f".{folder.name}.partial")
+    if unfinished.is_symlink() or unfinished.is_file():
+        raise TwinError("--out", f"{unfinished} is in the way", "a folder without this file")
+    if unfinished.exists():  # of an export that was killed
+        shutil.rmtree(unfinished)
+    unfinished.mkdir(parents=True)
+    try:
+        yield unfinished
+        unfinished.replace(folder)
+    except BaseException:
+        shutil.rmtree(unfinished, ignore_errors=True)
+        raise
+
+
+def format_rows() -> list[tuple[str, ...]]:
+    """Returns the rows of the list of formats: name, description, and the contents that the format needs."""
+    return [("format", "contents", "needs")] + [
+        (name, form.description, ", ".join(sorted(form.needs))) for name, form in FORMATS.items()
+    ]
+
+
+def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunContents:  # noqa: B008 (immutable)
+    """Returns the contents of a run folder for the writers.
+
+    Raises:
+        TwinError: the folder is not that of a run, a file of it is damaged, or an option is not valid.
+    """
+    run = load_run(folder)
+    rig = replayed_rig(run.scenario)
+    scenario = None if rig is not None else load_scenario(folder / SCENARIO_FILE, allow_plugins=True)
+    if scenario is not None:
+        rig = scenario.believed_rig()
+    assert rig is not None
+    frames = recorded_frames(run)
+    _check_poses(run, frames)
+    elevation = _elevation(run)
+    return RunContents(
+        folder=folder,
+        name=str(run.scenario.get("name", folder.name)),
+        scenario=run.scenario,
+        rig=rig,
+        believed=believed_calibration(rig),
+        true=None if scenario is None else true_calibration(scenario),
+        trajectories=run.trajectories,
+        keyframe_rows=run.keyframes.frames,
+        frames=frames,
+        imu=None if scenario is None else recorded_imu(folder, scenario),
+        elevation=elevation,
+        error_m=_layer(run, "dem_error", elevation),
+        true_map=folder / "dem_truth.tif" if "dem_truth" in run.rasters else None,
+        orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
+        georeference=_georeference(folder, options),
+        true_layers=_true_layers(folder, scenario, frames, options.allow_plugins),
+        jpeg_quality=_quality(options.jpeg_quality),
+        notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
+    )
+
+
+def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
+    """Raises TwinError unless the true and final trajectories that exist have a pose per frame, at increasing times."""
+    needed = max((one.index for one in frames), default=-1) + 1
+    for name in POSES:
+        if (path := run.trajectories.get(name)) is not None:
+            file = str(run.folder / f"trajectory_{name}.tum")
+            if len(path) < needed:
+                raise TwinError(file, f"has {len(path)} poses", f"{needed}, one per frame")
+            times_s = path.times_s
+            if not (np.isfinite(times_s).all() and (np.diff(times_s) > 0).all() and (times_s >= 0).all()):
+                raise TwinError(file, "has times that do not increase", "an undamaged file, written by `twin run`")
+
+
+def _true_layers(
+    folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...], allow_plugins: bool
+) -> Callable[[], TrueLayers] | None:
+    """Returns the function that renders the true layers; None without a rendered world or recorded true poses.
+
+    The function prepares the survey, which runs the plug-ins of the scenario.
+    """
+    if scenario is None or scenario.imaging.fidelity != "rendered" or not (folder / "frames" / "truth.npz").is_file():
+        return None
+    from twin.exports import true_layers
+
+    def layers() -> TrueLayers:
+        given = load_scenario(folder / SCENARIO_FILE, allow_plugins=allow_plugins)
+        return true_layers.true_layers(folder, given, frames)
+
+    return layers
+
+
+def _quality(quality: int | None) -> int | None:
+    """Returns the JPEG quality; raises TwinError unless it is None or from 1 to 100."""
+    if quality is not None and not 1 <= quality <= 100:
+        raise TwinError("--jpeg", f"{quality} is not a quality", "1 to 100")
+    return quality
+
+
+def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
+    """Returns the georeference given by the options, otherwise that of dem.tif; None if there is neither.
+
+    Raises:
+        TwinError: only one of the options --origin and --crs is given, one of them is not valid, or dem.tif is damaged.
+    """
+    if options.origin is None and options.crs is None:
+        file = folder / "dem.tif"
+        return geotiff.read_georeference(file) if file.is_file() else None
+    if options.origin is None or options.crs is None:
+        raise TwinError("--crs", "is given without --origin, or --origin without --crs", "both or none of them")
+    try:
+        east, north, *height = (float(part) for part in options.origin.split(","))
+        if len(height) > 1 or not np.isfinite([east, north, *height]).all():
+            raise ValueError
+    except ValueError:
+        problem = f"{options.origin[:60]!r} is not a position"
+        raise TwinError("--origin", problem, "E,N or E,N,H in the CRS, as in 432000,5571000,-35") from None
+    return geotiff.georeference_in(options.crs, (east, north, height[0] if height else 0.0))
+
+
+def _elevation(run: Run) -> ElevationMap | None:
+    """Returns the elevation map of a run with the colours of the orthomosaic at its cells; None if there is none."""
+    if "dem" not in run.rasters:
+        return None
+    grid, height_m = run.rasters["dem"]
+    sigma = run.rasters.get("dem_sigma")
+    sigma_m = np.full(height_m.shape, np.nan) if sigma is None or sigma.grid != grid else sigma.values
+    mosaic = _colours(run.rasters.get("mosaic"), run.rasters["dem"])
+    heights = height_m.astype(np.float32), sigma_m.astype(np.float32)
+    return ElevationMap(grid, *heights, mosaic, run.keyframes.map_from_world)
+
+
+def _colours(mosaic: Raster | None, dem: Raster) -> Image:
+    """Returns the mean colour (rows, cols, 3) of the orthomosaic around the centre of each cell; black without data.
+
+    The mean is taken over a square about as large as a cell. Without an orthomosaic, all cells are black.
+    """
+    if mosaic is None:
+        return np.zeros((*dem.values.shape, 3), np.uint8)
+    if mosaic.grid == dem.grid:
+        return mosaic.values.astype(np.uint8)
+    side = max(1, round(dem.grid.cell_m / mosaic.grid.cell_m))
+    smooth = cv2.blur(mosaic.values.astype(np.uint8), (side, side))
+    x, y = dem.grid.centres()
+    cols = np.floor((x - mosaic.grid.west_m) / mosaic.grid.cell_m).astype(int)
+    rows = np.floor((mosaic.grid.north_m - y) / mosaic.grid.cell_m).astype(int)
+    inside_rows, inside_cols = (rows >= 0) & (rows < mosaic.grid.rows), (cols >= 0) & (cols < mosaic.grid.cols)
+    sampled = smooth[np.clip(rows, 0, mosaic.grid.rows - 1)][:, np.clip(cols, 0, mosaic.grid.cols - 1)]
+    return np.where((inside_rows[:, None] & inside_cols)[..., None], sampled, np.uint8(0))
+
+
+def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.float32] | None:
+    """Returns the layer of a run with a given name; None if the run has none on the grid of its elevation map."""
+    raster = run.rasters.get(name)
+    if raster is None or elevation is None or raster.grid != elevation.grid:
+        return None
+    return raster.values.astype(np.float32)

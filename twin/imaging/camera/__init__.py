@@ -1,0 +1,1 @@
+"""From radiance to pixel values: lens, port, shutter, sensor, white balance."""

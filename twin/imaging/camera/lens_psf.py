@@ -1,0 +1,449 @@
+"""Point spread function of a lens: diffraction, aberrations, lateral colour and depth of field.
+
+The image of a point is described by the modulation transfer function (MTF), the contrast at a spatial frequency nu
+relative to that at frequency 0. A lens of f-number N without aberrations has, in light of wavelength l (Goodman,
+Introduction to Fourier Optics, section 6.3; Hopkins 1955), with x = nu l N,
+
+    MTF = 2 / pi (arccos(x) - x sqrt(1 - x^2)),    0 for x > 1
+
+Aberrations are described by a Gaussian of standard deviation sigma in the image, MTF = exp(-2 pi^2 sigma^2 nu^2).
+Diffraction and aberrations may differ between the colour bands, as may the scale of the image (lateral colour).
+
+A point at depth z is imaged as a disc of the diameter (circle of confusion)
+
+    c = A f |1/z - 1/s|
+
+for a lens with an aperture of diameter A, focused at depth s, with f the focal length in water [px] (thin lens; the
+focal length is negligible compared with s). A pixel gets the mean light over the disc that belongs to its own depth, so
+the blur of a near object does not spread over the background.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.records import StereoRig
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.camera.port import pinhole
+from twin.imaging.light.bands import CENTRE_NM
+from twin.kernels import kernel
+from twin.scenario.model import LensConfig, Scenario, SensorConfig
+
+Array = NDArray[np.float64]
+Radiance = NDArray[np.float32]
+Depth = NDArray[np.float32]
+
+REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; `_add_across` is written for 4
+TAPS = 4  # taps of cubic interpolation
+GRID = 64  # samples of the MTF along each axis, from which the kernel is computed
+MTF_ERROR = 5e-3  # separable terms are added until their transform is within this of that of the kernel
+NEAREST_FOCUS_M = 0.05  # smallest depth to which a lens can be focused
+SMALL_PX = 3.0  # largest circle of confusion for the 3 x 3 kernel
+NEGLIGIBLE_PX = 0.1  # circles of confusion up to this diameter are ignored: their variance is below 0.001 px^2
+
+
+class Defocus(NamedTuple):
+    """Aperture diameter [m], and the inverse of the depth in focus [1/m], 0 for a lens focused at infinity."""
+
+    aperture_m: float
+    focus_per_m: float
+
+    def confusion_px(self, focal_px: float, depth_m: Array) -> Array:
+        """Returns the diameters of the circles of confusion [px] at depths of any shape [m]."""
+        return self.aperture_m * focal_px * np.abs(1 / depth_m - self.focus_per_m)
+
+
+def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
+    """Returns aperture and focus of the lenses; None without a sensor, or if `lens.focus_m` is 0.
+
+    The aperture is the focal length in air divided by the f-number.
+
+    Args:
+        scenario: lens, port and sensor.
+        rig: the rendered cameras, with the focal length in water.
+    """
+    lens, sensor = scenario.lens, scenario.sensor
+    if sensor is None or not lens.focus_m:
+        return None
+    air_focal_m = rig.focal_px / pinhole(scenario.port).focal_ratio * sensor.pixel_um * 1e-6
+    return Defocus(air_focal_m / sensor.f_number, 1 / lens.focus_m)
+
+
+def diffraction_mtf(cycles_per_px: Array, wavelength_nm: float, sensor: SensorConfig) -> Array:
+    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px].
+
+    Args:
+        cycles_per_px: spatial frequencies.
+        wavelength_nm: wavelength of the light in air.
+        sensor: f-number and size of the pixels.
+    """
+    s = np.abs(cycles_per_px) / sensor.pixel_um * wavelength_nm * 1e-3 * sensor.f_number
+    s = np.minimum(s, 1.0)
+    return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
+
+
+class LensPsf:
+    """Point spread function of both lenses, which is applied to the light of a rendered image.
+
+    Args:
+        scenario: lens, port and sensor; without a sensor there is neither diffraction nor depth of field.
+        rig: the rendered cameras.
+    """
+
+    def __init__(self, scenario: Scenario, rig: StereoRig):
+        lens = scenario.lens
+        self._defocus, self._focal_px = defocus_of(scenario, rig), rig.focal_px
+        self._taps = _taps(lens, scenario.sensor)
+        self._scales = _magnification(lens, rig) if any(lens.lateral_colour) else None
+
+    def out_of_focus(self, light: Radiance, depth: Depth) -> Radiance:
+        """Returns the radiance (H, W, 3) with defocus blur; `light` itself if the blur is off or negligible.
+
+        Args:
+            light: (H, W, 3) radiance.
+            depth: (H, W) depth along the optical axis [m]; inf is valid.
+        """
+        if self._defocus is None:
+            return light
+        extremes = np.array([depth.min(), depth.max()], np.float64)
+        if self._defocus.confusion_px(self._focal_px, extremes).max() <= NEGLIGIBLE_PX:
+            return light
+        near, out = np.reciprocal(depth), np.empty_like(light)
+        scale, focus = np.float32(self._defocus.aperture_m * self._focal_px), np.float32(self._defocus.focus_per_m)
+        flat, filled = light.reshape(len(light), -1), out.reshape(len(light), -1)
+        in_row_bands(lambda first, end: _defocus(flat, near, scale, focus, filled, first, end), len(light))
+        return out
+
+    def transfer(self, light: Radiance) -> Radiance:
+        """Returns the radiance (H, W, 3) after diffraction, aberrations and lateral colour, at least 0.
+
+        It is `light` itself if the lens has none of them.
+        """
+        if self._taps is None and self._scales is None:
+            return light
+        rows, width, taps = *light.shape[:2], self._taps
+        flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
+        if taps is None:
+            in_row_bands(lambda first, end: _split_rows(flat, bands, first, end), rows)
+        else:
+            in_row_bands(lambda first, end: _convolve(flat, *taps, bands, first, end), rows)
+        out = np.empty((rows, 3 * width), np.float32)
+        if self._scales is None:
+            in_row_bands(lambda first, end: _join_rows(bands, out, first, end), rows)
+        else:
+            tables = self._scales
+            in_row_bands(lambda first, end: _magnify(bands, *tables, out, first, end), rows)
+        return out.reshape(rows, width, 3)
+
+
+def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:
+    """Returns the MTF of a lens in a band (0 red, 1 green, 2 blue) at frequencies of any shape [cycles/px].
+
+    It is that of the aberrations, times that of diffraction if `lens.diffraction` is set and there is a sensor.
+    """
+    share = np.exp(-2 * (np.pi * lens.blur_px[band] * cycles_per_px) ** 2)
+    return share * diffraction_mtf(cycles_per_px, CENTRE_NM[band], sensor) if lens.diffraction and sensor else share
+
+
+def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
+    """Returns the point spread functions of the bands as sums of products of a kernel along columns and one along rows.
+
+    The result is two arrays (3, terms, REACH_PX + 1), the kernels along columns and those along rows, of the bands R,
+    G, B; kernels are symmetric and stored from the centre outwards. The result is None if the lens does not blur.
+    """
+    if not lens.diffraction and not any(lens.blur_px):
+        return None
+    bands = [_separable(_kernel(lens, sensor, band)) for band in range(3)]
+    terms = max(len(band) for band in bands)
+    down, across = np.zeros((2, 3, terms, REACH_PX + 1), np.float32)
+    for k, band in enumerate(bands):
+        for i, (value, vector) in enumerate(band):
+            down[k, i], across[k, i] = value * vector[REACH_PX:], vector[REACH_PX:]
+    return down, across
+
+
+def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
+    """Returns the kernel (2 REACH_PX + 1, 2 REACH_PX + 1) of a band, the inverse Fourier transform of its MTF.
+
+    The light that falls outside is spread evenly over the kernel, so that its sum is 1: among the kernels of this size
+    with sum 1, this one has the smallest mean square error of the MTF.
+    """
+    nu = np.fft.fftfreq(GRID)
+    share = mtf(lens, sensor, band, np.hypot(nu, nu[:, None]))
+    kernel = np.fft.fftshift(np.fft.ifft2(share).real)
+    inside = slice(GRID // 2 - REACH_PX, GRID // 2 + REACH_PX + 1)
+    kernel = kernel[inside, inside]
+    return kernel + (1 - kernel.sum()) / kernel.size
+
+
+def _separable(kernel: Array) -> list[tuple[float, Array]]:
+    """Returns the eigenvalues of largest magnitude, and their eigenvectors, of a symmetric kernel.
+
+    The sum of the outer products of the eigenvectors with themselves, times the eigenvalues, has a transform within
+    `MTF_ERROR` of that of the kernel. The eigenvalues are then scaled so that all elements of this sum add up to 1.
+    """
+    values, vectors = np.linalg.eigh(kernel)
+    order, n = np.argsort(-np.abs(values)), 1
+    while True:
+        chosen = order[:n]
+        total = np.einsum("k,ik,jk->ij", values[chosen], vectors[:, chosen], vectors[:, chosen])
+        if np.abs(np.fft.fft2(total - kernel)).max() < MTF_ERROR or n == len(values):
+            return [(values[k] / total.sum(), vectors[:, k]) for k in chosen]
+        n += 1
+
+
+class _Magnification(NamedTuple):
+    """Lateral colour: the images of the red and the blue band are magnified relative to the green one.
+
+    Args:
+        runs: (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band,
+            first column, end column (exclusive), and this offset.
+        across: (3, TAPS, W) weights along the rows, for each band.
+        lines: (3, H) offset of the first tap of each row from the row.
+        down: (3, H, TAPS) weights along the columns.
+    """
+
+    runs: NDArray[np.int64]
+    across: NDArray[np.float32]
+    lines: NDArray[np.int64]
+    down: NDArray[np.float32]
+
+
+def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
+    """Returns the interpolation that magnifies the red and the blue band relative to the green one (lateral colour)."""
+    red, blue = lens.lateral_colour
+    scales = 1 + np.array([red, 0.0, blue])
+    first, across = _taps_of(rig.width_px, rig.cx_px, scales)
+    runs = []
+    for band, taps in enumerate(first):
+        starts = np.flatnonzero(np.diff(taps, prepend=taps[0] - 1))
+        ends = np.append(starts[1:], rig.width_px)
+        runs.append(np.column_stack([np.full(len(starts), band), starts, ends, taps[starts]]))
+    across = np.ascontiguousarray(across.swapaxes(1, 2))
+    return _Magnification(np.concatenate(runs), across, *_taps_of(rig.height_px, rig.cy_px, scales))
+
+
+def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Returns the taps of the magnification along an axis of n pixels, by cubic interpolation (Keys 1981).
+
+    Args:
+        n: number of pixels.
+        middle_px: position that the magnification does not move.
+        scales: (3,) magnification of the bands.
+
+    Returns:
+        For R, G, B, the offset (3, n) of the first tap of each pixel from this pixel [px], and the weights (3, n, TAPS)
+        of the TAPS consecutive pixels from there.
+    """
+    at = middle_px + (np.arange(n) - middle_px) / scales[:, None]
+    whole = np.floor(at)
+    t = at - whole
+    cubic = np.array(
+        [-0.5 * t * (1 - t) ** 2, 1 - t**2 * (2.5 - 1.5 * t), 1 - (1 - t) ** 2 * (1 + 1.5 * t), -0.5 * (1 - t) * t**2]
+    )
+    return whole.astype(np.int64) - 1 - np.arange(n), np.ascontiguousarray(np.moveaxis(cubic, 0, 2), np.float32)
+
+
+@kernel
+def _split_rows(light, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
+    for v in range(first, end):
+        _split_row(light[v], out[v, 0], out[v, 1], out[v, 2])
+
+
+@kernel
+def _join_rows(bands, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) from `bands` (H, 3, W)."""
+    for v in range(first, end):
+        _join_row(bands[v, 0], bands[v, 1], bands[v, 2], out[v])
+
+
+@kernel
+def _split_row(row, red, green, blue):
+    """Copies R, G, B, which alternate in `row` (3 W,), to one array (W,) each."""
+    for u in range(red.size):
+        red[u], green[u], blue[u] = row[3 * u], row[3 * u + 1], row[3 * u + 2]
+
+
+@kernel
+def _join_row(red, green, blue, row):
+    """Fills `row` (3 W,) with alternating R, G, B, at least 0."""
+    zero = np.float32(0.0)
+    for u in range(red.size):
+        row[3 * u], row[3 * u + 1], row[3 * u + 2] = max(red[u], zero), max(green[u], zero), max(blue[u], zero)
+
+
+@kernel
+def _convolve(light, down, across, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
+
+    The bands are kept apart, so that the weights of a row are constant. The latest rows of the image are stored in
+    `lines`: row v in lines[v modulo their number].
+
+    Args:
+        down, across: weights of `_taps` along columns and rows.
+    """
+    rows, _, width = out.shape
+    n, terms = 2 * REACH_PX + 1, down.shape[1]
+    lines, wide = np.empty((n, 3, width), np.float32), np.empty(width + 2 * REACH_PX, np.float32)
+    middle = wide[REACH_PX : REACH_PX + width]
+    for v in range(first - REACH_PX, end + REACH_PX):
+        line = lines[v % n]
+        _split_row(light[min(max(v, 0), rows - 1)], line[0], line[1], line[2])
+        at = v - REACH_PX
+        if at < first:
+            continue
+        for band in range(3):
+            filled = out[at, band]
+            for i in range(terms):
+                weights = down[band, i]
+                _weigh_line(lines[at % n, band], weights[0], middle)
+                for t in range(1, REACH_PX + 1, 2):
+                    above, below = lines[(at - t) % n, band], lines[(at + t) % n, band]
+                    higher, lower = lines[(at - t - 1) % n, band], lines[(at + t + 1) % n, band]
+                    _add_pairs(above, below, weights[t], higher, lower, weights[t + 1], middle)
+                for k in range(REACH_PX):
+                    wide[k], wide[REACH_PX + width + k] = middle[0], middle[width - 1]
+                _add_across(wide, across[band, i], filled, i == 0)
+
+
+@kernel(forceinline=True, fastmath={"contract"})
+def _weigh_line(values, weight, out):
+    """Fills `out` (n,) with `values` (n,) times a weight."""
+    for k in range(out.size):
+        out[k] = weight * values[k]
+
+
+@kernel(forceinline=True, fastmath={"contract"})
+def _add_pairs(before, after, weight, earlier, later, other_weight, out):
+    """Adds two pairs of filter taps to `out` (n,): the sum of each pair of values (n,), times its weight."""
+    for k in range(out.size):
+        out[k] += weight * (before[k] + after[k]) + other_weight * (earlier[k] + later[k])
+
+
+@kernel(forceinline=True, fastmath={"contract"})
+def _add_across(wide, weights, out, is_first):
+    """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,).
+
+    If `is_first`, it replaces the values of `out`.
+    """
+    a, b, c, d, e = wide[0:], wide[1:], wide[2:], wide[3:], wide[4:]
+    f, g, h, i = wide[5:], wide[6:], wide[7:], wide[8:]
+    w0, w1, w2, w3, w4 = weights[0], weights[1], weights[2], weights[3], weights[4]
+    if is_first:
+        for k in range(out.size):
+            out[k] = np.float32(0.0)
+    for k in range(out.size):
+        near = w1 * (d[k] + f[k]) + w2 * (c[k] + g[k])
+        out[k] += w0 * e[k] + near + (w3 * (b[k] + h[k]) + w4 * (a[k] + i[k]))
+
+
+@kernel
+def _magnify(light, runs, across, lines, down, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
+
+    The other arguments are those of `_Magnification`.
+    """
+    rows, _, width = light.shape
+    pad = max(-runs[:, 3].min(), runs[:, 3].max() + TAPS - 1, 0)
+    wide, filled = np.empty((3, width + 2 * pad), np.float32), np.empty((3, width), np.float32)
+    for v in range(first, end):
+        for band in range(3):
+            start, weights = v + lines[band, v], down[band, v]
+            a, b = light[min(max(start, 0), rows - 1), band], light[min(max(start + 1, 0), rows - 1), band]
+            c, d = light[min(max(start + 2, 0), rows - 1), band], light[min(max(start + 3, 0), rows - 1), band]
+            middle = wide[band, pad : pad + width]
+            _weighted_sum(a, b, c, d, weights[0], weights[1], weights[2], weights[3], middle)
+            for k in range(pad):
+                wide[band, k], wide[band, pad + width + k] = middle[0], middle[width - 1]
+        for r in range(runs.shape[0]):
+            band, start, stop, shift = runs[r, 0], runs[r, 1], runs[r, 2], pad + runs[r, 3]
+            a, b = across[band, 0, start:stop], across[band, 1, start:stop]
+            c, d = across[band, 2, start:stop], across[band, 3, start:stop]
+            _weigh_across(wide[band, shift + start :], a, b, c, d, filled[band, start:stop])
+        _join_row(filled[0], filled[1], filled[2], out[v])
+
+
+@kernel(forceinline=True, fastmath={"contract"})
+def _weighted_sum(a, b, c, d, of_a, of_b, of_c, of_d, out):
+    """Fills `out` (n,) with the weighted sum of four arrays (n,)."""
+    for k in range(out.size):
+        out[k] = of_a * a[k] + of_b * b[k] + of_c * c[k] + of_d * d[k]
+
+
+@kernel(forceinline=True, fastmath={"contract"})
+def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
+    """Fills `out` (n,) with sums of TAPS consecutive `values` (n + TAPS - 1,), weighted by the arrays `of_...` (n,)."""
+    second, third, fourth = values[1:], values[2:], values[3:]
+    for k in range(out.size):
+        left = of_first[k] * values[k] + of_second[k] * second[k]
+        out[k] = left + of_third[k] * third[k] + of_fourth[k] * fourth[k]
+
+
+@kernel
+def _defocus(light, near, scale, focus, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
+
+    Args:
+        near: (H, W) inverse depth [1/m].
+        scale: diameter of the aperture times the focal length [px m]; this times the absolute difference between the
+            inverse depth and `focus` is the diameter of the disc [px].
+        focus: inverse of the depth in focus [1/m].
+    """
+    rows, width = near.shape
+    wide = np.empty(3 * width, np.float32)
+    for v in range(first, end):
+        most = np.float32(0.0)
+        for u in range(width):
+            c = scale * abs(near[v, u] - focus)
+            most = max(most, c)
+            wide[3 * u] = wide[3 * u + 1] = wide[3 * u + 2] = c
+        short = most <= np.float32(SMALL_PX)
+        _defocus_row(light[max(v - 1, 0)], light[v], light[min(v + 1, rows - 1)], wide, out[v])
+        for u in range(0, width, max(width - 1, 1) if short else 1):
+            if 0 < u < width - 1 and wide[3 * u] <= np.float32(SMALL_PX):
+                continue
+            _gather(light, v, u, wide[3 * u], rows, width, out[v, 3 * u : 3 * u + 3])
+
+
+@kernel
+def _defocus_row(above, here, below, diameter, out):
+    """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel that has the moments of a disc.
+
+    A disc of diameter c has the variance c^2 / 16 along each axis and the fourth moment <x^2 y^2> = c^4 / 384.
+    `diameter` (3 W,) [px] has the diameter for each band of each pixel; those above `SMALL_PX` count as `SMALL_PX`.
+    """
+    before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
+    a0, a1, a2 = above[before], above[middle], above[after]
+    b0, b1, b2 = here[before], here[middle], here[after]
+    c0, c1, c2 = below[before], below[middle], below[after]
+    diameter, out = diameter[middle], out[middle]
+    for k in range(out.size):
+        cc = min(diameter[k] * diameter[k], np.float32(SMALL_PX * SMALL_PX))
+        both = cc * cc * np.float32(1 / 384)
+        side, corner = np.float32(0.5) * (cc * np.float32(1 / 16) - both), np.float32(0.25) * both
+        total = side * (b0[k] + b2[k] + a1[k] + c1[k]) + corner * (a0[k] + a2[k] + c0[k] + c2[k])
+        out[k] = total + (np.float32(1.0) - np.float32(4.0) * (side + corner)) * b1[k]
+
+
+@kernel
+def _gather(light, v, u, diameter, rows, width, out):
+    """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u).
+
+    Beyond the image border, the pixels of the border are repeated.
+    """
+    radius = np.float32(0.5) * diameter + np.float32(0.5)
+    reach = int(radius)
+    red = green = blue = total = np.float32(0.0)
+    for j in range(-reach, reach + 1):
+        row = light[min(max(v + j, 0), rows - 1)]
+        for i in range(-reach, reach + 1):
+            weight = min(radius - np.sqrt(np.float32(i * i + j * j)), np.float32(1.0))
+            if weight > 0:
+                at = 3 * min(max(u + i, 0), width - 1)
+                red, green, blue = red + weight * row[at], green + weight * row[at + 1], blue + weight * row[at + 2]
+                total += weight
+    out[0], out[1], out[2] = red / total, green / total, blue / total

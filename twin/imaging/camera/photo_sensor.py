@@ -1,0 +1,191 @@
+"""Physical sensor (section [sensor] of a scenario): radiance to digital numbers; exposure and read-out time."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.records import Exposure, Image, StereoRig
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.camera.photons import electrons_per_cd, vignetting
+from twin.imaging.camera.pixels import PixelResponse, Raw, read_out
+from twin.imaging.camera.sensor import Array, AutoExposure, ExposureSetting, PlainSensor, Radiance
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.imaging.camera.tone import linear_of, tone
+from twin.imaging.camera.white_balance import WhiteBalance
+from twin.kernels import kernel
+from twin.scenario.model import Scenario, SensorConfig
+
+BLACK_SHARE = 1 / 64  # black level as a fraction of the number of levels, so that dark noise is not clipped at zero
+
+
+class Sensor(Protocol):
+    """Interface of the sensor model that both cameras share."""
+
+    @property
+    def setting(self) -> ExposureSetting | None: ...
+
+    def meter(self, light: Radiance) -> ExposureSetting: ...
+
+    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None: ...
+
+    def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image: ...
+
+    def signal_per_cd(self, setting: ExposureSetting) -> Exposure: ...
+
+
+def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
+    """Returns a scenario's sensor in its initial state: `PhotoSensor` with a section [sensor], else `PlainSensor`.
+
+    Args:
+        scenario: survey scenario.
+        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
+
+    Raises:
+        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
+    """
+    return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
+
+
+class PhotoSensor:
+    """Physical sensor of both cameras, with auto-exposure that increases first the exposure time, then the gain.
+
+    At the limits of exposure time and gain, images become dark or saturate. Auto-exposure meters the radiance, not
+    the image, so it does not oscillate if an image saturates.
+
+    Args:
+        scenario: survey scenario.
+        sensor: section [sensor] of the scenario.
+        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
+
+    Raises:
+        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
+    """
+
+    def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
+        rig = scenario.believed_rig()
+        self._sensor = sensor
+        self._vignetting = vignetting(rig if raw_rig is None else raw_rig, sensor.vignetting_power)
+        self._electrons_per_cd_s = electrons_per_cd(sensor, scenario.port.water_index)
+        top, self._black_dn = float((1 << sensor.bits) - 1), float(round(BLACK_SHARE * (1 << sensor.bits)))
+        self._top_dn, self._dn_per_e = top, (top - self._black_dn) / sensor.full_well_e
+        self._white = WhiteBalance(scenario, self._electrons_per_cd_s)
+        # signal per second at 1 cd/m2 and gain 1 in the most sensitive band; white balance amplifies the others
+        self._signal_per_s = float(self._electrons_per_cd_s.max()) / sensor.full_well_e
+        self._shortest_s, self._longest_s = sensor.exposure_min_ms / 1000, sensor.exposure_max_ms / 1000
+        self._most_gain = 10 ** (sensor.gain_max_db / 20)
+        limits = self._signal_per_s * self._shortest_s, self._signal_per_s * self._longest_s * self._most_gain
+        gray_level = linear_of(scenario.imaging.gray_level, sensor.tone_curve)
+        self._exposure = AutoExposure(gray_level, rig.frame_rate_hz, sensor.exposure_lag_s, limits)
+
+    @property
+    def setting(self) -> ExposureSetting | None:
+        """Returns the exposure of the next frame; None before the first frame is metered."""
+        gain = self._exposure.next_gain
+        return None if gain is None else self._setting(gain, self._white.next_factors)
+
+    def meter(self, light: Radiance) -> ExposureSetting:
+        """Returns this frame's exposure, and meters `light` for the later frames.
+
+        The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
+
+        Args:
+            light: (H, W, 3) radiance at the raw pixels.
+        """
+        mean = _weighted_mean(light, self._vignetting)
+        white = self._white.factors(mean, self._exposure.share)
+        return self._setting(self._exposure.gain_for(float((mean * self._white.relative(white)).max())), white)
+
+    def _setting(self, gain: float, white: Array) -> ExposureSetting:
+        """Returns the exposure with the given gain [1 / (cd/m2)] and white balance (3,)."""
+        product_s = gain / self._signal_per_s
+        exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
+        amplification = min(max(product_s / exposure_s, 1.0), self._most_gain)
+        balance = None if self._white.is_of_white_light else (white[0], white[1], white[2])
+        return ExposureSetting(gain, exposure_s, amplification, balance)
+
+    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
+        """Returns the motion of a camera during its exposure; None if it has no effect on the image.
+
+        Args:
+            twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+            setting: exposure of this frame.
+            n_rows: number of rows of the rendered image, which may have a margin around the rows of the sensor; the
+                read-out time of the result is that of these rows.
+        """
+        row_ratio = (n_rows - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
+        readout_s = row_ratio * self._sensor.readout_ms / 1000
+        exposure_s = setting.exposure_s if self._sensor.motion_blur else 0.0
+        return ExposureMotion(twist, exposure_s, readout_s) if twist.any() and (readout_s or exposure_s) else None
+
+    def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
+        """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
+        return self.develop(self.raw(light, setting, rng), setting.white)
+
+    def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
+        """Returns the linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]."""
+        white = np.ones(3) if setting.white is None else self._white.relative(np.array(setting.white)) * np.ones(3)
+        red, green, blue = (setting.gain * white).tolist()
+        return red, green, blue
+
+    def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
+        """Returns raw digital numbers: (H, W) with a Bayer filter, else (H, W, 3); without noise if `rng` is None."""
+        return read_out(light, self._vignetting, self._response(setting), self._sensor.bayer, rng)
+
+    def develop(self, raw: Raw, white: tuple[float, float, float] | None = None) -> Image:
+        """Returns the 8-bit RGB image (H, W, 3) of a raw image.
+
+        The black level is subtracted, white balance and tone curve are applied, and a Bayer image is demosaiced.
+
+        Args:
+            raw: digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
+            white: factors of R, G, B; None = those of white light.
+        """
+        toned = np.empty(raw.shape, np.uint8)
+        tones = self._tone_table(self._white.of_white_light if white is None else np.array(white))
+        bands = raw.reshape(*raw.shape[:2], -1), tones, toned.reshape(*raw.shape[:2], -1)
+        in_row_bands(lambda first, end: _tone(*bands, first, end), len(raw))
+        if raw.ndim == 3:
+            return toned
+        image = np.empty((*raw.shape, 3), np.uint8)
+        cv2.cvtColor(toned, cv2.COLOR_BayerRGGB2RGB, image)
+        return image
+
+    def _response(self, setting: ExposureSetting) -> PixelResponse:
+        return PixelResponse(
+            self._electrons_per_cd_s * setting.exposure_s, self._sensor.full_well_e, self._sensor.read_noise_e,
+            self._dn_per_e * setting.analogue_gain, self._black_dn, self._top_dn,
+        )  # fmt: skip
+
+    def _tone_table(self, white: Array) -> NDArray[np.uint8]:
+        """Returns the tone table (3, 2^bits): the 8-bit value of each digital number in each band."""
+        signal = (np.arange(self._top_dn + 1) - self._black_dn) / (self._top_dn - self._black_dn)
+        return np.clip(255 * tone(white[:, None] * signal, self._sensor.tone_curve) + 0.5, 0, 255).astype(np.uint8)
+
+
+@kernel(fastmath={"contract", "reassoc"})
+def _weighted_mean(light, weights):
+    """Returns the mean (3,) of `light` (H, W, 3) times `weights` (H, W) over all pixels, for each band."""
+    total = np.zeros(3)
+    for v in range(weights.shape[0]):
+        row, shares = light[v].reshape(-1), weights[v]
+        red = green = blue = np.float32(0.0)
+        for u in range(shares.size):
+            red += shares[u] * row[3 * u]
+            green += shares[u] * row[3 * u + 1]
+            blue += shares[u] * row[3 * u + 2]
+        total[0], total[1], total[2] = total[0] + red, total[1] + green, total[2] + blue
+    return total / weights.size
+
+
+@kernel
+def _tone(raw, tones, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` with the 8-bit values of `raw` (H, W, 1 or 3), from the tone table."""
+    _, width, bands = raw.shape
+    for v in range(first, end):
+        for u in range(width):
+            for k in range(bands):
+                out[v, u, k] = tones[(v & 1) + (u & 1) if bands == 1 else k, raw[v, u, k]]

@@ -1,0 +1,136 @@
+"""Ports of a camera housing: refraction of rays at the inner and outer face of the glass (Snell's law).
+
+All quantities are in the axes of the camera with the entrance pupil of the lens as origin; the housing is filled with
+air of refractive index 1. A ray of direction (X, Y, Z) in air is described by its normalised coordinates X / Z, Y / Z.
+
+Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics): a ray at a small angle
+leaves the outer face at the distance h from the axis and the angle w to the axis, both proportional to its angle in
+air. The pinhole lies at a distance h / w from that face, on the side of the camera, and its focal length is that of
+the lens times the ratio of the angles in air and in water. For a flat pane at distance d, of thickness t and index g,
+in water of index n, the pinhole lies d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that
+of the lens. Treibitz et al. 2012 (doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.imaging.camera.lens import solve
+from twin.scenario.model import PortConfig
+
+Array = NDArray[np.float64]
+
+STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: maximum steps; finite difference and tolerance of X / Z
+SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
+
+
+class Pinhole(NamedTuple):
+    """Pinhole camera in water that is equivalent, near the optical axis, to a camera behind a port.
+
+    Args:
+        centre_m: position of the pinhole on the optical axis, positive in front of the entrance pupil.
+        focal_ratio: focal length of the pinhole camera divided by that of the lens in air.
+    """
+
+    centre_m: float
+    focal_ratio: float
+
+
+def pinhole(port: PortConfig) -> Pinhole:
+    """Returns the equivalent pinhole of a port, ignoring its tilt and lateral offset (mounting errors)."""
+    if port.kind == "none":
+        return Pinhole(0.0, 1.0)
+    straight = port.model_copy(update={"tilt_deg": 0.0, "offset_m": (0.0, 0.0, port.offset_m[2])})
+    origin, direction = water_rays(straight, np.array([[SMALL_RAD, 0.0]]))
+    (x, _, z), (along_x, _, along_z) = origin[0], direction[0]
+    return Pinhole(float(z - x * along_z / along_x), float(SMALL_RAD * along_z / along_x))
+
+
+def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
+    """Returns the origin on the outer face [m] and the unit direction in water of rays, both (..., 3).
+
+    The direction is NaN where a ray misses the port or is totally reflected; the origin is NaN where a ray misses the
+    port. Without a port, rays start at the entrance pupil.
+
+    Args:
+        port: geometry and refractive indices.
+        normalised: (..., 2) normalised coordinates X / Z, Y / Z of the rays in air.
+    """
+    ray = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    start = np.zeros_like(ray)
+    if port.kind == "none":
+        return start, ray
+    hit = _hit_pane if port.kind == "flat" else _hit_dome
+    inner, normal = hit(port, start, ray, 0.0)
+    ray = refract(ray, normal, 1 / port.glass_index)
+    outer, normal = hit(port, inner, ray, port.thickness_m)
+    return outer, refract(ray, normal, port.glass_index / port.water_index)
+
+
+def air_coordinates(port: PortConfig, points_m: Array) -> Array:
+    """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN where none is found.
+
+    `water_rays` is inverted by Newton's method, starting from the equivalent pinhole. For a flat pane, convergence is
+    monotonic, because the angle in air grows faster than the angle in water.
+    """
+    normalised = points_m[..., :2] / points_m[..., 2:]
+    if port.kind == "none":
+        return normalised
+    equivalent = pinhole(port)
+    normalised = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
+
+    def miss(at: Array) -> Array:
+        """Returns the vector (..., 2) across the axis by which rays miss their points, divided by the points' depth.
+
+        Args:
+            at: (..., 2) normalised coordinates of the rays in air.
+        """
+        origin, direction = water_rays(port, at)
+        along = (points_m[..., 2:] - origin[..., 2:]) / direction[..., 2:]
+        return (origin + along * direction - points_m)[..., :2] / points_m[..., 2:]
+
+    for _ in range(STEPS):
+        residual = miss(normalised)
+        if np.nanmax(np.abs(residual), initial=0.0) < TOLERANCE:
+            break
+        columns = [(miss(normalised + step) - residual) / STEP for step in STEP * np.eye(2)]
+        normalised = normalised - solve(np.stack(columns, axis=-1), residual)
+    converged = np.abs(miss(normalised)).max(axis=-1) < 100 * TOLERANCE
+    return np.where(converged[..., None], normalised, np.nan)
+
+
+def refract(ray: Array, normal: Array, ratio: float) -> Array:
+    """Returns the refracted unit vectors (..., 3) by Snell's law; NaN where light is totally reflected.
+
+    Args:
+        ray: (..., 3) unit directions of incidence.
+        normal: (..., 3) unit normals in the direction of propagation.
+        ratio: refractive index before the face, divided by the index behind the face.
+    """
+    cosine = (ray * normal).sum(axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore"):
+        behind = np.sqrt(1 - ratio**2 * (1 - cosine**2))
+    return ratio * ray + (behind - ratio * cosine) * normal
+
+
+def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
+    """Returns intersections and normals (..., 3) of rays with the plane `depth_m` outside the inner face of a pane."""
+    tilt = np.deg2rad(port.tilt_deg)
+    normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    along = ray @ normal
+    distance = (port.distance_m + depth_m - start @ normal) / np.where(along > 0, along, np.nan)
+    return start + distance[..., None] * ray, np.broadcast_to(normal, ray.shape)
+
+
+def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
+    """Returns intersections and normals (..., 3) of rays with the sphere `depth_m` outside the inner face of a dome."""
+    radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
+    from_centre = start - centre
+    along = (from_centre * ray).sum(axis=-1)
+    distance = -along + np.sqrt(along**2 - (from_centre**2).sum(axis=-1) + radius_m**2)
+    at = start + distance[..., None] * ray
+    return at, (at - centre) / radius_m

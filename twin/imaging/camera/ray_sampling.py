@@ -1,0 +1,206 @@
+"""Sampling of a rendered image along the rays of the true pixels: lens, port and rolling shutter in one resampling.
+
+A pixel of the raw image has a ray o + s d in the axes of the rendered camera, with the origin o, the direction d and
+the parameter s. A rolling shutter exposes row v of h rows at
+
+    t = readout (v / (h - 1) - 1/2)
+
+after the middle of the read-out, when a camera with constant twist xi has moved by exp(xi t), so the ray in the axes of
+the camera at mid-exposure is turned and shifted by that pose. Relative to the principal point, the column where
+the ray meets the floor is f d_x / d_z + f (o_x - o_z d_x / d_z) / z, with z the depth of the floor there and f the
+focal length; the row is that with y in place of x. This equation is solved for the position by iteration, for a whole
+row at a time so that the compiler can vectorize it; it starts from the depths that the rays of the previous row meet.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.camera.resample import Positions, Radiance, spline_row
+from twin.kernels import kernel
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+INTERSECTION_STEPS = 4  # maximum; each multiplies the error by p / z (see `intersect`) times the slope of the floor
+INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
+
+
+class RowMotion(NamedTuple):
+    """Motion of a camera while the rows of an image are exposed one after the other.
+
+    Args:
+        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
+        readout_s: time from the first sampled row of the raw image to the last.
+        focal_px: focal length of the rendered image.
+        principal_px: (2,) column and row of its principal point.
+    """
+
+    twist: Array
+    readout_s: float
+    focal_px: float
+    principal_px: tuple[float, float]
+
+
+def intersect(
+    depth: Depth, positions: Positions, parallax_px_m: Positions | None, motion: RowMotion | None = None
+) -> Positions:
+    """Returns the image positions (h, w, 2) [px] where the rays of pixels intersect the floor.
+
+    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
+    vanishing point, with f the focal length [px] and z the depth of the floor at that position. The map of 1 / z, which
+    is linear for a plane, is interpolated bilinearly.
+
+    Args:
+        depth: (H, W) depth [m]; inf where there is no floor.
+        positions: (h, w, 2) vanishing points of the rays [px].
+        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
+        motion: motion of a camera with a rolling shutter; None = all rows are exposed together.
+    """
+    out, near = np.empty_like(positions), np.reciprocal(depth)
+    rays = near, positions, parallax_px_m, _arguments(motion)
+    in_row_bands(lambda first, end: _intersect(*rays, out, first, end), len(positions))
+    return out
+
+
+def sample_rays(
+    light: Radiance,
+    depth: Depth,
+    positions: Positions,
+    parallax_px_m: Positions | None,
+    motion: RowMotion | None = None,
+) -> Radiance:
+    """Returns the radiance (h, w, 3) where the rays of pixels intersect the floor.
+
+    Args:
+        light: (H, W, 3) radiance; beyond its border, the values of the nearest border pixel are repeated.
+        depth, positions, parallax_px_m, motion: see `intersect`.
+    """
+    out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
+    source = np.ascontiguousarray(light).reshape(len(light), -1)
+    rays = near, positions, parallax_px_m, _arguments(motion)
+    in_row_bands(lambda first, end: _sample_rays(source, *rays, out, first, end), len(positions))
+    return out
+
+
+def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[float, float]] | None:
+    """Returns the motion as a tuple of its fields, for the compiled kernels; None if `motion` is None."""
+    if motion is None:
+        return None
+    return np.ascontiguousarray(motion.twist, np.float64), motion.readout_s, motion.focal_px, motion.principal_px
+
+
+@kernel
+def _intersect(near, positions, parallax, motion, out, first, end):
+    """Writes the intersections of rows `first` to `end` - 1 to `out`; `near` is the inverse depth."""
+    rays, cells = np.empty((8, out.shape[1]), np.float32), np.empty(out.shape[1], np.int32)
+    for v in range(first, end):
+        _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
+        for u in range(out.shape[1]):
+            out[v, u, 0], out[v, u, 1] = rays[0, u], rays[1, u]
+
+
+@kernel
+def _sample_rays(source, near, positions, parallax, motion, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W); `near` is the inverse depth."""
+    n = out.shape[1]
+    rays, cells, weights = np.empty((8, n), np.float32), np.empty(n, np.int32), np.empty((8, n), np.float32)
+    for v in range(first, end):
+        _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
+        spline_row(source, rays[0], rays[1], weights, cells, out[v].reshape(-1))
+
+
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
+    """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
+
+    Rows 2 and 3 are filled with the vanishing points of the rays, rows 4 and 5 with their parallax, and row 6 with the
+    inverse depth of the floor. The iteration starts from the inverse depth of the previous row or, if `is_first`, from
+    that at the vanishing points. Row 7 is not used; `cells` (w,) int32 is working memory.
+    """
+    rows, cols = near.shape
+    x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]
+    inverse, part_x, part_y = rays[6], rays[0], rays[1]
+    place = positions[v].reshape(-1)
+    for u in range(x.size):
+        base_x[u], base_y[u] = place[2 * u], place[2 * u + 1]
+    if parallax is None:
+        slope_x[:] = np.float32(0.0)
+        slope_y[:] = np.float32(0.0)
+    else:
+        step = parallax[v].reshape(-1)
+        for u in range(x.size):
+            slope_x[u], slope_y[u] = step[2 * u], step[2 * u + 1]
+    if motion is not None:
+        twist, readout_s, focal, principal = motion
+        then = geometry.exp(twist * (readout_s * (v / (positions.shape[0] - 1) - 0.5)))
+        _move(then, np.float32(focal), np.float32(principal[0]), np.float32(principal[1]), rays)
+    flat = near.reshape(-1)
+    if is_first:
+        for u in range(x.size):
+            col = min(max(int(base_x[u]), 0), cols - 1)
+            inverse[u] = flat[min(max(int(base_y[u]), 0), rows - 1) * cols + col]
+    for _ in range(INTERSECTION_STEPS):
+        _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_y, cells)
+        if not _look_up(flat, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
+            break
+    for u in range(x.size):
+        x[u], y[u] = base_x[u] + slope_x[u] * inverse[u], base_y[u] + slope_y[u] * inverse[u]
+
+
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _move(pose, focal, cx, cy, rays):
+    """Turns and shifts the rays of a row (8, w), see `_hit_row`, by a pose (4, 4)."""
+    base_x, base_y, slope_x, slope_y = rays[2], rays[3], rays[4], rays[5]
+    a, b, c, p = np.float32(pose[0, 0]), np.float32(pose[0, 1]), np.float32(pose[0, 2]), focal * np.float32(pose[0, 3])
+    d, e, f, q = np.float32(pose[1, 0]), np.float32(pose[1, 1]), np.float32(pose[1, 2]), focal * np.float32(pose[1, 3])
+    g, h, i, r = np.float32(pose[2, 0]), np.float32(pose[2, 1]), np.float32(pose[2, 2]), focal * np.float32(pose[2, 3])
+    per_focal = np.float32(1.0) / focal
+    for u in range(base_x.size):
+        x, y = (base_x[u] - cx) * per_focal, (base_y[u] - cy) * per_focal
+        per_z = np.float32(1.0) / (g * x + h * y + i)
+        along_x, along_y = (a * x + b * y + c) * per_z, (d * x + e * y + f) * per_z
+        shift_x, shift_y = a * slope_x[u] + b * slope_y[u] + p, d * slope_x[u] + e * slope_y[u] + q
+        shift_z = g * slope_x[u] + h * slope_y[u] + r
+        base_x[u], base_y[u] = focal * along_x + cx, focal * along_y + cy
+        slope_x[u], slope_y[u] = shift_x - shift_z * along_x, shift_y - shift_z * along_y
+
+
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_y, cells):
+    """Computes the square of four pixel centres that each ray falls in, and the position in the square.
+
+    `cells` is filled with the index of its top left pixel, `part_x` and `part_y` with the position, 0 to 1.
+    """
+    zero, one, last_x, last_y = np.float32(0.0), np.float32(1.0), np.float32(cols - 2), np.float32(rows - 2)
+    n_cols = np.int32(cols)
+    for u in range(base_x.size):
+        x, y = base_x[u] + slope_x[u] * inverse[u], base_y[u] + slope_y[u] * inverse[u]
+        col, row = min(max(np.floor(x), zero), last_x), min(max(np.floor(y), zero), last_y)
+        part_x[u], part_y[u] = min(max(x - col, zero), one), min(max(y - row, zero), one)
+        cells[u] = np.int32(row) * n_cols + np.int32(col)
+
+
+@kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
+def _look_up(near, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
+    """Replaces `inverse` by the inverse depth at the positions of the rays.
+
+    Returns the number of rays whose position this changes by more than `INTERSECTION_PX`; a sum of integers, unlike a
+    largest value, lets the compiler vectorize the loop.
+    """
+    n_moved, limit = 0, np.float32(INTERSECTION_PX)
+    for u in range(cells.size):
+        k, s, t = np.uint32(cells[u]), part_x[u], part_y[u]
+        m = k + np.uint32(cols)
+        above = near[k] + s * (near[k + np.uint32(1)] - near[k])
+        below = near[m] + s * (near[m + np.uint32(1)] - near[m])
+        met = above + t * (below - above)
+        change = met - inverse[u]
+        n_moved += abs(change * slope_x[u]) + abs(change * slope_y[u]) > limit
+        inverse[u] = met
+    return n_moved

@@ -1,0 +1,214 @@
+"""Resampling of images at subpixel positions by cubic B-splines in single precision.
+
+OpenCV's warps are not used, because they round positions to 1/32 px. For radiance, the B-spline is the point spread
+function of a pixel: it suppresses spatial frequencies above half a cycle per pixel, which would alias. Sensor images
+are interpolated: a prefilter makes the spline pass through the value of every pixel (Unser et al. 1993, doi
+10.1109/78.193221).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.interpolation import bspline_weights
+from twin.core.records import Image
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.light.pixel_sum import sum_of_pixels
+from twin.kernels import kernel
+
+Radiance = NDArray[np.float32]
+Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
+
+REACH_PX = 2  # support of the spline to each side
+POLE, MIRRORED = 3**0.5 - 2, 16  # pole of the prefilter, length of its initial sum; POLE^16 is negligible
+BLOCK = 128  # columns filtered at a time, so that they stay in the second-level cache
+TAPS = 8  # pixels to each side in the prefilter of rows; POLE^9 is 7e-6
+
+
+def sample(light: Radiance, positions: Positions) -> Radiance:
+    """Returns the radiance (h, w, 3) recorded by pixels at these positions in a radiance image (H, W, 3).
+
+    Beyond the image border, the values of the nearest border pixel are repeated.
+    """
+    return _sampled(np.ascontiguousarray(light).reshape(len(light), -1), positions)
+
+
+def interpolate(image: Image, positions: Positions) -> Image:
+    """Returns the image (h, w, 3) interpolated from `image` (H, W, 3) at `positions`; exact at pixel centres."""
+    spline, out = image.reshape(len(image), -1).astype(np.float32), np.empty((*positions.shape[:2], 3), np.uint8)
+    in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
+    in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
+    in_row_bands(lambda first, end: _fill_rounded_from(spline, positions, out, first, end), len(positions))
+    return out
+
+
+def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
+    out = np.empty((*positions.shape[:2], 3), np.float32)
+    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
+    return out
+
+
+@kernel
+def _fill_from(source, positions, out, first, end):
+    """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W)."""
+    n = out.shape[1]
+    x, y, weights, cells = _row_memory(n)
+    for v in range(first, end):
+        _unpack(positions[v].reshape(-1), x, y)
+        spline_row(source, x, y, weights, cells, out[v].reshape(-1))
+
+
+@kernel
+def _fill_rounded_from(source, positions, out, first, end):
+    """Fills rows `first` to `end` - 1 of 8-bit `out` as `_fill_from` does; the values are rounded and clipped."""
+    n = out.shape[1]
+    x, y, weights, cells = _row_memory(n)
+    row, least, most = np.empty(3 * n, np.float32), np.float32(0.0), np.float32(255.0)
+    for v in range(first, end):
+        _unpack(positions[v].reshape(-1), x, y)
+        spline_row(source, x, y, weights, cells, row)
+        filled = out[v].reshape(-1)
+        for k in range(row.size):
+            filled[k] = np.uint8(min(max(row[k] + np.float32(0.5), least), most))
+
+
+@kernel
+def _row_memory(n):
+    """Returns uninitialised source columns and rows (n,) of n output pixels, `weights` and `cells` of `spline_row`."""
+    x, y = np.empty(n, np.float32), np.empty(n, np.float32)
+    return x, y, np.empty((8, n), np.float32), np.empty(n, np.int32)
+
+
+@kernel
+def _unpack(place, x, y):
+    """Copies columns and rows, which alternate in `place` (2 w,), to x and y (w,)."""
+    for u in range(x.size):
+        x[u], y[u] = place[2 * u], place[2 * u + 1]
+
+
+@kernel
+def spline_row(source, x, y, weights, cells, out):
+    """Fills `out` (3 w,) with the values of the cubic B-spline of an image (H, 3 W) at columns x and rows y (w,).
+
+    `weights` (8, w) float32 and `cells` (w,) int32 are working memory.
+    """
+    _spline_weights(x, weights[0], weights[1], weights[2], weights[3])
+    _spline_weights(y, weights[4], weights[5], weights[6], weights[7])
+    sum_row(source, x, y, weights, cells, out)
+
+
+@kernel
+def sum_row(source, x, y, weights, cells, out):
+    """Fills `out` as `spline_row` does, with given weights (8, w) of 4 columns and 4 rows, see `sum_of_pixels`."""
+    rows, cols = source.shape[0], source.shape[1] // 3
+    _inner_cells(x, y, rows, cols, cells)
+    for u in range(x.size):
+        if cells[u] >= 0:
+            red, green, blue = sum_of_pixels(source, np.int64(cells[u]), 3 * cols, weights, u)  # pyright: ignore
+            out[3 * u], out[3 * u + 1], out[3 * u + 2] = red, green, blue
+        else:
+            _sum_at_border(source, x[u], y[u], weights, u, out)
+
+
+@kernel(forceinline=True, fastmath={"contract"})
+def _spline_weights(at, before, here, after, last):
+    """Computes the B-spline weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
+    for u in range(at.size):
+        before[u], here[u], after[u], last[u] = bspline_weights(at[u] - np.floor(at[u]))
+
+
+@kernel
+def _inner_cells(x, y, rows, cols, cells):
+    """Computes the index of the first of the 4 x 4 pixels around each position; -1 if not all are inside the image."""
+    zero, last_x, last_y = np.float32(0.0), np.float32(cols - 2), np.float32(rows - 2)
+    stride, three, one = np.int32(3 * cols), np.int32(3), np.int32(1)
+    for u in range(x.size):
+        col, row = np.floor(x[u]), np.floor(y[u])
+        inside = (col > zero) & (col < last_x) & (row > zero) & (row < last_y)
+        cell = (np.int32(row) - one) * stride + three * (np.int32(col) - one)
+        cells[u] = cell if inside else -one
+
+
+@kernel
+def _sum_at_border(source, x, y, weights, u, out):
+    """Fills pixel u of `out` with the result of `sum_of_pixels`; beyond the image, its border pixels are repeated."""
+    rows, cols = source.shape[0], source.shape[1] // 3
+    col, row = int(np.floor(x)), int(np.floor(y))
+    for band in range(3):
+        total = np.float32(0.0)
+        for j in range(4):
+            line = source[min(max(row - 1 + j, 0), rows - 1)]
+            for i in range(4):
+                weight = weights[4 + j, u] * weights[i, u]
+                total += weight * line[3 * min(max(col - 1 + i, 0), cols - 1) + band]
+        out[3 * u + band] = total
+
+
+@kernel
+def _filter_columns(image, first, end):
+    """Replaces columns `first` to `end` - 1 of an image (H, n) by cubic B-spline coefficients; borders are mirrored."""
+    for start in range(first, end, BLOCK):
+        _filter_block(image, start, min(start + BLOCK, end))
+
+
+@kernel
+def _filter_block(image, first, end):
+    """Filters columns `first` to `end` - 1 of an image, see `_filter_columns`.
+
+    The filter 6 / (1 - p z^-1) is followed by -p / (1 - p z), with p the pole (Unser et al. 1993).
+    """
+    pole, rows = np.float32(POLE), image.shape[0]
+    for k in range(first, end):
+        total, power = image[0, k], np.float32(1.0)
+        for i in range(1, min(MIRRORED, rows)):
+            power *= pole
+            total += power * image[i, k]
+        image[0, k] = total
+    for v in range(1, rows):
+        before, here = image[v - 1, first:end], image[v, first:end]
+        for k in range(here.size):
+            here[k] += pole * before[k]
+    last, before = image[rows - 1, first:end], image[rows - 2, first:end]
+    for k in range(last.size):
+        last[k] = np.float32(6.0) * pole / (pole * pole - np.float32(1.0)) * (last[k] + pole * before[k])
+    for v in range(rows - 2, -1, -1):
+        after, here = image[v + 1, first:end], image[v, first:end]
+        for k in range(here.size):
+            here[k] = pole * (after[k] - np.float32(6.0) * here[k])
+
+
+@kernel(fastmath={"contract"})
+def _filter_rows(image, first, end):
+    """Replaces rows `first` to `end` - 1 of an image (H, 3 W) as `_filter_columns` does with columns.
+
+    The two recursive filters have the impulse response -6 p / (1 - p^2) p^|n|, which is symmetric and is summed up to
+    |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the previous pixel.
+    """
+    n = image.shape[1]
+    width = n // 3
+    wide = np.empty(n + 6 * TAPS, np.float32)
+    pole = np.float32(POLE)
+    middle_weight = np.float32(-6.0) * pole / (np.float32(1.0) - pole * pole)
+    for v in range(first, end):
+        row = image[v]
+        wide[3 * TAPS : 3 * TAPS + n] = row
+        for i in range(1, TAPS + 1):
+            before, after = _mirrored(-i, width), _mirrored(width - 1 + i, width)
+            for band in range(3):
+                wide[3 * (TAPS - i) + band] = row[3 * before + band]
+                wide[3 * (TAPS + width - 1 + i) + band] = row[3 * after + band]
+        for k in range(n):
+            total, weight, at = middle_weight * wide[k + 3 * TAPS], middle_weight, np.uint32(k)
+            for i in range(1, TAPS + 1):  # the innermost loop, so that each value is written once
+                weight *= pole
+                total += weight * (wide[at + np.uint32(3 * (TAPS - i))] + wide[at + np.uint32(3 * (TAPS + i))])
+            row[k] = total
+
+
+@kernel
+def _mirrored(at, size):
+    """Returns the position of a pixel in an image that is mirrored at the centres of its first and last pixel."""
+    period = max(2 * (size - 1), 1)
+    at = abs(at) % period
+    return min(at, period - at) if size > 1 else 0

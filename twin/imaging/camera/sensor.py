@@ -1,0 +1,190 @@
+"""Plain sensor model in fractions of full scale: auto-exposure, shot noise, read noise, saturation, 8-bit output.
+
+It is used for scenarios without a section [sensor]. Its gain is unlimited and its exposure time is zero.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.records import Exposure, Image
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.camera.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.kernels import kernel
+from twin.scenario.model import ImagingConfig, Scenario
+
+Array = NDArray[np.float64]
+Radiance = NDArray[np.float32]
+
+EXPOSURE_LAG_S = 0.5  # time constant of the auto-exposure
+
+DARK_CD_M2 = 1e-6  # lower limit of the metered radiance
+
+
+class AutoExposure:
+    """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest band reaches `gray_level`.
+
+    The brightest band is used because water absorbs the colours unequally: if the mean of all bands were metered, the
+    least absorbed band would saturate. The gain of a frame is computed from the previous frames, as in a real
+    camera; the gain of the first frame is computed from that frame itself.
+
+    Args:
+        gray_level: target mean as a fraction of full scale.
+        frame_rate_hz: frames per second.
+        lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
+        limits: smallest and largest gain [1 / (cd/m2)].
+
+    Attributes:
+        share: fraction by which log gain approaches its target per frame.
+    """
+
+    def __init__(
+        self,
+        gray_level: float,
+        frame_rate_hz: float,
+        lag_s: float = EXPOSURE_LAG_S,
+        limits: tuple[float, float] = (0.0, math.inf),
+    ):
+        self._gray_level = gray_level
+        self.share = 1 - np.exp(-1 / (frame_rate_hz * lag_s)) if lag_s else 1.0
+        self._limits = limits
+        self._log_gain: float | None = None
+
+    @property
+    def next_gain(self) -> float | None:
+        """Returns the gain of the next frame [1 / (cd/m2)]; None before the first frame is metered."""
+        return None if self._log_gain is None else float(np.exp(self._log_gain))
+
+    def gain(self, radiance: Radiance) -> float:
+        """Returns the gain of this frame [1 / (cd/m2)], and meters `radiance` (H, W, 3) as in `gain_for`."""
+        return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
+
+    def gain_for(self, brightest: float) -> float:
+        """Returns the gain of this frame [1 / (cd/m2)], given the mean radiance of its brightest band [cd/m2].
+
+        Except for the first frame, this mean affects only the gain of later frames. The target gain is clipped to the
+        limits.
+        """
+        least, most = self._limits
+        wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
+        metered = float(np.log(wanted))
+        log_gain = metered if self._log_gain is None else self._log_gain
+        self._log_gain = log_gain + self.share * (metered - log_gain)
+        return float(np.exp(log_gain))
+
+
+class ExposureSetting(NamedTuple):
+    """Exposure of one frame.
+
+    Args:
+        gain: linear image signal per unit of radiance on the optical axis, with the white balance for white light
+            [1 / (cd/m2)]; a signal of 1 saturates.
+        exposure_s: exposure time; 0 for the plain sensor.
+        analogue_gain: amplification before digitization.
+        white: (3,) factors that the white balance applies to R, G, B; None = those for white light.
+    """
+
+    gain: float
+    exposure_s: float = 0.0
+    analogue_gain: float = 1.0
+    white: tuple[float, float, float] | None = None
+
+
+class PlainSensor:
+    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`.
+
+    Args:
+        scenario: survey scenario.
+    """
+
+    def __init__(self, scenario: Scenario):
+        self._imaging = scenario.imaging
+        self._exposure = AutoExposure(scenario.imaging.gray_level, scenario.rig.frame_rate_hz)
+
+    @property
+    def setting(self) -> ExposureSetting | None:
+        """Returns the exposure of the next frame; None before the first frame is metered."""
+        gain = self._exposure.next_gain
+        return None if gain is None else ExposureSetting(gain)
+
+    def meter(self, light: Radiance) -> ExposureSetting:
+        """Returns this frame's exposure, and meters `light` (H, W, 3) for the later frames.
+
+        The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
+        """
+        return ExposureSetting(self._exposure.gain(light))
+
+    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
+        """Returns None: the exposure time is zero."""
+        return None
+
+    def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
+        """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
+        if rng is not None:
+            return expose(light, setting.gain, self._imaging, rng)
+        noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
+        return expose(light, setting.gain, noiseless, np.random.default_rng(0))
+
+    def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
+        """Returns the signal of R, G and B per unit of radiance [1 / (cd/m2)]."""
+        return setting.gain, setting.gain, setting.gain
+
+
+def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
+    """Returns the noisy 8-bit image (H, W, 3) of a radiance image.
+
+    With signals as fractions of full scale, the noise variance is noise_sd^2 + shot_noise^2 * signal.
+
+    Args:
+        radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
+        gain: image signal per unit of radiance [1 / (cd/m2)]; a signal of 1 saturates.
+        imaging: standard deviations of read noise and of shot noise at full signal, as fractions of full scale.
+        rng: random stream of this camera, from which one number is drawn per image.
+    """
+    image = np.empty(radiance.shape, np.uint8)
+    rows = len(radiance)
+    light, filled = np.ascontiguousarray(radiance).reshape(rows, -1), image.reshape(rows, -1)
+    numbers = np.float32(gain), np.float32(imaging.noise_sd**2), np.float32(imaging.shot_noise**2)
+    seed, normal = seed_of(rng), normal_numbers()
+    in_row_bands(lambda first, end: _digitise(light, *numbers, seed, normal, filled, first, end), rows)
+    return image
+
+
+@kernel
+def _mean(light):
+    """Returns the mean (3,) of each band of an image (H, 3 W); each column is averaged first, then all columns."""
+    columns, total = np.zeros(light.shape[1]), np.zeros(3)
+    for v in range(light.shape[0]):
+        row = light[v]
+        for k in range(row.size):
+            columns[k] += row[k]
+    for k in range(columns.size):
+        total[k % 3] += columns[k] / light.shape[0]
+    return total / (light.shape[1] // 3)
+
+
+@kernel
+def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
+    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values.
+
+    64 random bits select four normally distributed noise values from the table `normal`.
+    """
+    n = light.shape[1]
+    n_words = (n + 3) // 4
+    full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)
+    noise = np.empty(4 * n_words, np.float32)
+    for v in range(first, end):
+        for w in range(n_words):
+            bits = random_bits(seed, np.uint64(v * n_words + w))
+            for k in range(4):
+                noise[4 * w + k] = normal[(bits >> np.uint64(16 * k)) & np.uint64(NORMAL_MASK)]
+        row, out = light[v], image[v]
+        for k in range(n):
+            signal = gain * row[k]
+            level = signal + noise[k] * np.sqrt(read_variance + shot_variance * signal)
+            out[k] = np.uint8(min(max(level * full + half, zero), full))

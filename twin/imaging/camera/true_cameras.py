@@ -1,0 +1,359 @@
+"""Geometry of the true cameras: maps rendered images to raw images, and raw images to rectified frames.
+
+The floor is rendered for two parallel pinhole cameras in water, with images larger than the frames where necessary.
+Each pixel of a raw image has its own ray through lens and port; the radiance of the pixel is sampled from the rendered
+image at the point where its ray intersects the rendered floor. The sensor model converts the sampled radiance to the
+raw image, which is rectified with the believed calibration to obtain the frame. If both true cameras equal the believed
+pinhole cameras, apart from the baseline, the rendered image is used unchanged.
+
+Raw images have the size of the frames plus a border that the rectification needs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import Image, StereoRig
+from twin.errors import TwinError
+from twin.imaging.camera import lens as lenses
+from twin.imaging.camera import port as ports
+from twin.imaging.camera import resample
+from twin.imaging.camera.lens import Distortion
+from twin.imaging.camera.port import Pinhole
+from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
+from twin.imaging.camera.resample import Positions
+from twin.imaging.camera.shutter import ExposureMotion
+from twin.scenario.model import CalibrationErrorConfig, PortConfig, Scenario
+
+Array = NDArray[np.float64]
+Radiance = NDArray[np.float32]
+Depth = NDArray[np.float32]
+
+NEAREST_M = 0.3  # smallest depth of the floor for which the rendered margin suffices
+MARGIN_STEP_PX = 8  # margins are multiples of this; two of them add a multiple of 16 to the width or height
+WIDEST_TANGENT = 5.0  # largest tangent of half the field of view
+
+
+class CameraModel(NamedTuple):
+    """Model of one camera, true or believed, in the axes of the believed camera.
+
+    Args:
+        focal_px: focal length of the lens: that of the equivalent pinhole camera divided by `pinhole.focal_ratio`.
+        principal_px: (2,) column and row of the principal point.
+        lens: distortion coefficients.
+        port: geometry and refractive indices of the port.
+        pinhole: pinhole camera in water that is equivalent to lens and port near the optical axis.
+        believed_from_camera: (3, 3) rotation from this camera to the believed camera, about the centre of `pinhole`.
+    """
+
+    focal_px: float
+    principal_px: Array
+    lens: Distortion
+    port: PortConfig
+    pinhole: Pinhole
+    believed_from_camera: Array
+
+    def rays(self, pixels: Array) -> tuple[Array, Array]:
+        """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water.
+
+        Both are in the axes of the believed camera. The direction is NaN for a pixel without a ray, e.g. if the ray is
+        totally reflected at the port.
+        """
+        air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
+        if self.port.kind == "none":
+            air = air / self.pinhole.focal_ratio
+        origin, direction = ports.water_rays(self.port, air)
+        origin = origin - [0.0, 0.0, self.pinhole.centre_m]
+        return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
+
+    def pixels(self, points_m: Array) -> Array:
+        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in the axes of the believed camera.
+
+        The points must lie in front of the camera; whether they lie inside the image is not checked. The result is NaN
+        for a point without a ray through the port, and for one that is too far off the optical axis for the distortion
+        model or more than arctan(`WIDEST_TANGENT`) off it.
+        """
+        points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
+        air = ports.air_coordinates(self.port, points_m)
+        if self.port.kind == "none":
+            air = air * self.pinhole.focal_ratio
+        off_axis = np.hypot(air[..., :1], air[..., 1:])
+        air = np.where(off_axis < min(lenses.fold(self.lens), WIDEST_TANGENT), air, np.nan)
+        return lenses.distort(air, self.lens) * self.focal_px + self.principal_px
+
+
+class SamplingMap(NamedTuple):
+    """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled.
+
+    Args:
+        positions: (h, w, 2) position for each raw pixel if its ray meets the floor at infinity [px].
+        parallax_px_m: (h, w, 2) parallax times depth [px m]: if the ray meets the floor at depth z, the position is
+            `positions` + `parallax_px_m` / z. None if it is zero for all pixels.
+    """
+
+    positions: Positions
+    parallax_px_m: Positions | None
+
+
+@dataclass(frozen=True)
+class TrueCameras:
+    """Geometry of the true stereo camera: maps rendered images to raw images, and raw images to rectified frames.
+
+    Args:
+        rendered_rig: calibration used for rendering: the believed rig with the true baseline, and images enlarged by
+            the margin.
+        margin_px: (columns, rows) by which the rendered image extends beyond the frame on each side.
+        raw_rig: calibration of the raw images: their size, the focal length of the lens, the true baseline.
+        sampling: for the left and the right camera, position in the rendered image of each raw pixel; None if the
+            rendered images are used as raw images.
+        rectification: (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None if the raw
+            images are used as frames.
+        models: models of the true left and right camera.
+        believed: camera model that is used to rectify the images of both cameras.
+        rectified_depth_m: depth of the points for which the rectification is computed.
+    """
+
+    rendered_rig: StereoRig
+    margin_px: tuple[int, int]
+    raw_rig: StereoRig
+    sampling: tuple[SamplingMap, SamplingMap] | None
+    rectification: Positions | None
+    models: tuple[CameraModel, CameraModel]
+    believed: CameraModel
+    rectified_depth_m: float
+
+    def sample(self, light: Radiance, depth: Depth, camera: int, motion: ExposureMotion | None = None) -> Radiance:
+        """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right).
+
+        Args:
+            light: (H, W, 3) radiance in the rendered image.
+            depth: (H, W) depth in the rendered image [m].
+            camera: 0 left, 1 right.
+            motion: motion of the camera during the exposure; its rolling-shutter effect is applied if the rendered
+                images are resampled (`sampling` is not None). None: no motion.
+        """
+        if self.sampling is None:
+            return light
+        positions, parallax = self.sampling[camera]
+        rows = self._row_motion(motion, len(light), len(positions))
+        if parallax is None and rows is None:
+            return resample.sample(light, positions)
+        return sample_rays(light, depth, positions, parallax, rows)
+
+    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, n_raw: int) -> RowMotion | None:
+        """Returns the motion during the read-out of the raw rows; None without rolling shutter.
+
+        Args:
+            motion: motion of the camera during the exposure.
+            n_rendered: rows of the rendered image.
+            n_raw: rows of the raw image.
+        """
+        if motion is None or not motion.readout_s:
+            return None
+        rig, readout_s = self.rendered_rig, motion.readout_s * (n_raw - 1) / (n_rendered - 1)
+        return RowMotion(motion.twist, readout_s, rig.focal_px, (rig.cx_px, rig.cy_px))
+
+    def rectify(self, raw: Image) -> Image:
+        """Returns the frame: the raw image of either camera, rectified with the believed calibration."""
+        return raw if self.rectification is None else resample.interpolate(raw, self.rectification)
+
+    def crop(self, rendered: NDArray[Any]) -> NDArray[Any]:
+        """Returns a rendered image without its margin, i.e. with the size of the frame."""
+        (x, y), (height, width) = self.margin_px, rendered.shape[:2]
+        return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
+
+    def project(self, points_m: Array, camera: int = 0) -> Array:
+        """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points without an image.
+
+        Points outside the borders of the frame have pixel coordinates too.
+
+        Args:
+            points_m: (n, 3) points in the axes of the rendered camera [m].
+            camera: 0 left, 1 right.
+        """
+        rig = self.rendered_rig
+        if self.sampling is None:
+            return rig.project(points_m)
+        ahead = np.where(points_m[:, 2:] > 1e-3, points_m, np.nan)
+        origin, direction = self.believed.rays(self.models[camera].pixels(ahead))
+        on_plane = origin + direction * ((self.rectified_depth_m - origin[:, 2]) / direction[:, 2])[:, None]
+        centre = [rig.cx_px - self.margin_px[0], rig.cy_px - self.margin_px[1]]
+        return on_plane[:, :2] / self.rectified_depth_m * rig.focal_px + centre
+
+
+def make_true_cameras(scenario: Scenario) -> TrueCameras:
+    """Returns the true cameras of a scenario.
+
+    Raises:
+        TwinError: the lens is outside its dome, the port transmits no rays to part of the image, the distortion folds
+            the image back onto itself, or the field of view is too wide.
+    """
+    believed_rig, calibration = scenario.believed_rig(), scenario.calibration_error
+    _check_port(scenario.port)
+    true_rig = replace(believed_rig, baseline_m=believed_rig.baseline_m * (1 + calibration.baseline_error))
+    models, believed = _true_models(scenario), _believed_model(scenario)
+    calibrated = scenario.port.kind != "none" and scenario.port.calibrated_at_m > 0
+    depth_m = scenario.port.calibrated_at_m if calibrated else 1.0
+    if _is_ideal(scenario, believed):
+        return TrueCameras(true_rig, (0, 0), true_rig, None, None, models, believed, depth_m)
+    rectification = None
+    border = np.zeros(2, np.int64)
+    if calibrated or any(believed.lens):
+        rectification = _rectification(believed, believed_rig, depth_m)
+        border = _missing_px(rectification, believed_rig)
+        rectification = rectification + border
+    pixels = _grid(believed_rig, border)
+    rays = [_rendered_rays(model, pixels, believed_rig) for model in models]
+    margin = _margin(rays, believed_rig)
+    raw_rig = replace(_enlarged(true_rig, border), focal_px=models[0].focal_px)
+    left, right = (
+        SamplingMap((positions + margin).astype(np.float32), _or_none(parallax)) for positions, parallax in rays
+    )
+    return TrueCameras(
+        _enlarged(true_rig, margin), (int(margin[0]), int(margin[1])), raw_rig, (left, right),
+        None if rectification is None else rectification.astype(np.float32), models, believed, depth_m,
+    )  # fmt: skip
+
+
+def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
+    """Returns the models of the true left and right camera."""
+    calibration, pinhole, rig = scenario.calibration_error, ports.pinhole(scenario.port), scenario.believed_rig()
+    focal_px = rig.focal_px / pinhole.focal_ratio * (1 + calibration.focal_error)
+    lens = lenses.true_lens(scenario.lens)
+    errors = (calibration.left_principal_point_error_px, calibration.right_principal_point_error_px)
+    rotations = (np.eye(3), right_rotation(calibration))
+    left, right = (
+        CameraModel(focal_px, np.array([rig.cx_px, rig.cy_px]) + error, lens, scenario.port, pinhole, rotation)
+        for error, rotation in zip(errors, rotations, strict=True)
+    )
+    return left, right
+
+
+def _believed_model(scenario: Scenario) -> CameraModel:
+    """Returns the camera model for the rectification.
+
+    If the refraction of the port was not calibrated (`port.calibrated_at_m` = 0), the model contains only its effect
+    on the focal length.
+    """
+    rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
+    lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)
+    port = scenario.port
+    if not port.calibrated_at_m:
+        port, pinhole = PortConfig(), Pinhole(0.0, pinhole.focal_ratio)
+    principal_px = np.array([rig.cx_px, rig.cy_px])
+    return CameraModel(rig.focal_px / pinhole.focal_ratio, principal_px, lens, port, pinhole, np.eye(3))
+
+
+def right_rotation(calibration: CalibrationErrorConfig) -> Array:
+    """Returns the rotation error (3, 3) of the right camera, from its true axes to the believed ones.
+
+    It is R_y(yaw) R_x(pitch) R_z(roll), with x right, y down, z forward.
+    """
+    roll, pitch, yaw = np.deg2rad([calibration.right_roll_deg, calibration.right_pitch_deg, calibration.right_yaw_deg])
+    x, y, z = np.eye(3)
+    return geometry.so3_exp(yaw * y) @ geometry.so3_exp(pitch * x) @ geometry.so3_exp(roll * z)
+
+
+def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
+    """Returns whether the true and the believed cameras are the same pinhole camera without a port.
+
+    The baseline may differ.
+    """
+    same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
+    return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
+
+
+def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
+    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`.
+
+    Positions are relative to the frame's top left pixel, without the border of the raw image.
+
+    Raises:
+        TwinError: the port transmits no rays to a part of the frame, or the distortion folds the image onto itself.
+    """
+    normalised = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
+    points_m = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1) * depth_m
+    positions = believed.pixels(points_m)
+    if not np.isnan(positions).any():
+        return positions
+    if np.isnan(believed._replace(lens=Distortion()).pixels(points_m)).any():
+        raise TwinError("rig.hfov_deg", "no rays reach the corners of the frame through the port", "less")
+    raise TwinError("lens.k1", "the believed lens folds the image back within the frame", "less distortion")
+
+
+def _rendered_rays(camera: CameraModel, pixels: Array, rig: StereoRig) -> tuple[Array, Array]:
+    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin.
+
+    Raises:
+        TwinError: the port transmits no rays to a part of the image, or the distortion folds the image onto itself.
+    """
+    distorted = (pixels - camera.principal_px) / camera.focal_px
+    if np.isnan(lenses.undistort(distorted, camera.lens)).any():
+        raise TwinError("lens.k1", "the lens folds the image back within the sensor", "less distortion")
+    origin, direction = camera.rays(pixels)
+    if not (direction[..., 2] > 1 / 20).all():
+        raise TwinError("port.kind", "no rays reach the image border through the port", "a smaller field of view")
+    slope = direction[..., :2] / direction[..., 2:]
+    offset_m = origin[..., :2] - origin[..., 2:] * slope
+    return slope * rig.focal_px + [rig.cx_px, rig.cy_px], offset_m * rig.focal_px
+
+
+def _enlarged(rig: StereoRig, border: NDArray[np.int64]) -> StereoRig:
+    """Returns the rig with a border of (columns, rows) on each side of its images."""
+    return replace(rig, width_px=rig.width_px + 2 * int(border[0]), height_px=rig.height_px + 2 * int(border[1]))
+
+
+def _or_none(parallax: Array) -> Positions | None:
+    """Returns the parallax in single precision; None if it is zero for all pixels."""
+    return parallax.astype(np.float32) if np.abs(parallax).max() > 1e-9 else None
+
+
+def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
+    """Returns column and row (h, w, 2) of all pixels of an image and its border, from the top left pixel of the image.
+
+    Args:
+        rig: size of the image.
+        border: (columns, rows) of the border on each side.
+    """
+    columns = np.arange(-border[0], rig.width_px + border[0])
+    rows = np.arange(-border[1], rig.height_px + border[1])
+    return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
+
+
+def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
+    """Returns the border (columns, rows) [px] that spline interpolation at `positions` [px] needs on each side."""
+    last = np.array([rig.width_px - 1, rig.height_px - 1])
+    missing = np.maximum(-positions.min(axis=(0, 1)), positions.max(axis=(0, 1)) - last)
+    return np.maximum(np.ceil(missing + resample.REACH_PX), 0).astype(np.int64)
+
+
+def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64]:
+    """Returns the margin (columns, rows) [px] that the rendered image needs on each side.
+
+    With this margin it covers the rays of all raw pixels for depths from `NEAREST_M` to infinity.
+
+    Raises:
+        TwinError: the field of view with the margin is too wide.
+    """
+    ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
+    missing = np.max([_missing_px(end, rig) for end in ends], axis=0)
+    margin = -(-missing // MARGIN_STEP_PX) * MARGIN_STEP_PX
+    half = (np.array([rig.width_px, rig.height_px]) / 2 + margin) / rig.focal_px
+    if half.max() > WIDEST_TANGENT:
+        degrees = 2 * np.rad2deg(np.arctan([half.max(), WIDEST_TANGENT]))
+        raise TwinError("rig.hfov_deg", f"the true field of view is {degrees[0]:.0f} deg", f"up to {degrees[1]:.0f}")
+    return margin
+
+
+def _check_port(port: PortConfig) -> None:
+    """Raises TwinError if the entrance pupil of the lens is outside the dome."""
+    if port.kind == "dome" and np.linalg.norm(port.offset_m) >= port.radius_m:
+        raise TwinError(
+            "port.offset_m", f"{np.linalg.norm(port.offset_m):g} m: the lens is outside its dome",
+            f"shorter than port.radius_m, {port.radius_m:g} m",
+        )  # fmt: skip

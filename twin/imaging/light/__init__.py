@@ -1,0 +1,1 @@
+"""Light in the water: lamps, daylight, scattering, caustics, shadows."""

@@ -1,0 +1,246 @@
+"""Caustics: bright moving lines on the floor where waves on the water surface focus the sunlight.
+
+The surface is a sum of waves with the spectrum of `waves`, periodic in a square tile. A vertical ray that meets the
+surface at a small slope s is deflected by the angle (1 - 1/n) s, with n the refractive index of water, and reaches a
+floor at depth D with a horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite
+side, so the mean of the pattern is 1. Three effects blur the pattern, so that its contrast decreases with depth:
+
+- waves that the cells do not resolve: they focus far above the floor, so the deflections that they cause are modelled
+  as normally distributed, with (1 - 1/n)^2 times the variance of their slopes;
+- the angular size of the sun;
+- scattering in the water, with its complete phase function (small-angle theory of Wells 1973, see
+  `scattering_blur`).
+
+Waves longer than the tile are left out, as they focus far below the floor. The side of the tile is `TILE_DEPTHS` times
+the depth, so a camera below the surface rarely sees the pattern repeated.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import j0
+
+from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.phase_function import PhaseTable, table_of
+from twin.imaging.light.water import Medium
+from twin.imaging.light.waves import angular_frequency, slope_density, slope_variance
+from twin.kernels import kernel
+from twin.scenario.model import SEA_WATER_INDEX
+
+Array = NDArray[np.float64]
+
+CELLS = 256  # number of cells per side of the tile, a power of two
+TILE_DEPTHS = 1.5  # side of the tile in units of the depth
+RESOLVED = 0.95  # wave number of the shortest resolved waves, in units of the Nyquist wave number of the cells
+#: Standard deviation of directions within the solar disc along one axis, in water.
+SUN_RAD = 0.00465 / 2 / SEA_WATER_INDEX
+STREAM = 1 << 16  # key of the random stream for the waves
+_HEIGHTS, _ANGLES, _WAVE_NUMBERS = 24, 512, 80  # numbers of nodes of `scattering_blur`
+
+
+class Caustics:
+    """Caustics of one survey: a time-dependent pattern, computed on the reference plane.
+
+    The wind blows from west to east. The phases of the waves are random, their amplitudes are not: the slopes have the
+    variance of the spectrum at any time.
+
+    Args:
+        illumination: optical properties of the water, depth of the reference plane, and the fraction of the daylight
+            that the waves focus; the rest of the daylight is diffuse and uniform.
+        wind_mps: wind speed 10 m above the sea.
+        seed: seed of the scenario.
+
+    Attributes:
+        tile_m: side of the tile.
+    """
+
+    def __init__(self, illumination: Illumination, wind_mps: float, seed: int):
+        water, daylight = illumination
+        depth_m = daylight.reference_depth_m
+        rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
+        self.tile_m = TILE_DEPTHS * depth_m
+        kx, ky = _wave_numbers(self.tile_m)
+        k = np.hypot(kx, ky)
+        shortest = RESOLVED * np.pi * CELLS / self.tile_m
+        # waves travel downwind: the half plane kx > 0 has the variance of both; of kx = 0, one half is kept, too
+        downwind = (k <= shortest) & ((kx > 0) | (ky > 0))
+        variance = np.where(downwind, 2 * slope_density(kx, ky, wind_mps) * (2 * np.pi / self.tile_m) ** 2, 0.0)
+        waves = np.sqrt(2 * variance) * np.exp(2j * np.pi * rng.random(k.shape))
+        # the inverse transform counts the columns kx > 0 twice (Hermitian spectrum), and the real part of column 0 once
+        waves *= np.where(kx > 0, 0.5, 1.0) / np.where(k > 0, k, 1.0)
+        self._slope = [(along * waves).astype(np.complex64) for along in (kx, ky)]
+        self._turns_per_s = angular_frequency(k) / (2 * np.pi)
+        self._cells_per_slope = np.float32((1 - 1 / SEA_WATER_INDEX) * depth_m * self.cells_per_m)
+        blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest))
+        self._blur = (_packed(blur) * daylight.focused_share / CELLS**2).astype(np.float32)
+        self._diffuse_share = np.float32(1 - daylight.focused_share)
+        self._cached: tuple[float, NDArray[np.float32]] | None = None
+        self._computing = threading.Lock()
+
+    @property
+    def cells_per_m(self) -> float:
+        """Number of cells of the pattern per metre."""
+        return CELLS / self.tile_m
+
+    def pattern(self, time_s: float) -> NDArray[np.float32]:
+        """Returns the illuminance (CELLS, CELLS) divided by its mean; row 0 = south, column 0 = west."""
+        return self.closed_pattern(time_s)[:-1, :-1]
+
+    def closed_pattern(self, time_s: float) -> NDArray[np.float32]:
+        """Returns `pattern` with its first row and its first column repeated at the end: (CELLS + 1, CELLS + 1).
+
+        The latest pattern is cached, because both cameras use it; they may do so at the same time.
+        """
+        with self._computing:
+            if self._cached is None or self._cached[0] != time_s:
+                self._cached = time_s, self._compute(time_s)
+            return self._cached[1]
+
+    def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS).
+
+        Their common sign is arbitrary: because the phases of the waves are random, it does not affect the statistics of
+        the pattern.
+        """
+        turns = self._turns_per_s * time_s
+        turns -= np.floor(turns)
+        turns *= 2 * np.pi
+        angle = turns.astype(np.float32)
+        spectrum = np.zeros((CELLS, CELLS, 2), np.float32)
+        east, north = self._slope
+        _add_waves(east, north, np.cos(angle), np.sin(angle), spectrum)
+        both = np.asarray(cv2.dft(spectrum, flags=cv2.DFT_INVERSE), np.float32)
+        return both[..., 0], both[..., 1]
+
+    def _compute(self, time_s: float) -> NDArray[np.float32]:
+        """Returns the result of `closed_pattern`, computed without its cache."""
+        light = np.zeros((CELLS, CELLS), np.float32)
+        _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
+        spectrum = np.asarray(cv2.dft(light), np.float32)
+        spectrum *= self._blur
+        closed = np.empty((CELLS + 1, CELLS + 1), np.float32)
+        focused = np.asarray(cv2.dft(spectrum, flags=cv2.DFT_INVERSE), np.float32)
+        np.add(focused, self._diffuse_share, out=closed[:-1, :-1])
+        closed[-1, :-1] = closed[0, :-1]
+        closed[:, -1] = closed[:, 0]
+        return closed
+
+    def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
+        """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves.
+
+        Args:
+            depth_m: depth of the plane below the surface.
+            water: optical properties of the water, of which those of the green band are used.
+            unresolved: variances of the slopes along and across the wind due to waves that the cells do not resolve.
+        """
+        kx, ky = _wave_numbers(self.tile_m)
+        along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
+        rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
+        green = float(water.absorption_per_m[1]), float(water.scattering_per_m[1])
+        phase = table_of(water.scatterers[1])
+        return rough * scattering_blur(np.hypot(kx, ky), depth_m, green, phase)
+
+
+def scattering_blur(k: Array, depth_m: float, per_m: tuple[float, float], phase: PhaseTable) -> Array:
+    """Returns the modulation transfer function of the irradiance at a depth below a narrow vertical beam.
+
+    Light that is scattered by the angle t at the height h above the plane meets the plane at the distance h tan(t)
+    from the beam, after a path that is longer by h (1 / cos(t) - 1), over which light is absorbed. With any number of
+    such scattering events (Wells 1973), the irradiance has the transform exp(b (F(k) - F(0))), where F(k) is the
+    integral over h from 0 to the depth and over all downward directions of p(t) exp(-a h (1 / cos(t) - 1))
+    J0(k h tan(t)).
+
+    Args:
+        k: wave numbers of the pattern, of any shape [rad/m].
+        depth_m: depth of the plane below the surface.
+        per_m: absorption coefficient a and scattering coefficient b of the water [1/m].
+        phase: phase function p of the water.
+    """
+    absorption, scattering = per_m
+    if scattering * depth_m == 0:
+        return np.ones_like(k)
+    every = (len(phase.cumulative) - 1) // _ANGLES
+    middle = (np.arange(_ANGLES) + 0.5) / _ANGLES
+    angle, share = 2 * np.arcsin(middle**2), np.diff(phase.cumulative[::every])
+    angle, share = angle[angle < np.pi / 2], share[angle < np.pi / 2]
+    node, weight = np.polynomial.legendre.leggauss(_HEIGHTS)
+    height = depth_m * (node[:, None] + 1) / 2
+    arriving = share * np.exp(-absorption * height * (1 / np.cos(angle) - 1)) * weight[:, None] * depth_m / 2
+    at = np.concatenate([[0.0], np.geomspace(0.01 / depth_m, max(float(k.max()), 1 / depth_m), _WAVE_NUMBERS)])
+    scattered = np.array([(arriving * j0(one * height * np.tan(angle))).sum() for one in at])
+    return np.exp(scattering * (np.interp(k, at, scattered) - scattered[0]))
+
+
+def _wave_numbers(tile_m: float) -> tuple[Array, Array]:
+    """Returns the wave numbers towards east (1, CELLS / 2 + 1) and north (CELLS, 1) of one half plane [rad/m]."""
+    step, index = 2 * np.pi / tile_m, np.arange(CELLS, dtype=np.float64)
+    return step * index[None, : CELLS // 2 + 1], step * np.where(index < CELLS / 2, index, index - CELLS)[:, None]
+
+
+def _packed(transfer: Array) -> Array:
+    """Returns the factors (CELLS, CELLS) of the numbers in a spectrum of `cv2.dft` of a real image.
+
+    OpenCV stores the real and the imaginary part of a coefficient in consecutive columns 2 k - 1 and 2 k, or in such
+    rows in the first and the last column, whose coefficients are symmetric.
+
+    Args:
+        transfer: (CELLS, CELLS / 2 + 1) real and symmetric transfer function.
+    """
+    index = np.arange(CELLS)
+    half = (index + 1) // 2
+    rows = np.where((half == 0) | (half == CELLS // 2), half[:, None], index[:, None])
+    return transfer[rows, half]
+
+
+@kernel(error_model="numpy")
+def _add_waves(east, north, cosine, sine, spectrum):
+    """Adds waves to the spectrum of a complex image: real part slope towards east, imaginary part slope towards north.
+
+    Both slopes are real: the coefficient of a wave number determines that of the opposite wave number.
+
+    Args:
+        east, north: (n, n / 2 + 1) complex amplitudes of the slopes at time 0.
+        cosine, sine: (n, n / 2 + 1) cosine and sine of the phase by which the waves have advanced.
+        spectrum: (n, n, 2) real and imaginary part of the spectrum, modified in place: that of the slopes towards east
+            plus i times that of the slopes towards north.
+    """
+    n, half = spectrum.shape[0], spectrum.shape[1] // 2
+    for i in range(n):
+        opposite = spectrum[(n - i) % n]
+        for j in range(half + 1):
+            # the columns 0 and n / 2 hold both halves of their wave numbers
+            share = np.float32(0.5 if j == 0 or j == half else 1.0)
+            turn = np.complex64(complex(share * cosine[i, j], -share * sine[i, j]))
+            a, b = east[i, j] * turn, north[i, j] * turn
+            spectrum[i, j, 0] += a.real - b.imag
+            spectrum[i, j, 1] += a.imag + b.real
+            k = (n - j) % n
+            opposite[k, 0] += a.real + b.imag
+            opposite[k, 1] += b.real - a.imag
+
+
+@kernel(error_model="numpy")
+def _trace_rays(east, north, cells_per_slope, light):
+    """Traces one vertical ray per cell through the surface; adds each to four cells of `light` with bilinear weights.
+
+    Args:
+        east, north: (n, n) slopes of the surface.
+        cells_per_slope: displacement of a ray on the floor, towards west and south, per unit of slope [cells].
+        light: (n, n) illuminance relative to its mean, initially 0; filled in place. n is a power of two.
+    """
+    n, one = light.shape[0], np.float32(1.0)
+    for i in range(n):
+        for j in range(n):
+            col, row = np.float32(j) - cells_per_slope * east[i, j], np.float32(i) - cells_per_slope * north[i, j]
+            left, low = np.floor(col), np.floor(row)
+            w, h = col - left, row - low
+            k, m = int(left) & (n - 1), int(low) & (n - 1)
+            k1, m1 = (k + 1) & (n - 1), (m + 1) & (n - 1)
+            light[m, k] += (one - w) * (one - h)
+            light[m, k1] += w * (one - h)
+            light[m1, k] += (one - w) * h
+            light[m1, k1] += w * h

@@ -1,0 +1,202 @@
+"""Light of the lamps in the water: unscattered, scattered any number of times by small angles, or once by any angle.
+
+A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular to its light, the illuminance
+
+    (I(theta) exp(-c d) + S(theta, d)) / d^2,
+
+with c the attenuation. S is exp(-a d), with a the absorption, times the beam convolved with the kernel of
+`spread.lamp_mixture`: the scattered light is not lost, but makes the beam wider and its edge softer. In water without
+scattering, or with single scattering, S is 0. Light that the floor reflects and the water scatters back to it is
+neglected, and so are the shadows of the floor in scattered light.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.imaging.light.lamps import LightSources, beam_share
+from twin.imaging.light.phase_function import phase_at
+from twin.imaging.light.shading import RANGE_SCALE_M
+from twin.imaging.light.spread import LAMP_SIGMA_RAD, NODES_M, Absorbed, Receiver, lamp_mixture, over_path, ring_shares
+from twin.imaging.light.water import Medium
+from twin.kernels import kernel
+
+Array = NDArray[np.float64]
+Beam: TypeAlias = tuple[tuple[float, ...], ...]
+
+LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
+ANGLE_STEPS, SOFT_STEPS = 256, 64  # steps of sqrt(1 - cos(angle)) from 0 to 1, for all light and for scattered light
+PATH_STEPS = 96  # number of steps of d / (d + RANGE_SCALE_M) from 0 to 1
+RINGS, AZIMUTHS = 120, 24  # rings around the straight path, and directions on one half of each ring
+
+
+class LampLight:
+    """Light of the lamps on particles in the water, at points in the axes of one camera.
+
+    See `floor_tables` for their light on the floor.
+
+    Args:
+        sources: lamps in the axes of the camera.
+        water: optical properties of the water.
+    """
+
+    def __init__(self, sources: LightSources, water: Medium):
+        self.sources, self._water = sources, water
+        self._tables = (
+            [_light(beam, water, "particle")[1] for beam in sources.beam] if water.scatters_repeatedly else None
+        )
+
+    def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
+        """Returns the light (..., 3) of a lamp on particles for R, G, B [lx], and unit directions (..., 3) from it.
+
+        The light is the illuminance of a plane that faces the lamp, except that scattered light counts equally from all
+        directions. Distances below `LAMP_RADIUS_M` count as `LAMP_RADIUS_M`; there the directions are shorter than 1.
+
+        Args:
+            lamp: number of the lamp.
+            points: (..., 3) points in the axes of the camera [m].
+        """
+        sources, position, axis = self.sources, self.sources.position_m[lamp], self.sources.axis[lamp]
+        strength = sources.intensity_cd[lamp] * sources.colour[lamp]
+        if self._tables is not None:
+            points = np.ascontiguousarray(points, np.float64)
+            lux, from_lamp = np.empty_like(points), np.empty_like(points)
+            flat = points.reshape(-1, 3), position, axis, strength, self._tables[lamp]
+            _from_table(*flat, lux.reshape(-1, 3), from_lamp.reshape(-1, 3))
+            return lux, from_lamp
+        from_lamp = points - position
+        distance = np.maximum(np.linalg.norm(from_lamp, axis=-1), LAMP_RADIUS_M)[..., None]
+        from_lamp /= distance
+        share = beam_share(from_lamp @ axis, sources.beam[lamp])[..., None]
+        return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
+
+    def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
+        """Returns the light (..., n, 3) that the water scatters into a ray to the camera, per metre of the ray [cd/m3].
+
+        Its loss on the way from these points to the camera is not included.
+
+        Args:
+            points: (..., n, 3) points of the ray in the axes of the camera [m].
+            ray: (..., 3) unit direction from the camera.
+        """
+        total = np.zeros(points.shape)
+        for lamp in range(len(self.sources.intensity_cd)):
+            lux, from_lamp = self.lux(lamp, points)
+            lux *= phase_at(self._water.scatterers, -(from_lamp @ ray[..., None])[..., 0])
+            total += lux
+        return total * self._water.scattering_per_m
+
+
+def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32] | None:
+    """Returns the light of each lamp on a floor (lamps, 2, n, m, 4), relative to `LightSources.intensity_cd`.
+
+    Axes: lamp; scattered light S, which the floor is assumed not to block, then all light, I exp(-c d) + S; even steps
+    of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. The result is None in water
+    without multiple scattering, and without lamps.
+
+    Args:
+        sources: lamps in the axes of a camera.
+        water: optical properties of the water.
+    """
+    if not (water.scatters_repeatedly and len(sources.beam)):
+        return None
+    return with_a_zero(np.array([_light(beam, water, "floor") for beam in sources.beam]))
+
+
+def with_a_zero(table: Array) -> NDArray[np.float32]:
+    """Returns a table (..., 3) of R, G, B padded with a zero to (..., 4), so that an entry lies in one cache line."""
+    return np.concatenate([table, np.zeros((*table.shape[:-1], 1))], axis=-1).astype(np.float32)
+
+
+def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array]:
+    """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`.
+
+    Args:
+        beam: (m, 2) beam table of the lamp.
+        water: optical properties of the water.
+        receiver: floor or particle that the light meets, which determines S.
+
+    Returns:
+        (ANGLE_STEPS + 1, PATH_STEPS + 1, 3) each, with the axes of `floor_tables`.
+    """
+    at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
+    low = np.minimum(at.astype(int), SOFT_STEPS - 1)
+    coarse = _softened(beam, water, receiver)
+    soft = coarse[low] + (at - low)[:, None, None] * (coarse[low + 1] - coarse[low])
+    share, every = beam_share(1 - np.linspace(0.0, 1.0, ANGLE_STEPS + 1) ** 2, beam), soft.copy()
+    every[:, :-1] += share[:, None, None] * np.exp(-water.attenuation_per_m * _path_m()[:, None])
+    return soft, every
+
+
+def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
+    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2).
+
+    S is relative to `LightSources.intensity_cd`; the axes are those of `floor_tables`.
+    """
+    return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
+
+
+@lru_cache(maxsize=64)
+def _softened_of(beam: Beam, bands: tuple[Absorbed, ...], receiver: Receiver) -> Array:
+    """Returns the result of `_softened`; the arguments are hashable, for the cache."""
+    rings, path_m = _on_rings(beam), _path_m()
+    out = np.zeros((SOFT_STEPS + 1, PATH_STEPS + 1, 3))
+    for k, band in enumerate(bands):
+        if band.scattering_per_m:
+            share = rings @ lamp_mixture(band, NODES_M, receiver).T
+            out[:, :-1, k] = over_path(share, band.scattering_per_m, path_m)
+            out[:, :-1, k] *= np.exp(-band.absorption_per_m * path_m)
+    return out
+
+
+def _path_m() -> Array:
+    """Returns the distances (PATH_STEPS,) of the tables [m], without the last, which is infinite."""
+    x = np.linspace(0.0, 1.0, PATH_STEPS + 1)[:-1]
+    return RANGE_SCALE_M * x / (1 - x)
+
+
+@lru_cache(maxsize=64)
+def _on_rings(beam: Beam) -> Array:
+    """Returns the means (SOFT_STEPS + 1, m) of a beam around each of n directions, weighted by each of m Gaussians.
+
+    The n = SOFT_STEPS + 1 directions are at even steps of sqrt(1 - cos(angle)) from the beam axis, 0 to 1; the standard
+    deviations of the Gaussians are `LAMP_SIGMA_RAD`.
+    """
+    edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])
+    cosine = 1 - np.linspace(0.0, 1.0, SOFT_STEPS + 1)[:, None, None] ** 2
+    azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi
+    ring = ((edges[1:] + edges[:-1]) / 2)[:, None]
+    along = cosine * np.cos(ring) + np.sqrt(1 - cosine**2) * np.sin(ring) * np.cos(azimuth)
+    mean = beam_share(along, np.array(beam)).mean(-1)
+    return mean @ ring_shares(edges, LAMP_SIGMA_RAD)
+
+
+@kernel(error_model="numpy", fastmath={"arcp", "contract"})
+def _from_table(points, position, axis, strength, table, lux, from_lamp):
+    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
+
+    Args:
+        position, axis: (3,) position [m] and unit beam axis of the lamp.
+        strength: (3,) intensity for R, G, B, to which `table` is relative [cd].
+        table: (n, m, 3) all light of the lamp, see `_light`.
+    """
+    rows, cols = table.shape[0] - 1, table.shape[1] - 1
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0] - position[0], points[k, 1] - position[1], points[k, 2] - position[2]
+        d = max(np.sqrt(x * x + y * y + z * z), LAMP_RADIUS_M)
+        from_lamp[k, 0], from_lamp[k, 1], from_lamp[k, 2] = x / d, y / d, z / d
+        cosine = (x * axis[0] + y * axis[1] + z * axis[2]) / d
+        if cosine <= 0:
+            lux[k, 0], lux[k, 1], lux[k, 2] = 0.0, 0.0, 0.0
+            continue
+        row, col = np.sqrt(max(1 - cosine, 0.0)) * rows, d / (d + RANGE_SCALE_M) * cols
+        i, j = min(int(row), rows - 1), min(int(col), cols - 1)
+        u, v = row - i, col - j
+        for c in range(3):
+            near = table[i, j, c] + u * (table[i + 1, j, c] - table[i, j, c])
+            far = table[i, j + 1, c] + u * (table[i + 1, j + 1, c] - table[i, j + 1, c])
+            lux[k, c] = strength[c] * (near + v * (far - near)) / (d * d)

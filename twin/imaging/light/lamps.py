@@ -1,0 +1,119 @@
+"""Light sources of a camera: the lamps in its axes, with beam, intensity and colour, and the daylight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import StereoRig
+from twin.errors import TwinError
+from twin.imaging.light.bands import NM, band_weights
+from twin.imaging.light.illumination import Daylight
+from twin.scenario.model import LampConfig
+
+Array = NDArray[np.float64]
+
+#: Measured beam of an LED lamp: angle from the axis [deg], intensity relative to the axis (Song et al. 2021).
+LED_BEAM = (
+    (0.0, 1.0), (10.0, 0.96), (20.0, 0.87), (30.0, 0.75), (35.0, 0.63), (40.0, 0.5), (45.0, 0.28), (50.0, 0.2),
+    (60.0, 0.12), (90.0, 0.0),
+)  # fmt: skip
+
+WHITE_K = 6500.0  # colour temperature of white light
+LUMINANCE_SHARES = np.array([0.2126, 0.7152, 0.0722])  # fractions of R, G, B in the luminance of white (ITU-R BT.709)
+_HC_PER_K = 0.014387769  # h c / k, second radiation constant [m K]
+
+
+class LightSources(NamedTuple):
+    """Light sources of one camera: the lamps in the axes of the camera, and the daylight.
+
+    Args:
+        position_m: (n, 3) positions of the lamps [m].
+        axis: (n, 3) unit vectors of the beam axes of the lamps.
+        intensity_cd: (n,) luminous intensity of each lamp on its beam axis.
+        colour: (n, 3) factors of the intensity for R, G, B.
+        beam: for each lamp, (m, 2) angle from the beam axis [deg] and intensity relative to `intensity_cd`.
+        daylight: daylight in the water.
+    """
+
+    position_m: Array
+    axis: Array
+    intensity_cd: Array
+    colour: Array
+    beam: tuple[Array, ...]
+    daylight: Daylight
+
+
+def light_sources_in_camera(
+    rig: StereoRig, lamps: Sequence[LampConfig], daylight: Daylight, camera: int
+) -> LightSources:
+    """Returns the lamps, which are fixed to the body, in the axes of a camera, with the daylight.
+
+    Args:
+        rig: the cameras, with their pose in the axes of the body.
+        lamps: lamps in the axes of the body.
+        daylight: daylight, which is returned unchanged.
+        camera: 0 left, 1 right.
+
+    Raises:
+        TwinError: the angles of a beam table do not start at 0, or do not increase.
+    """
+    camera_from_body = geometry.inverse(rig.body_from_camera @ (rig.left_from_right if camera else np.eye(4)))
+    position = np.array([lamp.position_m for lamp in lamps]).reshape(-1, 3)
+    axis = np.array([_beam_axis(lamp) for lamp in lamps]).reshape(-1, 3)
+    return LightSources(
+        geometry.transform(camera_from_body, position),
+        axis @ camera_from_body[:3, :3].T,
+        np.array([lamp.intensity_cd for lamp in lamps]),
+        np.array([colour(lamp.colour_temperature_k) for lamp in lamps]).reshape(-1, 3),
+        tuple(_beam(k, lamp) for k, lamp in enumerate(lamps)),
+        daylight,
+    )
+
+
+def _beam_axis(lamp: LampConfig) -> Array:
+    """Returns the beam axis (3,), a unit vector in body axes: down, tilted towards the bow and panned towards port."""
+    tilt, pan = np.deg2rad([lamp.tilt_deg, lamp.pan_deg])
+    return np.array([np.sin(tilt), np.cos(tilt) * np.sin(pan), -np.cos(tilt) * np.cos(pan)])
+
+
+def _beam(number: int, lamp: LampConfig) -> Array:
+    """Returns the beam table (m, 2) of a lamp. Raises TwinError if its angles do not start at 0 or do not increase."""
+    table = np.array(lamp.beam or LED_BEAM)
+    if table[0, 0] != 0 or not (np.diff(table[:, 0]) > 0).all():
+        raise TwinError(f"lamps.{number}.beam", "angles do not increase from 0", "as in [[0, 1], [30, 0.7], [60, 0]]")
+    return table
+
+
+def beam_share(cos_angle: Array, table: Array) -> Array:
+    """Returns the relative intensity of a lamp by its beam table.
+
+    It is 0 beyond the last angle of the table, and behind the lamp: at angles above 90 deg from the beam axis.
+
+    Args:
+        cos_angle: cosine of the angle from the beam axis, of any shape.
+        table: (m, 2) angle [deg] and relative intensity, interpolated linearly.
+    """
+    angle_deg = np.rad2deg(np.arccos(np.clip(cos_angle, -1.0, 1.0)))
+    return np.where(np.asarray(cos_angle) < 0, 0.0, np.interp(angle_deg, *table.T, right=0.0))
+
+
+def colour(temperature_k: float) -> Array:
+    """Returns the intensities (3,) of a black body in R, G, B, relative to those of one at 6500 K with equal luminance.
+
+    Args:
+        temperature_k: colour temperature.
+    """
+    power, white = _black_body(temperature_k), _black_body(WHITE_K)
+    against_white = band_weights(white) @ (power / white)
+    return against_white / (against_white @ LUMINANCE_SHARES)
+
+
+def _black_body(temperature_k: float) -> Array:
+    """Returns the power (n,) of a black body per wavelength at `bands.NM`, up to a factor (Planck 1901)."""
+    metres = NM * 1e-9
+    return metres**-5 / np.expm1(_HC_PER_K / (metres * temperature_k))

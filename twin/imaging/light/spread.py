@@ -1,0 +1,243 @@
+"""Multiple scattering of light near its straight path, as mixtures of Gaussians: the spread of a beam, and of an image.
+
+A lamp lights a point at the distance d. In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), the light
+that arrives is the beam convolved, in the angle at the lamp, with a kernel whose Hankel transform at the angular
+frequency k is
+
+    exp(-a d - b d (1 - K(k))),
+
+with a and b the absorption and scattering coefficients of the water, and K the transform of the kernel of light
+scattered once, per b d. The kernel of an image is that of a beam with the path reversed. Here K is not approximated by
+small angles, but exact for light scattered once, also at wide angles: with t the scattering angle, and alpha and beta
+the angles at the point and at the lamp of the triangle lamp, scattering, point (alpha + beta = t), the volume element
+divided by both squared distances is d(alpha) d(beta) d(azimuth) / d, so that
+
+    k1(beta) = integral over t > beta of p(t) g(t - beta) exp(-a d (path / d - 1)),  per d(beta) d(azimuth),
+
+with path / d = (sin(alpha) + sin(beta)) / sin(t). g is the response of the point to light that arrives at the angle
+alpha from the straight path: the cosine for a floor, 1 for a particle in the water. The integral of the kernel is below
+1 for a floor, as light scattered by wide angles misses it or is absorbed on its longer path.
+
+For a camera that views a floor at the range r, a ray of the camera is scattered by the angle t at the distance u r and
+meets the floor at tan(beta) = (1 - u) tan(t); its weight is p(t) sin(t), reduced by absorption on the excess path.
+"""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.special import j1
+
+from twin.imaging.light.phase_function import Scatterer, phase_at
+
+Array = NDArray[np.float64]
+#: Receiver of lamp light: a floor, whose response is the cosine, or a particle, whose response is 1 in all directions.
+Receiver = Literal["floor", "particle"]
+
+ANGLES = 140  # number of cells of the scattering angle, even in its logarithm
+LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; that of a camera's outermost ring, as a tangent
+STEPS = 24  # number of positions of a scattering along a ray of the camera
+MAX_GROWTH = 1.0  # upper limit of b d (K - 1), the logarithm of the transform relative to exp(-a d)
+WEIGHT_OF_TOTAL = 10.0  # weight of the integral of the kernel in the fit of a mixture
+#: Lengths of the path at which kernels are computed [m]; between them, values per scattered light are interpolated.
+NODES_M = tuple(np.geomspace(0.05, 30.0, 22).tolist())
+#: Standard deviations of the Gaussians of the kernel of a lamp [rad].
+LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
+
+
+class Absorbed(NamedTuple):
+    """Optical properties of the water in one band, for the kernels of scattered light.
+
+    Args:
+        absorption_per_m: absorption coefficient a [1/m].
+        scattering_per_m: scattering coefficient b [1/m].
+        scatterer: molecules and particles that scatter the light.
+    """
+
+    absorption_per_m: float
+    scattering_per_m: float
+    scatterer: Scatterer
+
+
+@lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
+def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
+    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), as a mixture of Gaussians.
+
+    Args:
+        water: one band of the water.
+        distances_m: (n,) distances from the lamp.
+        receiver: where the light arrives, on a floor or on a particle in the water.
+
+    Returns:
+        (n, m) weights of normalised Gaussians in the angle at the lamp, with the standard deviations `LAMP_SIGMA_RAD`.
+    """
+    rings = _rings(np.pi)
+    once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
+    return _mixtures(once, rings, water.scattering_per_m * np.array(distances_m), LAMP_SIGMA_RAD)
+
+
+@lru_cache(maxsize=64)
+def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
+    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), as a mixture of Gaussians.
+
+    Args:
+        water: one band of the water.
+        ranges_m: (n,) ranges of the floor.
+        sigmas: (m,) standard deviations of the Gaussians, as tangents; 0 is light that is not blurred.
+
+    Returns:
+        (n, m) weights of normalised Gaussians.
+    """
+    once = np.array([_camera_rings(water, r) for r in ranges_m])
+    return _mixtures(once, _rings(MOST_TAN), water.scattering_per_m * np.array(ranges_m), np.array(sigmas))
+
+
+def ring_shares(edges: Array, sigmas: Array) -> Array:
+    """Returns the share (n, m) of each normalised Gaussian that lies in each of n rings.
+
+    Args:
+        edges: (n + 1,) edges of the rings.
+        sigmas: (m,) standard deviations of the Gaussians.
+    """
+    beyond = np.exp(-(edges[:, None] ** 2) / (2 * sigmas**2))
+    return beyond[:-1] - beyond[1:]
+
+
+def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
+    """Returns values (..., m) at path lengths (m,) [m], interpolated from `share` (..., nodes) at `NODES_M`.
+
+    The quantity that is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d),
+    with b the scattering coefficient and d the path length.
+    """
+    of_scattered = share / -np.expm1(-scattering_per_m * np.array(NODES_M))
+    at = np.interp(np.log(np.maximum(path_m, 1e-9)), np.log(NODES_M), np.arange(len(NODES_M)))
+    low = np.minimum(at.astype(int), len(NODES_M) - 2)
+    part = at - low
+    found = of_scattered[..., low] * (1 - part) + of_scattered[..., low + 1] * part
+    return found * -np.expm1(-scattering_per_m * path_m)
+
+
+@cache
+def _rings(most: float) -> Array:
+    """Returns the edges (ANGLES + 1,) of rings: 0, then values up to `most` with a constant ratio."""
+    return np.concatenate([[0.0], np.geomspace(LEAST_RAD, most, ANGLES)])
+
+
+def _middle(edges: Array) -> Array:
+    """Returns the middle of each ring: the geometric mean of its edges; for the innermost ring, half its outer edge."""
+    return np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])
+
+
+@cache
+def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
+    """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp.
+
+    The first is the response of the receiver times the width of the part of the cell of beta that is below t, the
+    second the excess length of the scattered path relative to the straight one, path / d - 1.
+    """
+    edges = _rings(np.pi)
+    t = _middle(edges)[:, None]
+    inside = np.clip(t - edges[:-1], 0.0, np.diff(edges))  # the part of each cell of beta that is below t
+    beta = np.minimum(edges[:-1] + inside / 2, t)
+    alpha = t - beta
+    excess = (np.sin(beta) + np.sin(alpha)) / np.maximum(np.sin(t), 1e-12) - 1
+    response = np.maximum(np.cos(alpha), 0.0) if receiver == "floor" else np.ones_like(alpha)
+    return response * inside, np.maximum(excess, 0.0)
+
+
+def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array:
+    """Returns the light (ANGLES,) scattered once in each ring of the angle at the lamp, divided by b d exp(-a d).
+
+    d is the distance from the lamp, a and b are absorption and scattering coefficient of the water.
+    """
+    width, excess = _lamp_geometry(receiver)
+    edges = _rings(np.pi)
+    density = phase_at((water.scatterer,), np.cos(_middle(edges)))[:, 0] * np.diff(edges)
+    return 2 * np.pi * density @ (width * np.exp(-water.absorption_per_m * distance_m * excess))
+
+
+@cache
+def _camera_geometry() -> tuple[Array, Array, Array]:
+    """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera.
+
+    Returns:
+        Index of the ring of tan(beta), and excess length of the scattered path over the straight one, divided by the
+        range, each (STEPS, ANGLES) over u and t; solid angles (ANGLES,) of the cells of t [sr].
+    """
+    edges = _rings(np.pi / 2 * 0.999)
+    t = _middle(edges)
+    u = (np.arange(STEPS) + 0.5)[:, None] / STEPS
+    tangent = (1 - u) * np.tan(t)
+    excess = u + (1 - u) / np.cos(t) - np.sqrt(1 + tangent**2)
+    ring = np.minimum(np.searchsorted(_rings(MOST_TAN), tangent, side="right") - 1, ANGLES - 1)
+    solid = 4 * np.pi * np.diff(np.sin(edges / 2) ** 2)
+    return ring, excess, solid
+
+
+def _camera_rings(water: Absorbed, range_m: float) -> Array:
+    """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r).
+
+    There is one value per ring of tan(beta), where beta is the angle at the camera between the point of the floor and
+    the pixel's ray. r is the range; a and b are absorption and scattering coefficient of the water.
+    """
+    ring, excess, solid = _camera_geometry()
+    density = phase_at((water.scatterer,), np.cos(_middle(_rings(np.pi / 2 * 0.999))))[:, 0] * solid
+    light = density / STEPS * np.exp(-water.absorption_per_m * range_m * excess)
+    return np.asarray(np.bincount(ring.ravel(), light.ravel(), ANGLES), np.float64)
+
+
+def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Array:
+    """Returns the weights (n, m) of the Gaussians for light that is scattered at least once.
+
+    The transform of that light, exp(-t) (exp(t K) - 1), is fitted by Gaussians with weights of 0 or more.
+
+    Args:
+        once: (n, rings) light scattered once in each ring, per optical thickness of scattering.
+        edges: (rings + 1,) edges of the rings.
+        thickness: (n,) optical thickness of scattering t.
+        sigmas: (m,) standard deviations of the Gaussians.
+    """
+    k = _frequencies(float(sigmas[sigmas > 0].min()), float(sigmas.max()))
+    transform = once @ _ring_transforms(k, edges).T
+    t = thickness[:, None]
+    # exp(-t) (exp(t K) - 1); without the limit, light near a lamp would grow without bound in very turbid water
+    wanted = np.exp(np.minimum(t * (transform - 1), MAX_GROWTH)) * -np.expm1(-t * transform)
+    basis = np.exp(-(k[:, None] ** 2) * sigmas**2 / 2)
+    basis[0] *= WEIGHT_OF_TOTAL
+    return np.array([_fit(basis, row) for row in wanted])
+
+
+def _fit(basis: Array, wanted: Array) -> Array:
+    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel.
+
+    Args:
+        basis: (frequencies, m) transforms of the Gaussians; the first row, at frequency 0, is multiplied by
+            `WEIGHT_OF_TOTAL`, so that the integral is fitted best.
+        wanted: (frequencies,) transform of the kernel.
+    """
+    total = wanted[0]
+    if total <= 0:
+        return np.zeros(basis.shape[1])
+    rows = wanted / total
+    rows[0] *= WEIGHT_OF_TOTAL
+    return nnls(basis, rows, maxiter=100 * basis.shape[1])[0] * total
+
+
+def _frequencies(least: float, most: float) -> Array:
+    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least.
+
+    Args:
+        least, most: smallest and largest standard deviation of the Gaussians; the frequencies are in radians per unit
+            of these.
+    """
+    return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
+
+
+def _ring_transforms(k: Array, edges: Array) -> Array:
+    """Returns the Hankel transforms (n, rings) of uniform rings, each with the integral 1."""
+    at = np.where(k[:, None] > 0, edges * j1(k[:, None] * edges) / np.maximum(k[:, None], 1e-12), edges**2 / 2)
+    return 2 * np.diff(at, axis=1) / np.diff(edges**2)

@@ -1,0 +1,174 @@
+"""Optical properties of water: absorption, scattering, phase function, and diffuse attenuation of daylight."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.user_files import reading
+from twin.errors import TwinError
+from twin.imaging.light.bands import CENTRE_NM, NM, band_weights, effective_per_m
+from twin.imaging.light.light_spectra import Light, spectrum_of
+from twin.imaging.light.phase_function import Scatterer, molecular_scattering_per_m
+from twin.imaging.light.spread import Absorbed
+from twin.imaging.light.water_tables import water_spectrum
+from twin.scenario.model import ScatteringModel, WaterConfig
+
+Array = NDArray[np.float64]
+
+#: Largest size of a spectrum file.
+MAX_SPECTRUM_BYTES = 10_000_000
+
+
+class Medium(NamedTuple):
+    """Optical properties of the water in the bands R, G, B.
+
+    Args:
+        absorption_per_m: (3,) absorption coefficient a [1/m].
+        scattering_per_m: (3,) scattering coefficient b [1/m].
+        scatterers: for each band, phase function of the particles and molecular share of b.
+        multiple: whether multiple scattering is modelled; else all light that is scattered from its path is lost.
+    """
+
+    absorption_per_m: Array
+    scattering_per_m: Array
+    scatterers: tuple[Scatterer, ...] = (Scatterer(),) * 3
+    multiple: bool = True
+
+    @property
+    def attenuation_per_m(self) -> Array:
+        """Beam attenuation coefficient c = a + b (3,) [1/m], which counts all scattered light as lost."""
+        return self.absorption_per_m + self.scattering_per_m
+
+    @property
+    def camera_loss_per_m(self) -> Array:
+        """Loss of light between floor and camera (3,) [1/m]: a with multiple scattering, else c = a + b."""
+        return self.absorption_per_m if self.multiple else self.attenuation_per_m
+
+    @property
+    def scatters_repeatedly(self) -> bool:
+        """Whether the water scatters, and multiple scattering is modelled."""
+        return self.multiple and bool(self.scattering_per_m.any())
+
+    @property
+    def bands(self) -> tuple[Absorbed, ...]:
+        """Properties of each band, as hashable records."""
+        rows = zip(self.absorption_per_m.tolist(), self.scattering_per_m.tolist(), self.scatterers, strict=True)
+        return tuple(Absorbed(*row) for row in rows)
+
+
+def medium(
+    water: WaterConfig, scattering: ScatteringModel = "full", *, path_m: float = 0.0, light: Light = "led"
+) -> Medium:
+    """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
+
+    Args:
+        water: the water of a scenario.
+        scattering: `imaging.scattering`; with "none", the water does not scatter.
+        path_m: path length of the light for which the effective absorption of each band is computed [m]; 0: mean
+            absorption of the band.
+        light: light whose spectrum weights absorption and scattering in a band.
+
+    Raises:
+        TwinError: absorption or scattering is missing or given twice, the spectrum cannot be read (`read_spectrum`), or
+            there is no spectrum of the water type or the light (`water_spectrum`, `spectrum_of`).
+    """
+    absorption, per_m = _coefficients(water, path_m, light)
+    per_m = per_m * (water.turbidity if scattering != "none" else 0.0)
+    return Medium(absorption, per_m, scatterers(water, per_m), scattering == "full")
+
+
+def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, ...]:
+    """Returns the phase function of the particles and the molecular share of each band.
+
+    With the phase function "sea", the molecular scattering coefficient is that of pure sea water (Morel 1974), at most
+    b, and the rest of b is due to particles; otherwise all scattering is due to particles.
+
+    Args:
+        water: the water of a scenario.
+        scattering_per_m: (3,) scattering coefficient b of molecules and particles [1/m].
+    """
+    if water.phase_function == "sea":
+        molecules = molecular_scattering_per_m(np.array(CENTRE_NM))
+        share = np.minimum(molecules / np.maximum(scattering_per_m, 1e-12), 1.0)
+        return tuple(Scatterer("petzold", float(one)) for one in share)
+    parameters = {
+        "petzold": (),
+        "fournier_forand": (water.particle_index, water.particle_slope),
+        "henyey_greenstein": (water.mean_cosine,),
+    }[water.phase_function]
+    return (Scatterer(water.phase_function, 0.0, parameters),) * 3
+
+
+def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
+    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type.
+
+    Raises:
+        TwinError: see `medium`.
+    """
+    own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
+    given = [key for key, value in own.items() if value is not None]
+    if given and water.spectrum_file is not None:
+        raise TwinError(f"water.{given[0]}", "given twice, as there is a water.spectrum_file", "one of them")
+    if len(given) == 1:
+        missing = next(key for key in own if key not in given)
+        raise TwinError(f"water.{missing}", f"missing, as there is a water.{given[0]}", "both or none")
+    if given:
+        return np.array(water.absorption_per_m), np.array(water.scattering_per_m)
+    if water.spectrum_file is not None:
+        absorption, scattering = read_spectrum(Path(water.spectrum_file))
+    elif water.jerlov == "clear":
+        return np.zeros(3), np.zeros(3)
+    else:
+        absorption, scattering, _ = water_spectrum(water.jerlov, water.source)
+    weights = band_weights(spectrum_of(light))
+    return effective_per_m(absorption, weights, path_m), effective_per_m(scattering, weights)
+
+
+def read_spectrum(file: Path) -> tuple[Array, Array]:
+    """Returns absorption and scattering (n,) [1/m] at `bands.NM`, with linear interpolation between rows.
+
+    Args:
+        file: comma-separated rows of wavelength [nm], absorption, scattering [1/m]; # starts a comment.
+
+    Raises:
+        TwinError: the file cannot be read or is larger than `MAX_SPECTRUM_BYTES`, does not have 3 columns and 2 or more
+            rows, its wavelengths do not increase or do not cover 400 to 700 nm, or a value is negative or not finite.
+    """
+    key = "water.spectrum_file"
+    wanted = "rows of wavelength [nm], absorption, scattering [1/m]"
+    with reading(file, key, wanted, MAX_SPECTRUM_BYTES), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # an empty file
+        table = np.loadtxt(file, delimiter=",", comments="#", ndmin=2, encoding="utf-8-sig")
+    if table.shape[1] != 3 or len(table) < 2:
+        raise TwinError(key, f"{file} has {table.shape[1]} columns and {len(table)} rows", "3 columns, 2 rows or more")
+    nm = table[:, 0]
+    if not (np.diff(nm) > 0).all():
+        raise TwinError(key, f"{file}: wavelengths do not increase", "strictly increasing [nm]")
+    low, high = NM[0], NM[-1]
+    if nm[0] > low or nm[-1] < high:
+        raise TwinError(key, f"{file} covers {nm[0]:g} to {nm[-1]:g} nm", f"{low:g} to {high:g} or more")
+    if not (np.isfinite(table).all() and (table[:, 1:] >= 0).all()):
+        row = int(np.argmin((np.isfinite(table) & (table >= 0)).all(axis=1)))
+        raise TwinError(key, f"{file}: negative or not finite at {nm[row]:g} nm", "0 or more [1/m]")
+    absorption, scattering = (np.interp(NM, nm, values) for values in table[:, 1:].T)
+    return absorption, scattering
+
+
+def downwelling_per_m(water: Medium, mean_cosine: float = 1.0) -> Array:
+    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m].
+
+    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu0, G = 0.425 mu0 - 0.19; a fit to Monte Carlo
+    simulations of multiple scattering. Kd is the mean down to the depth that 1 % of the light reaches. For the phase
+    function of Petzold's harbour water, b / a of 2 to 6 and mu0 of 0.85 to 1, `light_field` agrees with it within 4 %.
+
+    Args:
+        water: optical properties of the water.
+        mean_cosine: mean cosine of the zenith angle of the light just below the surface, mu0.
+    """
+    a, b = water.absorption_per_m, water.scattering_per_m
+    return np.sqrt(a**2 + (0.425 * mean_cosine - 0.19) * a * b) / mean_cosine

@@ -1,0 +1,1 @@
+"""What the light falls on: floor and objects as seen by a pixel."""

@@ -1,0 +1,279 @@
+"""Shadows that objects cast on the floor, on each other and on themselves, in the light of lamps and sun.
+
+For each light, the objects are drawn into a depth image as seen from the light (shadow map, Williams 1978), which spans
+the points that the camera sees and has about as many pixels as its image. A point is in the shadow where the map shows
+a nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the
+image. Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit
+unless the map shows a surface that is nearer to the light by more than a bias of some pixels.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import StereoRig
+from twin.core.row_parallel import in_row_bands
+from twin.imaging.scene.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_meshes
+from twin.imaging.scene.object_view import Objects
+from twin.kernels import kernel
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
+MARGIN_PX = 2.0  #: margin of a map around these points, in its pixels
+WIDEST_TANGENT = 5.0  #: largest tangent of half the field of view of a map; points outside the map count as lit
+BIAS_PX = 1.5  #: least distance of an occluder from a point of an object that faces the light, in pixels of the map
+STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias grows
+
+
+class _LightView(NamedTuple):
+    """View from a light, for its shadow map.
+
+    Args:
+        light_from_camera: (4, 4) transform from the axes of the camera to those of the view.
+        projection: projection of the map.
+        limits: (k, 4) planes of the view, see `Objects.in_view`.
+        shape: rows and columns of the map.
+    """
+
+    light_from_camera: Array
+    projection: Projection
+    limits: Array
+    shape: tuple[int, int]
+
+
+class ObjectShadows:
+    """Shadow casting by objects.
+
+    Args:
+        objects: the objects.
+        rig: the rendered cameras.
+        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
+        to_sun: (3,) unit direction to the sun in world axes; None: the sun casts no shadow.
+    """
+
+    def __init__(self, objects: Objects, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None):
+        self._objects, self._focal_px = objects, rig.focal_px
+        self._lamps, self._to_sun = lamp_positions_m, to_sun
+
+    def darken(
+        self,
+        lit: NDArray[np.uint8],
+        depth: Depth,
+        view: ObjectView,
+        world_from_camera: Array,
+        moment: tuple[int, float],
+    ) -> None:
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun, or faces away from it.
+
+        The last mask is that of the sun if it casts shadows.
+
+        Args:
+            lit: 0 where the floor occludes the light, else 1; modified in place.
+            depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
+            view: the objects in the image.
+            world_from_camera: (4, 4) pose of this camera.
+            moment: camera (0 left, 1 right), and time since the start of the survey [s].
+        """
+        camera, time_s = moment
+        points = self._sampled_points(depth)
+        if not len(points):
+            return
+        camera_from_world = geometry.inverse(world_from_camera)
+        for k in range(len(lit)):
+            if k < len(self._lamps[camera]):
+                light = _lamp_view(self._lamps[camera][k], points, depth.shape)
+            else:
+                assert self._to_sun is not None
+                light = _sun_view(camera_from_world[:3, :3] @ self._to_sun, points, depth.shape)
+            if light is None:
+                continue
+            nearest = np.full(light.shape, np.inf, np.float32)
+            light_from_world = light.light_from_camera @ camera_from_world
+            casting = self._objects.in_view(light_from_world, light.limits, light.projection, time_s)
+            draw_meshes(casting, light.projection, Target(nearest))
+            matrix = np.ascontiguousarray(light.light_from_camera[:3])
+            scene = lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection
+            in_row_bands(partial(_darken, *scene), len(depth))
+
+    def _sampled_points(self, depth: Depth) -> Array:
+        """Returns points (n, 3) [m] of floor and objects in camera axes, on a grid of pixels with spacing STRIDE_PX."""
+        height, width = depth.shape
+        rows = np.unique(np.append(np.arange(0, height, STRIDE_PX), height - 1))
+        cols = np.unique(np.append(np.arange(0, width, STRIDE_PX), width - 1))
+        z = depth[np.ix_(rows, cols)].astype(np.float64)
+        x = (cols - (width - 1) / 2) / self._focal_px * z
+        y = (rows[:, None] - (height - 1) / 2) / self._focal_px * z
+        return np.stack([x, y, z], axis=-1)[np.isfinite(z)]
+
+
+def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
+    """Returns the view from a lamp, with its axis in the mean direction of the points; None if no point is ahead of it.
+
+    Args:
+        lamp_m: (3,) position of the lamp in the axes of the camera.
+        points: (n, 3) points that the map shows, in the axes of the camera [m].
+        shape: rows and columns of the image.
+    """
+    away = points - lamp_m
+    rotation = _axes_along((away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0))
+    seen = away @ rotation
+    ahead = seen[seen[:, 2] > NEAR_M]
+    if not len(ahead):
+        return None
+    tangents = np.clip(ahead[:, :2] / ahead[:, 2:], -WIDEST_TANGENT, WIDEST_TANGENT)
+    low, high = tangents.min(axis=0), tangents.max(axis=0)
+    focal_px = _scale(low, high, shape)
+    margin = MARGIN_PX / focal_px
+    low, high = low - margin, high + margin
+    planes = np.array(
+        [[1, 0, -low[0], 0], [-1, 0, high[0], 0], [0, 1, -low[1], 0], [0, -1, high[1], 0], [0, 0, 1, -NEAR_M]]
+    )
+    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+    projection = Projection(focal_px, -low[0] * focal_px, -low[1] * focal_px, NEAR_M, True)
+    return _LightView(_looking(rotation, lamp_m), projection, planes, _size(low, high, focal_px))
+
+
+def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
+    """Returns the parallel view from the sun.
+
+    Args:
+        to_sun: (3,) unit direction to the sun in the axes of the camera.
+        points: (n, 3) points that the map shows, in the axes of the camera [m].
+        shape: rows and columns of the image.
+    """
+    rotation = _axes_along(-to_sun)
+    seen = points @ rotation
+    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
+    focal_px = _scale(low, high, shape)
+    margin = MARGIN_PX / focal_px
+    low, high = low - margin, high + margin
+    planes = np.array([[1, 0, 0, -low[0]], [-1, 0, 0, high[0]], [0, 1, 0, -low[1]], [0, -1, 0, high[1]]])
+    projection = Projection(focal_px, -low[0] * focal_px, -low[1] * focal_px, -np.inf, False)
+    return _LightView(_looking(rotation, np.zeros(3)), projection, planes, _size(low, high, focal_px))
+
+
+def _scale(low: Array, high: Array, shape: tuple[int, int]) -> float:
+    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image.
+
+    Args:
+        low, high: (2,) lower and upper ends of the map along columns and rows: tangents for a focal length, metres for
+            a scale.
+        shape: rows and columns of the image.
+    """
+    area = np.maximum(high - low, 1e-3).prod()
+    return float(np.sqrt(shape[0] * shape[1] / area))
+
+
+def _size(low: Array, high: Array, focal_px: float) -> tuple[int, int]:
+    """Returns the number of rows and columns of a shadow map of the given extent."""
+    cols, rows = np.ceil((high - low) * focal_px).astype(int) + 1
+    return int(rows), int(cols)
+
+
+def _axes_along(forward: Array) -> Array:
+    """Returns a rotation (3, 3) whose third column is along `forward`."""
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(z, x), z])
+
+
+def _looking(rotation: Array, position_m: Array) -> Array:
+    """Returns the transform (4, 4) from the axes of the camera to those of a view.
+
+    Args:
+        rotation: (3, 3) axes of the view, as columns, in the axes of the camera.
+        position_m: (3,) origin of the view in the axes of the camera.
+    """
+    return geometry.inverse(geometry.pose(rotation, position_m))
+
+
+@kernel(error_model="numpy")
+def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
+    """Sets `lit` (H, W) to 0 in the rows `first` to `end` - 1 where the map `nearest` shows an object that occludes.
+
+    A point is occluded if the depth in the map is less than that of the point minus a bias. On the floor, the bias is
+    one pixel of the map. On an object, it is BIAS_PX (1 + t) pixels, where t is the tangent of the angle of
+    incidence or, if smaller, STEEPEST. Surfaces of objects that face away from the light are not lit either.
+    """
+    height, width = depth.shape
+    x = (np.arange(width) - 0.5 * (width - 1)) / focal
+    cell, reach, bias = np.empty(width, np.int32), np.empty(width), np.empty(width)
+    in_map = nearest.reshape(-1)
+    for v in range(first, end):
+        y = (v - 0.5 * (height - 1)) / focal
+        _find_cells(depth[v], x, y, matrix, projection, nearest.shape, cell, reach, bias)
+        for u in range(width):
+            if cell[u] < 0:
+                continue
+            factor = 1.0
+            if label[v, u]:
+                cosine = _cosine(depth[v, u], x[u], y, normal[v, u], matrix, projection[4])
+                if cosine <= 0:
+                    lit[v, u] = 0
+                    continue
+                tangent = np.sqrt(max(1 - cosine * cosine, 0.0)) / cosine
+                factor = BIAS_PX * (1 + min(tangent, STEEPEST))
+            if in_map[cell[u]] < reach[u] - bias[u] * factor:
+                lit[v, u] = 0
+
+
+@kernel(error_model="numpy", forceinline=True)
+def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
+    """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map.
+
+    Args:
+        depth: (w,) depth of the points in the camera [m].
+        x: (w,) their horizontal tangents in the camera.
+        y: vertical tangent of the row.
+        matrix: (3, 4) map from the axes of the camera to those of the view.
+        projection: projection of the map.
+        shape: rows and columns of the map.
+        cell: filled with the numbers of the pixels.
+        reach: filled with the depths of the points in the view [m].
+        bias: filled with the size of a pixel at these depths [m].
+    """
+    scale, cx, cy, _, perspective = projection
+    rows, cols = shape
+    for u in range(depth.size):
+        z = np.float64(depth[u])
+        right, down = x[u] * z, y * z
+        a = matrix[0, 0] * right + matrix[0, 1] * down + matrix[0, 2] * z + matrix[0, 3]
+        b = matrix[1, 0] * right + matrix[1, 1] * down + matrix[1, 2] * z + matrix[1, 3]
+        c = matrix[2, 0] * right + matrix[2, 1] * down + matrix[2, 2] * z + matrix[2, 3]
+        share = 1 / c if perspective else 1.0
+        col, row = np.rint(scale * a * share + cx), np.rint(scale * b * share + cy)
+        there = (z < np.inf) & (share > 0) & (col >= 0) & (col < cols) & (row >= 0) & (row < rows)
+        cell[u] = np.int32(row if there else 0.0) * np.int32(cols) + np.int32(col if there else 0.0)
+        cell[u] = cell[u] if there else np.int32(-1)
+        reach[u] = c
+        bias[u] = 1 / (scale * share)
+
+
+@kernel(error_model="numpy", forceinline=True)
+def _cosine(depth, x, y, normal, matrix, perspective):
+    """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light.
+
+    The normal has the axes of the camera.
+
+    The tangents `x`, `y` and the depth [m] of the point are those in the camera; see `_find_cells`.
+    """
+    z = np.float64(depth)
+    x, y = x * z, y * z
+    nx, ny, nz = normal[0], normal[1], normal[2]
+    na = matrix[0, 0] * nx + matrix[0, 1] * ny + matrix[0, 2] * nz
+    nb = matrix[1, 0] * nx + matrix[1, 1] * ny + matrix[1, 2] * nz
+    nc = matrix[2, 0] * nx + matrix[2, 1] * ny + matrix[2, 2] * nz
+    if not perspective:
+        return -nc
+    a = matrix[0, 0] * x + matrix[0, 1] * y + matrix[0, 2] * z + matrix[0, 3]
+    b = matrix[1, 0] * x + matrix[1, 1] * y + matrix[1, 2] * z + matrix[1, 3]
+    c = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z + matrix[2, 3]
+    return -(na * a + nb * b + nc * c) / np.sqrt(a * a + b * b + c * c)

@@ -1,0 +1,143 @@
+"""Objects in the images of the cameras: drawn over the rendered floor where they are nearer to the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import Image, StereoRig
+from twin.imaging.scene.mesh_raster import NEAR_M, DrawnMesh, ObjectView, Projection, Target, draw_meshes
+from twin.imaging.scene.mesh_texture import TexturedSurface, paint_textures
+from twin.imaging.scene.sway import largest_displacement_m, swayed
+from twin.terrains.objects.detail import Level
+from twin.terrains.objects.floor_mesh import FloorTiles
+from twin.terrains.objects.model import PlacedObject
+from twin.terrains.objects.parts import UNKNOWN
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image [px]
+
+
+class Objects:
+    """Objects in the world, with the level of detail that a view needs.
+
+    Args:
+        placed: the objects.
+        current_mps: (3,) velocity of the current, in which plants sway.
+        floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: the floor is no mesh.
+    """
+
+    def __init__(
+        self, placed: Sequence[PlacedObject], current_mps: Array | None = None, floor: FloorTiles | None = None
+    ):
+        tiles = () if floor is None else floor.tiles
+        self._n_objects = len(placed)
+        self.placed = placed = (*placed, *(tile.placed for tile in tiles))
+        self._uv = [tile.uv if tile.texture >= 0 else None for tile in tiles]
+        self.surface = None
+        if floor is not None and len(floor.textures.levels):
+            of_label = [-1] * (1 + self._n_objects) + [tile.texture for tile in tiles]
+            self.surface = TexturedSurface(floor.textures, np.array(of_label, np.int32))
+        self._current_mps = np.zeros(3) if current_mps is None else current_mps
+        self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
+        self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
+
+    def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> list[DrawnMesh]:
+        """Returns the meshes of the objects in view, in the order of the depth of their centres.
+
+        Labels are 1 + the index in `placed`.
+
+        Args:
+            camera_from_world: (4, 4) transform from world axes to those of the camera.
+            limits: (k, 4) planes of the view frustum in these axes: unit normal, which points inward, and offset [m].
+            pixel: projection, whose pixels determine the levels of detail.
+            time_s: time since the start of the survey.
+        """
+        centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
+        visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
+        order = np.flatnonzero(visible)
+        drawn = []
+        for k in order[np.argsort(centres[order, 2])]:
+            item = self.placed[k]
+            nearest_m = max(centres[k, 2] - self._radii_m[k], pixel.near_m)
+            pixel_m = (nearest_m if pixel.perspective else 1.0) / pixel.focal_px
+            mesh, _, parts = _level(item, LEVEL_PX * pixel_m)
+            if item.model.sways:
+                mesh, parts = swayed(mesh, item, self._current_mps, time_s), UNKNOWN
+            transform, closed = camera_from_world @ item.world_from_object, item.model.closed
+            drawn.append(DrawnMesh(mesh, transform, int(k) + 1, closed, parts, self.uv_of(k)))
+        return drawn
+
+    def uv_of(self, number: int) -> NDArray[np.float32] | None:
+        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes.
+
+        Args:
+            number: index of the mesh in `placed`.
+        """
+        return self._uv[number - self._n_objects] if number >= self._n_objects else None
+
+
+def draw_objects(
+    objects: Objects, target: Target, camera_from_world: Array, limits: Array, projection: Projection,
+    time_s: float = 0.0,
+) -> None:  # fmt: skip
+    """Draws the objects in view into images, with their numbers + 1 as labels, and the textures of a mesh floor.
+
+    Args:
+        objects: the objects.
+        target: images to draw into; with textures, none of them is None.
+        camera_from_world, limits, projection, time_s: see `Objects.in_view`.
+    """
+    draw_meshes(objects.in_view(camera_from_world, limits, projection, time_s), projection, target)
+    if objects.surface is not None:
+        paint_textures(target, projection, objects.surface)
+
+
+class ObjectRenderer:
+    """Renderer that draws objects into images of the floor.
+
+    Args:
+        objects: the objects.
+        rig: calibration of the rendered cameras.
+    """
+
+    def __init__(self, objects: Objects, rig: StereoRig):
+        self._objects = objects
+        self._projection = Projection(rig.focal_px, rig.cx_px, rig.cy_px, NEAR_M, True)
+        self._limits = frustum(rig)
+
+    def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
+        """Draws the objects into `albedo` (H, W, 3) and `depth` (H, W) in place; returns their normals and labels.
+
+        Args:
+            albedo: (H, W, 3) uint8 albedo of the floor.
+            depth: (H, W) float32 depth of the floor along the optical axis [m]; inf where there is no floor.
+            world_from_camera: (4, 4) pose of the camera.
+            time_s: time since the start of the survey.
+        """
+        view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
+        uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)
+        target = Target(depth, albedo, *view, uv)
+        draw_objects(self._objects, target, geometry.inverse(world_from_camera), self._limits, self._projection, time_s)
+        return view
+
+
+def frustum(rig: StereoRig) -> Array:
+    """Returns the planes (5, 4) of the view of a camera in its axes: inward unit normal and offset [m]."""
+    left, right = (rig.cx_px + 0.5) / rig.focal_px, (rig.width_px - 0.5 - rig.cx_px) / rig.focal_px
+    top, bottom = (rig.cy_px + 0.5) / rig.focal_px, (rig.height_px - 0.5 - rig.cy_px) / rig.focal_px
+    planes = np.array(
+        [[1, 0, left, 0], [-1, 0, right, 0], [0, 1, top, 0], [0, -1, bottom, 0], [0, 0, 1, -NEAR_M]], np.float64
+    )
+    return planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+
+
+def _level(item: PlacedObject, cell_m: float) -> Level:
+    """Returns the coarsest level of detail of an object with cells of at most `cell_m` in the world."""
+    fine_enough = [level for level in item.model.levels if level.cell_m * item.scale <= cell_m]
+    return fine_enough[-1]

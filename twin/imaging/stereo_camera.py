@@ -1,0 +1,258 @@
+"""Simulated stereo camera: renders the floor and computes light in the water, exposure and noise of each image."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.records import Exposure, Image
+from twin.core.row_parallel import in_pair
+from twin.core.timing import StageTimer
+from twin.imaging.camera.lens_psf import LensPsf
+from twin.imaging.camera.photo_sensor import PhotoSensor, Sensor, sensor_of
+from twin.imaging.camera.pixels import Raw
+from twin.imaging.camera.sensor import ExposureSetting, Radiance
+from twin.imaging.camera.shutter import ExposureMotion, integrate
+from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
+from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
+from twin.imaging.scene.mesh_raster import ObjectView
+from twin.scenario.model import Scenario
+
+if TYPE_CHECKING:
+    from twin.imaging.scene.renderer import Renderer
+
+Array = NDArray[np.float64]
+Depth = NDArray[np.float32]
+
+AT_REST: Array = np.zeros(6)
+
+
+class StereoCapture(NamedTuple):
+    """One exposure of the stereo camera: images (H, W, 3) uint8 RGB, and true depths (H, W) [m] for the evaluation.
+
+    The right image and its depth are None if only the left camera was used. `exposure` is that of both images, as the
+    cameras report it (`Frame.exposure`).
+    """
+
+    left: Image
+    right: Image | None
+    depth_left: Depth
+    depth_right: Depth | None
+    exposure: Exposure
+
+
+class DecomposedImage(NamedTuple):
+    """A left image without noise, with the intermediate results of its computation.
+
+    Args:
+        albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
+        depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
+        components: direct signal, backscatter and other components of the radiance.
+        setting: exposure, metered on this image.
+        noise_free: (H, W, 3) image without noise.
+        raw: digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a
+            Bayer filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor.
+        linear: whether the image is proportional to the radiance: linear tone curve, white balance for white light.
+        objects: normals and labels (H, W) of the objects in the image; None without objects.
+    """
+
+    albedo: Image
+    depth: Depth
+    components: RadianceComponents
+    setting: ExposureSetting
+    noise_free: Image
+    raw: Raw | None
+    linear: bool
+    objects: ObjectView | None = None
+
+    @property
+    def gain(self) -> float:
+        """Image signal per unit of radiance on the optical axis [1 / (cd/m2)], see `ExposureSetting.gain`."""
+        return self.setting.gain
+
+
+class _View(NamedTuple):
+    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and the objects in it.
+
+    `pose` is that of the left camera, with the time; `objects` is None for a scene without objects.
+    """
+
+    pose: StampedPose
+    camera: int
+    albedo: Image
+    depth: Depth
+    objects: ObjectView | None
+
+
+class StereoCamera:
+    """Stereo camera: both cameras share one auto-exposure; their noise is independent.
+
+    Args:
+        renderer: renderer of albedo and depth of the floor.
+        image_formation: model of the radiance that reaches the cameras through the water.
+        scenario: settings of the cameras and the sensor.
+        left_rng, right_rng: random streams of the image noise.
+        stopwatch: timer of the stages "render" and "optics".
+        true_cameras: geometry of the true cameras; None = as defined by the scenario.
+
+    Raises:
+        TwinError: `true_cameras` is None and the scenario's cameras are invalid, see `make_true_cameras`; or the water
+            is invalid, see `sensor_of`.
+    """
+
+    def __init__(
+        self,
+        renderer: Renderer,
+        image_formation: ImageFormation,
+        scenario: Scenario,
+        left_rng: np.random.Generator,
+        right_rng: np.random.Generator,
+        stopwatch: StageTimer,
+        true_cameras: TrueCameras | None = None,
+    ):
+        self._cameras = make_true_cameras(scenario) if true_cameras is None else true_cameras
+        rig = self._cameras.rendered_rig
+        self._renderer, self._image_formation = renderer, image_formation
+        self._scenario, self._stopwatch = scenario, stopwatch
+        self._left_from_right, self._frame_rate_hz = rig.left_from_right, rig.frame_rate_hz
+        body_from_cameras = rig.body_from_camera, rig.body_from_camera @ rig.left_from_right
+        self._camera_from_body_twist = [geometry.adjoint(geometry.inverse(pose)) for pose in body_from_cameras]
+        self._sensor, self._psf = sensor_of(scenario, self._cameras.raw_rig), LensPsf(scenario, rig)
+        self._focal_px, self._linear = rig.focal_px, scenario.delivers_linear_images
+        self._rngs = (left_rng, right_rng)
+        self._n_captures = 0
+
+    def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
+        """Returns the image of the left camera and, if `stereo`, the simultaneous image of the right camera.
+
+        Each call advances the time by one frame.
+
+        Args:
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            stereo: whether the right camera is used too.
+            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
+        """
+        pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
+        self._n_captures += 1
+        cameras = (0, 1) if stereo else (0,)
+        views = [self._render(pose, camera) for camera in cameras]
+        with self._stopwatch("optics"):
+            setting = self._sensor.setting
+            metered = setting is not None
+            if setting is None:
+                setting = self._first_setting(views[0])
+            expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
+            if stereo:
+                (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
+            else:
+                (left, light), right = expose(views[0]), None
+            if metered:
+                self._sensor.meter(light)
+            depths = [self._cameras.crop(view.depth) for view in views]
+        exposure = self._sensor.signal_per_cd(setting)
+        return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
+
+    def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
+        """Returns the left and the right image (H, W, 3) at the time of the last capture.
+
+        Has no effect on later captures. The noise is that of the next capture.
+
+        Args:
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
+        """
+        kept = self._sensor, self._rngs, self._n_captures
+        self._sensor, self._rngs = copy.deepcopy(kept[:2])
+        self._n_captures = max(self._n_captures - 1, 0)
+        try:
+            captured = self.capture(world_from_left, True, twist_body)
+        finally:
+            self._sensor, self._rngs, self._n_captures = kept
+        assert captured.right is not None
+        return captured.left, captured.right
+
+    def twist_of_camera(self, camera: int, twist_body: Array) -> Array:
+        """Returns the [angular, linear] velocity (6,) of a camera (0 left, 1 right) in its own axes [rad/s, m/s]."""
+        return self._camera_from_body_twist[camera] @ twist_body
+
+    def decompose(self, world_from_left: Array, twist_body: Array = AT_REST, time_s: float = 0.0) -> DecomposedImage:
+        """Returns the left image at a pose and time with intermediate results; has no effect on later captures.
+
+        Args:
+            world_from_left: (4, 4) pose of the left camera at mid-exposure.
+            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s]; affects the
+                image and the digital numbers, not the components.
+            time_s: time since the start of the survey, at which snow, waves and swaying plants are drawn.
+        """
+        albedo, depth = self._renderer.render(world_from_left)
+        pose = StampedPose(world_from_left, time_s)
+        objects = self._image_formation.draw_objects(albedo, depth, 0, pose)
+        components = self._image_formation.components(albedo, depth, 0, pose, objects)
+        cameras = self._cameras
+        sensor = sensor_of(self._scenario, cameras.raw_rig)
+        floor = self._image_formation.radiance_without_snow(albedo, depth, 0, pose, objects)
+        setting = self._meter(sensor, components.total, depth)
+        motion = sensor.motion(self.twist_of_camera(0, twist_body), setting, len(depth))
+        light = self._through_lens(floor, depth, 0, pose, motion)
+        noise_free = cameras.rectify(sensor.image(light, setting, None))
+        next_rng = copy.deepcopy(self._rngs[0])
+        raw = sensor.raw(light, setting, next_rng) if isinstance(sensor, PhotoSensor) else None
+        cropped = {name: cameras.crop(part) for name, part in components._asdict().items() if part is not None}
+        components = components._replace(**cropped)
+        shown = None if objects is None else ObjectView(*(cameras.crop(layer) for layer in objects))
+        return DecomposedImage(
+            cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw, self._linear, shown
+        )
+
+    def _render(self, pose: StampedPose, camera: int) -> _View:
+        """Returns the rendered view of a camera, with the objects."""
+        world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
+        with self._stopwatch("render"):
+            albedo, depth = self._renderer.render(world_from_camera)
+            objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
+        return _View(pose, camera, albedo, depth, objects)
+
+    def _first_setting(self, view: _View) -> ExposureSetting:
+        """Returns the exposure of the first frame, metered on its left view at rest."""
+        light = self._image_formation.radiance(view.albedo, view.depth, 0, view.pose, view.objects)
+        return self._meter(self._sensor, light, view.depth)
+
+    def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
+        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels.
+
+        Args:
+            view: rendered view of this camera.
+            twist_body: see `capture`.
+            setting: exposure of this frame.
+        """
+        pose, camera, albedo, depth, objects = view
+        motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
+        floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
+        light = self._through_lens(floor, depth, camera, pose, motion)
+        return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[camera])), light
+
+    def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
+        """Returns the exposure metered on the light (H, W, 3) in the left camera at rest."""
+        return sensor.meter(self._cameras.sample(light, depth, 0))
+
+    def _through_lens(
+        self, floor: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None
+    ) -> Radiance:
+        """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water.
+
+        The array `floor` may be modified.
+
+        Depth of field and motion blur depend on depth; marine snow, which has other depths and velocities, is drawn
+        with its own blur afterwards.
+        """
+        light = self._psf.out_of_focus(floor, depth)
+        if motion is not None:
+            motion = motion._replace(rolls_later=self._cameras.sampling is not None)
+            light = integrate(light, depth, self._focal_px, motion)
+        self._image_formation.add_snow(light, depth, camera, pose, motion)
+        return self._cameras.sample(self._psf.transfer(light), depth, camera, motion=motion)

@@ -1,0 +1,1 @@
+"""Recorded stereo data sets: rectification, frames, aiding, and their replay by the estimators."""

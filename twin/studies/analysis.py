@@ -1,0 +1,390 @@
+"""Statistical analysis of a study's results: pass probability, metrics, sensitivities and reasons for failure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from twin.judge.map_error import with_completeness
+from twin.judge.require import more_is_better
+from twin.studies import statistics
+from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values
+from twin.studies.design import axis_names
+from twin.studies.statistics import Array, Interval, SobolIndex
+from twin.studies.study_file import Study
+
+_MAX_REASONS = 12
+_MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
+
+
+class MetricSummary(NamedTuple):
+    """Distribution of a metric over the surveys: median, 95th or 5th percentile, and required limit.
+
+    `surveys` is the number of surveys in these statistics (`StudyAnalysis.included`); `bound` is the 95th percentile,
+    or the 5th percentile if larger values of the metric are better; `limit` is None if the metric has no requirement.
+    """
+
+    name: str
+    surveys: int
+    median: Interval
+    bound: Interval
+    limit: float | None
+
+
+class Sensitivity(NamedTuple):
+    """Dependence of a metric on a key.
+
+    `correlation` is their rank correlation, NaN if the values of the key are not numbers. `explained` is the fraction
+    of the variance of the metric's ranks that the key explains (`statistics.explained_variance`).
+    """
+
+    key: str
+    metric: str
+    correlation: Interval
+    explained: float
+
+
+class KeyComparison(NamedTuple):
+    """Medians of a key over the surveys that passed and over the surveys that did not pass.
+
+    `superiority` is the probability that the key has a greater value in a survey that did not pass than in one that
+    passed; ties count half.
+    """
+
+    key: str
+    passed: float
+    not_passed: float
+    superiority: float
+
+
+class FailureReason(NamedTuple):
+    """Status of surveys that did not pass, the reason, and the number of surveys with this status and reason."""
+
+    status: str
+    reason: str
+    surveys: int
+
+
+class RefusedSample(NamedTuple):
+    """A sample with refused surveys: its number, number of refused surveys, value of each varied key, reason."""
+
+    sample: int
+    surveys: int
+    values: dict[str, Any]
+    reason: str
+
+
+class StudyAnalysis:
+    """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
+
+    Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Those
+    that only the surrogate refuses (`unmodelled`) also count in pass probabilities, as unknown results. Surveys of the
+    same scenario with the same seed are identical and count once, except in `sobol`.
+
+    Args:
+        rows: results table.
+        study: the study.
+        planned: number of surveys of the study; None: all of them are in the table.
+    """
+
+    def __init__(self, rows: pa.Table, study: Study, planned: int | None = None):
+        self.rows, self.study, self.required_probability = rows, study, study.probability
+        self.not_flown = max(0, (planned or 0) - rows.num_rows)
+        self.status, self.reason, self.warning = (self._texts(name) for name in ("status", "reason", "warning"))
+        self.refused, self.failed = self.status == "refused", self.status == "failed"
+        unmodelled = self.refused & (self.numbers("unmodelled") == 1)
+        self.duplicate = self._duplicates(~self.failed & (unmodelled | ~self.refused))
+        self.unmodelled = unmodelled & ~self.duplicate
+        self.evaluated = ~(self.refused | self.failed | self.duplicate)
+        self.counted = self.evaluated | self.unmodelled  # in pass probabilities
+        self.complete = self.evaluated & (self.status == "complete")
+        self.keys = [key for key in study.varied_keys if f"vary.{key}" in rows.column_names]
+        self.limits = self._limits()
+        names = with_completeness([*self.limits, *study.show])
+        self.metrics = [name for name in names if self._has_values(name)]
+        self.passed = self._passed()
+
+    def _texts(self, name: str) -> NDArray:
+        """Returns a column of the table as texts (n,), "" where a survey has no value or if there is no column."""
+        column = self.rows[name].to_pylist() if name in self.rows.column_names else [None] * self.rows.num_rows
+        return np.array(["" if value is None else str(value) for value in column], dtype=object)
+
+    def _duplicates(self, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the surveys in `counted` (n,) with the scenario and seed of an earlier one in it."""
+        hashes, seeds = self._texts("scenario_hash"), self.numbers("seed")
+        seen: set[tuple[str, float]] = set()
+        duplicate = np.zeros(self.rows.num_rows, np.bool_)
+        for k in np.flatnonzero(counted):
+            identity = hashes[k], float(seeds[k])
+            duplicate[k] = bool(hashes[k]) and identity in seen
+            seen.add(identity)
+        return duplicate
+
+    def numbers(self, name: str) -> Array:
+        """Returns a numeric column of the table (n,), with NaN where a survey has no value or if there is no column."""
+        if name not in self.rows.column_names:
+            return np.full(self.rows.num_rows, np.nan)
+        return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
+
+    def _has_values(self, metric: str) -> bool:
+        """Returns whether the metric is in the table, and is required or has a finite value in some survey.
+
+        Surveys by the surrogate, for example, have no contrast.
+        """
+        required = metric in self.limits and metric in self.rows.column_names
+        return required or bool(np.isfinite(self.numbers(metric)).any())
+
+    def included(self, metric: str) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the surveys that are included in the statistics of a metric.
+
+        These are the complete surveys with a finite value of the metric. The statistics of image quality metrics
+        ("vision.") also include degraded and aborted surveys.
+        """
+        flown = self.evaluated if metric.startswith("vision.") else self.complete
+        return flown & np.isfinite(self.numbers(metric))
+
+    def _limits(self) -> dict[str, float]:
+        limits = {}
+        for column in self.rows.column_names:
+            if match := re.fullmatch(r"require\.(.+)\.limit", column):
+                values = self.numbers(column)
+                limits[match[1]] = float(np.nanmax(values)) if np.isfinite(values).any() else np.nan
+        return limits
+
+    def _passed(self) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the surveys that were completed and met every requirement, without duplicates."""
+        met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
+        return np.logical_and.reduce([self.complete, *met])
+
+    @cached_property
+    def cluster_name(self) -> str:
+        """Returns the column that labels correlated surveys: "sample", or "seed" if that has more distinct values."""
+        n_samples, n_seeds = (len(np.unique(self.numbers(name))) for name in ("sample", "seed"))
+        return "sample" if n_samples >= n_seeds else "seed"
+
+    @cached_property
+    def clusters(self) -> Array:
+        """Returns the label of the cluster of each survey (n,): the surveys of a cluster share a sample or a seed."""
+        return self.numbers(self.cluster_name)
+
+    @cached_property
+    def pass_probability(self) -> Interval:
+        """Returns the fraction of the evaluated surveys that passed, with its confidence interval.
+
+        The interval allows for the unknown results of the `unmodelled` surveys, see `statistics.wilson_interval`.
+        """
+        return self.proportion(self.counted)
+
+    def proportion(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Interval:
+        """Returns the pass probability of the chosen surveys (a mask or row numbers), which are all in `counted`."""
+        return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unmodelled[chosen])
+
+    @property
+    def possible_fractions(self) -> tuple[float, float]:
+        """Returns the fraction of the surveys that passed if none, and if all, of the unknown results are passes."""
+        n, passed = max(int(self.counted.sum()), 1), int(self.passed.sum())
+        return passed / n, (passed + int(self.unmodelled.sum())) / n
+
+    @property
+    def requirement_missed(self) -> bool:
+        """Returns whether the fraction of surveys that passed is below the required value, or is not known.
+
+        Unknown results count as not passed. False if no pass probability is required.
+        """
+        required = self.required_probability
+        return required is not None and not (self.evaluated.any() and self.possible_fractions[0] >= required)
+
+    def key_numbers(self, key: str) -> Array | None:
+        """Returns the value of a key in each survey (n,), or None if the values are not numbers."""
+        column = self.rows[f"vary.{key}"]
+        if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
+            return self.numbers(f"vary.{key}")
+        return None
+
+    def key_groups(self, key: str, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[str]]:
+        """Groups surveys by the value of a key; see `statistics.group_indices` for numbers.
+
+        Args:
+            key: the varied key.
+            chosen: (n,) mask of the surveys to group.
+
+        Returns:
+            The group index of each chosen survey, and the name of each group: its value or its range of values.
+        """
+        values = self.key_numbers(key)
+        if values is None:
+            names, index = np.unique(self._texts(f"vary.{key}")[chosen].astype(str), return_inverse=True)
+            return index, [str(name) for name in names]
+        groups = statistics.group_indices(values[chosen])
+        return groups, [_range_text(values[chosen][groups == k]) for k in np.unique(groups)]
+
+    @cached_property
+    def metric_summaries(self) -> list[MetricSummary]:
+        """Returns the summary of the distribution of each metric."""
+        return [self._metric_summary(name) for name in self.metrics]
+
+    def _metric_summary(self, name: str) -> MetricSummary:
+        values, included = self.numbers(name), self.included(name)
+        data, clusters = values[included], self.clusters[included]
+        percent = 5.0 if more_is_better(name) else 95.0
+        return MetricSummary(
+            name,
+            len(data),
+            statistics.bootstrap_interval(data, statistics.median, clusters),
+            statistics.bootstrap_interval(data, lambda v: statistics.percentile(v, percent), clusters),
+            self.limits.get(name),
+        )
+
+    @cached_property
+    def sensitivities(self) -> list[Sensitivity]:
+        """Returns the sensitivity of each metric to each key, metric by metric, the strongest first."""
+        unsorted = [self._sensitivity(key, metric) for metric in self.metrics for key in self.keys]
+        order = {metric: k for k, metric in enumerate(self.metrics)}
+        return sorted(unsorted, key=lambda s: (order[s.metric], -_strength(s)))
+
+    def _sensitivity(self, key: str, metric: str) -> Sensitivity:
+        y, included = self.numbers(metric), self.included(metric)
+        x = self.key_numbers(key)
+        undefined = Interval(np.nan, np.nan, np.nan)
+        correlation = undefined if x is None else statistics.rank_correlation(x[included], y[included])
+        groups, _ = self.key_groups(key, included)
+        return Sensitivity(key, metric, correlation, statistics.explained_variance(groups, y[included]))
+
+    @cached_property
+    def sobol(self) -> dict[str, dict[str, SobolIndex]]:
+        """Returns the Sobol indices by metric and axis; empty without a complete Saltelli design of several axes.
+
+        A metric is left out if it is constant, or if a survey of the design is not complete or has no value of it.
+        """
+        axes = axis_names(self.study)
+        usable = self.study.sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1
+        if not usable or len(np.unique(self.numbers("sample"))) != (self.study.sampling.samples or 0) * (len(axes) + 2):
+            return {}
+        means = {metric: self._mean_of_samples(metric) for metric in self.metrics}
+        return {
+            metric: dict(zip(axes, statistics.sobol_indices(y, len(axes)), strict=True))
+            for metric, y in means.items()
+            if np.isfinite(y).all() and np.ptp(y) > 0
+        }
+
+    def _mean_of_samples(self, metric: str) -> Array:
+        """Returns the mean of a metric over the surveys of each sample, by sample number.
+
+        It is NaN unless all surveys of the sample are complete and have a value.
+        """
+        values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
+        sample = self.numbers("sample").astype(np.int64)
+        return np.bincount(sample, values) / np.bincount(sample)
+
+    @cached_property
+    def answers(self) -> dict[str, list[Answer]]:
+        """Returns, for each varied key, the verdicts on whether the pass probability reaches the required value.
+
+        A key with a continuous distribution has one answer per range. A key with listed values has one answer per
+        value, or per range if it has more than 12 different numbers. The other keys vary as the study specifies. The
+        result is empty without a required pass probability, or if no survey was evaluated. The `unmodelled` surveys
+        count as unknown.
+        """
+        if self.required_probability is None or not self.evaluated.any():
+            return {}
+        return {key: self._answers(key, self.required_probability) for key in self.keys}
+
+    def _answers(self, key: str, required: float) -> list[Answer]:
+        chosen = self.counted
+        record = PassRecord(self.passed[chosen], self.clusters[chosen], required, unknown=self.unmodelled[chosen])
+        x, distribution = self.key_numbers(key), self.study.vary.get(key)
+        if x is None:
+            return answers_of_values(self._texts(f"vary.{key}")[chosen].astype(str), record)
+        is_listed = distribution is None or distribution.kind in ("choice", "grid")
+        if len(np.unique(x[chosen])) == 1 or (is_listed and len(np.unique(x[chosen])) <= _MAX_LISTED):
+            return answers_of_values(x[chosen], record)
+        return answers_of_ranges(x[chosen], record)
+
+    @cached_property
+    def refused_samples(self) -> list[RefusedSample]:
+        """Returns the samples with refused surveys, in ascending order of their numbers."""
+        listed: dict[int, RefusedSample] = {}
+        sample = self.numbers("sample")
+        for k in np.flatnonzero(self.refused):
+            number = int(sample[k])
+            values = {key: self.rows[f"vary.{key}"][int(k)].as_py() for key in self.keys}
+            earlier = listed.get(number, RefusedSample(number, 0, values, self.reason[k]))
+            listed[number] = earlier._replace(surveys=earlier.surveys + 1)
+        return [listed[number] for number in sorted(listed)]
+
+    @cached_property
+    def refusal_reasons(self) -> list[FailureReason]:
+        """Returns the reasons why surveys were refused, at most 12, the most frequent first.
+
+        Reasons that differ only in numbers count as one, with the text of the first.
+        """
+        counts = count_similar(self.reason[self.refused])
+        return [FailureReason("refused", reason, count) for reason, count in counts.items()][:_MAX_REASONS]
+
+    @cached_property
+    def key_comparisons(self) -> list[KeyComparison]:
+        """Returns, for each numeric key, a comparison of the evaluated surveys that passed with those that did not.
+
+        The greatest difference comes first. Empty if all of these surveys passed or none did.
+        """
+        comparisons = []
+        for key in self.keys:
+            x = self.key_numbers(key)
+            if x is not None:
+                good, bad = x[self.evaluated & self.passed], x[self.evaluated & ~self.passed]
+                if len(good) and len(bad):
+                    superiority = statistics.probability_of_superiority(bad, good)
+                    comparisons.append(KeyComparison(key, float(np.median(good)), float(np.median(bad)), superiority))
+        return sorted(comparisons, key=lambda c: -abs(c.superiority - 0.5))
+
+    @cached_property
+    def failure_reasons(self) -> list[FailureReason]:
+        """Returns the reasons why surveys did not pass, with numbers masked: at most 12, the most frequent first."""
+        counts: dict[tuple[str, str], int] = {}
+        for k in np.flatnonzero(~self.passed & ~self.refused & ~self.duplicate):
+            reason = mask_numbers(self.reason[k]) or "requirement not met: " + " and ".join(self._missed_limits(int(k)))
+            counts[self.status[k], reason] = counts.get((self.status[k], reason), 0) + 1
+        reasons = [FailureReason(*key, count) for key, count in counts.items()]
+        return sorted(reasons, key=lambda r: (-r.surveys, r.reason))[:_MAX_REASONS]
+
+    @cached_property
+    def warning_counts(self) -> dict[str, int]:
+        """Returns the number of surveys with each warning, the most frequent first; see `count_similar`."""
+        return count_similar(self.warning[(self.warning != "") & ~self.duplicate])
+
+    def _missed_limits(self, row: int) -> list[str]:
+        return [name for name in self.limits if self.numbers(f"require.{name}.passed")[row] != 1]
+
+
+def mask_numbers(reason: str) -> str:
+    """Returns a reason with its numbers replaced by "…", so that reasons that differ only in numbers become equal.
+
+    Digits within a word, e.g. in "LE90", are kept.
+    """
+    return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", reason)
+
+
+def count_similar(texts: Iterable[str]) -> dict[str, int]:
+    """Returns {text: count}, the most frequent first; texts that differ only in numbers count as the first of them."""
+    first: dict[str, str] = {}
+    counts: dict[str, int] = {}
+    for text in texts:
+        shown = first.setdefault(mask_numbers(text), text)
+        counts[shown] = counts.get(shown, 0) + 1
+    return dict(sorted(counts.items(), key=lambda item: -item[1]))
+
+
+def _strength(sensitivity: Sensitivity) -> float:
+    strengths = [abs(sensitivity.correlation.value), sensitivity.explained**0.5]
+    return max([strength for strength in strengths if np.isfinite(strength)], default=0.0)
+
+
+def _range_text(values: Array) -> str:
+    low, high = float(values.min()), float(values.max())
+    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"

@@ -1,0 +1,151 @@
+"""Engine that runs tasks on a Dask cluster, which is either already running or started as SLURM jobs."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from typing import Any
+
+import dask.config
+from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
+
+from twin.errors import TwinError
+from twin.studies.engine import Outcome, Result, Task
+from twin.studies.worker import Reply, TaskLimits, WorkerPool, describe_exception
+
+_CONNECT_TIMEOUT_S = 20
+_QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
+_MIN_QUEUED = 64
+_REFRESH_S = 2.0
+_MAX_LOST_WORKERS = 3  # in SLURM jobs, a task fails if more Dask workers than this are lost while they run it
+
+
+@contextmanager
+def connect_scheduler(address: str) -> Iterator[DaskEngine]:
+    """Yields an engine that runs tasks on the workers of a running Dask scheduler.
+
+    Raises:
+        TwinError: the scheduler does not respond.
+    """
+    try:
+        client = Client(address, timeout=_CONNECT_TIMEOUT_S)
+    except (OSError, ValueError) as error:
+        allowed = "the address of a running scheduler, e.g. tcp://host:8786"
+        raise TwinError("--scheduler", f"{address} does not respond: {error}", allowed) from None
+    with client:
+        yield DaskEngine(client)
+
+
+@contextmanager
+def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
+    """Yields an engine that runs tasks on a new Dask cluster of `jobs` SLURM jobs.
+
+    Raises:
+        TwinError: dask-jobqueue is not installed.
+    """
+    with dask.config.set({"distributed.scheduler.allowed-failures": _MAX_LOST_WORKERS}):
+        with _slurm_cluster(jobs) as cluster, Client(cluster) as client:
+            yield DaskEngine(client)
+
+
+def _slurm_cluster(jobs: int) -> Any:
+    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration.
+
+    Where they give no cores or no memory, a job has one core or 4 GB.
+
+    Args:
+        jobs: number of SLURM jobs.
+
+    Raises:
+        TwinError: dask-jobqueue is not installed.
+    """
+    try:
+        from dask_jobqueue.slurm import SLURMCluster
+    except ImportError:
+        needed = "pip install 'seabed-twin[cluster]'"
+        raise TwinError("--scheduler", "slurm needs dask-jobqueue, which is not installed", needed) from None
+    given = dask.config.get("jobqueue.slurm")
+    cluster = SLURMCluster(cores=given.get("cores") or 1, processes=1, memory=given.get("memory") or "4GB")
+    cluster.scale(jobs=jobs)
+    return cluster
+
+
+class DaskEngine:
+    """Engine that runs tasks on a Dask cluster; each Dask worker runs them in a pool of processes, one per thread."""
+
+    def __init__(self, client: Client):
+        self.client = client
+        client.register_plugin(_WorkerPoolPlugin())
+
+    def run_many(
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
+    ) -> Iterator[Outcome[Task, Result]]:
+        """Runs `function` on every task; see `Engine.run_many`. The tasks of a lost Dask worker are resubmitted.
+
+        Raises:
+            TwinError: the connection to the scheduler was lost.
+        """
+        waiting, running, queue_size = iter(tasks), {}, _QueueSize(self.client)
+        arriving = as_completed(with_results=True, raise_errors=False)
+
+        def submit(count: int) -> None:
+            for task in islice(waiting, count):
+                future = self.client.submit(_run_task, function, task, limits, pure=False)
+                running[future.key] = task
+                arriving.add(future)
+
+        submit(queue_size())
+        for future, result in arriving:
+            yield _outcome(running.pop(future.key), future, result)
+            future.release()
+            submit(max(0, queue_size() - len(running)))
+
+
+class _WorkerPoolPlugin(WorkerPlugin):
+    """Dask plugin that holds the worker pool of one Dask worker."""
+
+    name = "twin-worker-pool"
+
+    def setup(self, worker: Any = None) -> None:
+        self.pool = WorkerPool()
+
+    def teardown(self, worker: Any = None) -> None:
+        self.pool.close()
+
+
+def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
+    """Runs a task in the worker pool of this Dask worker; see `WorkerPool.run`."""
+    plugin: Any = get_worker().plugins[_WorkerPoolPlugin.name]
+    return plugin.pool.run(function, task, limits)
+
+
+class _QueueSize:
+    """Callable that returns the number of tasks to keep submitted.
+
+    It caches this number for `_REFRESH_S` seconds, because a network call is needed to get the size of the cluster.
+    """
+
+    def __init__(self, client: Client):
+        self.client, self.tasks, self.updated_s = client, 0, -math.inf
+
+    def __call__(self) -> int:
+        if time.monotonic() - self.updated_s > _REFRESH_S:
+            threads: Any = self.client.nthreads()
+            self.tasks = max(_MIN_QUEUED, _QUEUED_PER_THREAD * sum(threads.values()))
+            self.updated_s = time.monotonic()
+        return self.tasks
+
+
+def _outcome(task: Any, future: Future, result: Any) -> Outcome:
+    if future.status == "finished":
+        reply, attempts = result
+        return Outcome(task, reply.value, reply.reason, attempts)
+    if future.status != "error":
+        raise TwinError("--scheduler", "the connection was lost", "a running scheduler; continue with --resume")
+    error: Any = result[1] if isinstance(result, tuple) else future.exception()
+    if isinstance(error, KilledWorker):
+        return Outcome(task, None, "the Dask workers that ran the task were lost", error.allowed_failures + 1)
+    return Outcome(task, None, describe_exception(error), 1)

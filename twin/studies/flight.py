@@ -1,0 +1,129 @@
+"""Flies one survey of a study, keeps the requested output files, and returns its row of results."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from twin.errors import ScenarioError, TwinError, UnmodelledError
+from twin.studies.design import Sample
+from twin.studies.surveys import Survey
+
+Row = dict[str, Any]
+#: Files of a run folder that are kept, by the value of the study's `keep`; "all" keeps every file, "none" no file.
+KEPT_FILES = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
+#: Argument `outputs` of `survey.run` for each value of the study's `keep`: files that would be deleted are not written.
+OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
+
+
+def fly(survey: Survey) -> Row:
+    """Flies a survey, writes the files of its run folder that are kept, and returns its row of results.
+
+    The row has the status "refused" if a ScenarioError was raised, and "failed" if another TwinError or an OSError was
+    raised; if only the surrogate refuses the scenario, `unmodelled` is true. The survey writes to a hidden folder that
+    is renamed at the end, so a folder with the final name is complete.
+    """
+    import cv2
+
+    from twin import survey as single_survey
+
+    cv2.setNumThreads(1)
+    start = time.perf_counter()
+    for leftover in survey.folder.parent.glob(f".{survey.folder.name}.*"):
+        shutil.rmtree(leftover, ignore_errors=True)  # files of an attempt that was killed
+    scratch = survey.folder.with_name(f".{survey.folder.name}.{uuid4().hex[:8]}")
+    try:
+        metrics = single_survey.run(survey.scenario, scratch, outputs=OUTPUTS[survey.keep]).metrics
+        _move_kept_files(scratch, survey)
+    except ScenarioError as error:
+        unmodelled = {"unmodelled": True} if isinstance(error, UnmodelledError) else {}
+        return row_of(survey, "refused", "; ".join(error.lines)) | unmodelled
+    except (TwinError, OSError) as error:
+        return row_of(survey, "failed", str(error))
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+    row = row_of(survey, _status(metrics), metrics["reason"]) | {"warning": metrics["warning"]} | flatten(metrics)
+    return row | {"timing.survey_s": time.perf_counter() - start, "timing.host": platform.node()}
+
+
+def _move_kept_files(scratch: Path, survey: Survey) -> None:
+    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name.
+
+    A folder that already has this name is deleted first. If no file is kept, `scratch` stays; the caller deletes it.
+    """
+    shutil.rmtree(survey.folder, ignore_errors=True)
+    if survey.keep == "none":
+        return
+    if survey.keep != "all":
+        for entry in scratch.iterdir():
+            if entry.name not in KEPT_FILES[survey.keep]:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    scratch.replace(survey.folder)
+
+
+def _status(metrics: Mapping[str, Any]) -> str:
+    """Returns the status of the run, or "failed" if an I/O error or a signal ended it or one of its stages."""
+    reason = metrics["reason"]
+    computer_failure = reason.startswith(("[Errno", "interrupted")) or reason.endswith(" skipped")
+    return "failed" if computer_failure else metrics["status"]
+
+
+def row_of(survey: Survey, status: str, reason: str) -> Row:
+    """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason, values of the varied keys.
+
+    Args:
+        survey: the survey.
+        status: "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
+            "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
+            computer failed.
+        reason: why the status is not "complete"; else "".
+    """
+    identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}
+    identity["fidelity"] = survey.scenario.imaging.fidelity
+    return identity | {"status": status, "reason": reason} | _varied(survey.values)
+
+
+def refused_row(sample: Sample, seed: int, reason: str) -> Row:
+    """Returns the row of a survey whose scenario is not valid; its scenario hash is empty."""
+    identity = {"sample": sample.number, "seed": seed, "scenario_hash": "", "status": "refused", "reason": reason}
+    return identity | _varied(sample.values)
+
+
+def _varied(values: Mapping[str, Any]) -> Row:
+    return {f"vary.{key}": value for key, value in values.items()}
+
+
+def has_passed(row: Row) -> bool:
+    """Returns whether the survey has the status "complete" and met every requirement."""
+    verdicts = (value for name, value in row.items() if name.startswith("require.") and name.endswith(".passed"))
+    return row["status"] == "complete" and all(verdicts)
+
+
+def flatten(metrics: Mapping[str, Any]) -> Row:
+    """Returns the values in the sections of metrics.json, keyed by dotted name, e.g. "map.le90_m".
+
+    Names of measured run times begin with "timing.". Top-level values, such as the status, are left out.
+    """
+    row: Row = {}
+    for section, value in metrics.items():
+        if section == "tracks":
+            for track in value:
+                for name, entry in track.items():
+                    prefix = "timing." if name == "ga_ms" else ""
+                    row[f"{prefix}tracks.{track['track']}.{name}"] = entry
+        elif isinstance(value, Mapping):
+            row.update(_leaves(value, section + "."))
+    return row
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value

@@ -1,0 +1,179 @@
+"""Check of a surrogate study: the surveys with the least certain verdicts are repeated with rendered images.
+
+These are the surveys whose metrics lie closest to the limits.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.judge.require import more_is_better
+from twin.studies import wording
+from twin.studies.analysis import StudyAnalysis
+from twin.studies.design import samples
+from twin.studies.engine import Engine
+from twin.studies.flight import Row, has_passed
+from twin.studies.progress import StudyProgress
+from twin.studies.runner import check_results, fly_surveys, open_folder
+from twin.studies.statistics import Array, Interval, wilson_interval
+from twin.studies.study_file import Study
+from twin.studies.surveys import Survey, surveys
+
+FOLDER = "rendered"  #: subfolder of the results folder
+
+
+class RenderedCheck(NamedTuple):
+    """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds.
+
+    Args:
+        rendered: (n,) whether each rendered survey was completed and met every requirement.
+        surrogate: (n,) whether each of the surrogate surveys was completed and met every requirement.
+        rows: result of each rendered survey.
+        interrupted: whether Ctrl-C ended the check, so that some of the rendered surveys are missing.
+        has_limits: whether the study has a limit, so that there are verdicts to check.
+        n_lost: number of rendered surveys that were refused or failed, and therefore have no verdict.
+    """
+
+    rendered: NDArray[np.bool_]
+    surrogate: NDArray[np.bool_]
+    rows: list[Row]
+    interrupted: bool = False
+    has_limits: bool = True
+    n_lost: int = 0
+
+    @property
+    def exit_status(self) -> int:
+        """Returns 130 if the check was interrupted; 0 if `agrees` is true or the study has no limit; otherwise 1."""
+        return 130 if self.interrupted else int(self.has_limits and not self.agrees)
+
+    @property
+    def pass_probability(self) -> Interval:
+        """Returns the fraction of the rendered surveys that passed, with its confidence interval (Wilson)."""
+        return wilson_interval(float(self.rendered.sum()), len(self.rendered))
+
+    @property
+    def agrees(self) -> bool:
+        """Returns whether the fraction of the surrogate surveys that passed lies in the interval of `pass_probability`.
+
+        False without a rendered survey.
+        """
+        interval = self.pass_probability
+        return len(self.rendered) > 0 and interval.low <= float(self.surrogate.mean()) <= interval.high
+
+    def sentence(self) -> str:
+        """Returns the result in one sentence, and another one if the check is incomplete."""
+        partial = " The check was interrupted and is incomplete; --resume continues it." if self.interrupted else ""
+        return self._result() + partial
+
+    def _result(self) -> str:
+        """Returns, in one sentence, the result of the rendered surveys flown so far."""
+        n = len(self.rendered)
+        if not self.has_limits:
+            return "No survey was flown rendered: the study has no limit in [require], so there is no verdict to check."
+        if n == 0 and self.interrupted:
+            return "No survey was flown rendered."
+        if n == 0 and self.n_lost:
+            return f"There is no verdict to check: {self.n_lost} rendered surveys were refused or failed."
+        if n == 0:
+            return "No survey was flown rendered: none of the surrogate surveys has a value of every required metric."
+        same = int((self.rendered == self.surrogate).sum())
+        passed, verdict = wording.percent_interval(self.pass_probability), "agrees" if self.agrees else "does not agree"
+        return (
+            f"Of the {n} surveys closest to the limits, {int(self.rendered.sum())} pass when rendered ({passed}) and "
+            f"{int(self.surrogate.sum())} with the surrogate, which {verdict}; {same} have the same verdict."
+        )
+
+
+def check(
+    study: Study, analysis: StudyAnalysis, n: int, folder: Path, engine: Engine, progress: StudyProgress
+) -> RenderedCheck:
+    """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
+
+    Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
+
+    Args:
+        study: the study.
+        analysis: results of the study.
+        n: largest number of surveys to compare.
+        folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
+
+    Raises:
+        TwinError: the subfolder cannot be written, or contains the results of another study; or the engine lost its
+            connection.
+        OSError: the results cannot be written.
+    """
+    nearest = nearest_surveys(analysis, n)
+    keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
+    others = {sample.number for sample in samples(study)} - {number for number, _ in keys}  # some may be refused
+    found = (survey for survey in surveys(study, folder, without=others) if survey.key in keys)
+    chosen = {survey.key: _rendered(survey, folder / FOLDER) for survey in found}
+    with open_folder(folder / FOLDER, True) as log:
+        check_results(log, ((key, survey.scenario_hash) for key, survey in chosen.items()))
+        done = log.done()
+        progress.begin(progress.done + len(set(keys) - done))
+        completed = fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
+        log.flush()
+    rows = {(row["sample"], row["seed"]): row for row in log.rows()}
+    flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
+    results, n_lost = [rows[keys[k]] for k in flown], sum(key in rows for key in keys) - len(flown)
+    passed = np.array([has_passed(row) for row in results], bool)
+    surrogate = analysis.passed[nearest[np.array(flown, np.int64)]]
+    return RenderedCheck(passed, surrogate, results, not completed, bool(analysis.limits), n_lost)
+
+
+def summary(checked: RenderedCheck) -> dict[str, Any]:
+    """Returns the check as JSON values."""
+    return {
+        "surveys": len(checked.rendered),
+        "rendered_passed": int(checked.rendered.sum()),
+        "surrogate_passed": int(checked.surrogate.sum()),
+        "same_verdict": int((checked.rendered == checked.surrogate).sum()),
+        "agrees": checked.agrees,
+        "interrupted": checked.interrupted,
+    }
+
+
+def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
+    """Returns the row numbers of the n surrogate surveys whose metrics are closest to the limits, the closest first.
+
+    The distance of a metric from its limit is the number of surveys whose value lies between the two, so that metrics
+    of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
+    or else closest to it. Surveys without a finite value of every required metric are left out.
+
+    Args:
+        analysis: results of the study.
+        n: largest number of surveys.
+    """
+    is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
+    chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
+    values = {name: analysis.numbers(name)[chosen] for name in analysis.limits}
+    if not values:
+        return np.zeros(0, np.int64)
+    excess = [_excess(values[name], limit) * (1 - 2 * more_is_better(name)) for name, limit in analysis.limits.items()]
+    finite = np.isfinite(list(values.values())).all(axis=0)
+    distance = np.abs(np.max(excess, axis=0))[finite]
+    return chosen[finite][np.argsort(distance, kind="stable")][:n]
+
+
+def _excess(values: Array, limit: float) -> Array:
+    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit.
+
+    Of the values that are equal to the value itself, half are counted.
+    """
+    ascending = np.sort(values)
+    rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
+    return rank - np.searchsorted(ascending, limit, "right")
+
+
+def _rendered(survey: Survey, folder: Path) -> Survey:
+    """Returns the rendered survey with the scenario and seed of a surrogate survey, and a run folder in `folder`."""
+    imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
+    scenario = survey.scenario.model_copy(update={"imaging": imaging})
+    run_folder = folder / "runs" / survey.folder.name
+    return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint(), folder=run_folder)

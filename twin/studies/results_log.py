@@ -1,0 +1,159 @@
+"""Results of a study on disk: one JSON line per survey while it runs, and one Parquet table at the end."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections.abc import Container, Iterable, Iterator
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from typing import IO, Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from twin.studies.flight import Row
+
+JOURNAL_FILE = "optuna.journal"  #: in the folder of a search, beside the log: its candidates
+_CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionaries would take gigabytes
+
+
+class ResultsLog:
+    """Log of the results in the file rows.jsonl: one row per line; a survey's last row supersedes its earlier rows.
+
+    Rows that cannot be written, e.g. because the disk is full, stay in memory and are written with the next row.
+    """
+
+    def __init__(self, folder: Path):
+        self.file = folder / "rows.jsonl"
+        self._unwritten: list[str] = []
+
+    def add(self, row: Row) -> None:
+        """Writes a row, together with earlier rows that could not be written; ignores a failure of the write."""
+        self._unwritten.append(json.dumps(row) + "\n")
+        with suppress(OSError):
+            self.flush()
+
+    def flush(self) -> None:
+        """Writes the rows that are still in memory.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        if not self._unwritten:
+            return
+        with self.file.open("a+b", buffering=0) as file:
+            begin = file.seek(0, 2)
+            lines = _line_end(file, begin) + "".join(self._unwritten).encode()
+            if (file.write(lines) or 0) < len(lines):
+                file.truncate(begin)  # remove the partly written row
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
+        self._unwritten.clear()
+
+    def rows(self) -> Iterator[Row]:
+        """Yields all rows of the file in the order in which they were written; skips partly written rows."""
+        if not self.file.exists():
+            return
+        with self.file.open("rb") as file:
+            for line in file:
+                try:
+                    row = json.loads(line)
+                except ValueError:
+                    continue
+                if isinstance(row, dict) and "sample" in row:
+                    yield row
+
+    def done(self) -> set[tuple[int, int]]:
+        """Returns (sample, seed) of every survey whose last row does not have the status "failed"."""
+        status = {(row["sample"], row["seed"]): row["status"] for row in self.rows()}
+        return {key for key, last in status.items() if last != "failed"}
+
+    def table(self, wanted: Container[tuple[int, int]] | None = None) -> pa.Table:
+        """Returns the last row of each survey as a table, sorted by sample and seed.
+
+        The table does not depend on the order in which the rows were written.
+
+        Args:
+            wanted: (sample, seed) of the surveys to include; None for all.
+        """
+        last = {(row["sample"], row["seed"]): number for number, row in enumerate(self.rows())}
+        included = {number for key, number in last.items() if wanted is None or key in wanted}
+
+        def included_rows() -> Iterator[Row]:
+            return (row for number, row in enumerate(self.rows()) if number in included)
+
+        types: dict[str, pa.DataType] = {}
+        for row in included_rows():
+            for name, value in row.items():
+                types[name] = _common_type(types.get(name, pa.null()), _type(value))
+        rows, chunks = included_rows(), []
+        while chunk := list(islice(rows, _CHUNK)):
+            chunks.append(pa.table({name: _column([row.get(name) for row in chunk], types[name]) for name in types}))
+        if not chunks:
+            return pa.table({})
+        whole = pa.concat_tables(chunks).sort_by([("sample", "ascending"), ("seed", "ascending")])
+        return whole.select(_sorted_columns(whole.column_names)).combine_chunks()
+
+
+def _line_end(file: IO[bytes], end: int) -> bytes:
+    """Returns a line break if the file does not end with one, e.g. after a power failure; else an empty string."""
+    if end == 0:
+        return b""
+    file.seek(end - 1)
+    return b"" if file.read(1) == b"\n" else b"\n"
+
+
+def write_parquet(rows: pa.Table, file: Path) -> None:
+    """Writes a table to a Parquet file atomically.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    part = file.with_name(f".{file.name}.part")
+    pq.write_table(rows, part)
+    part.replace(file)
+
+
+def _sorted_columns(names: Iterable[str]) -> list[str]:
+    """Returns the names of the columns in four sections: identity, varied keys, metrics, timing.
+
+    The identity has a fixed order; the names of each other section are sorted alphabetically.
+    """
+    identity = ("sample", "seed", "status", "reason", "unmodelled", "warning", "fidelity", "scenario_hash")
+    sections = {"vary": 1, "timing": 3}
+
+    def sort_key(name: str) -> tuple[int, int, str]:
+        if name in identity:
+            return 0, identity.index(name), name
+        return sections.get(name.partition(".")[0], 2), 0, name
+
+    return sorted(names, key=sort_key)
+
+
+def _type(value: Any) -> pa.DataType:
+    """Returns the column type of a value; lists and dictionaries are stored as JSON text."""
+    if value is None:
+        return pa.null()
+    for kind, column in ((bool, pa.bool_()), (int, pa.int64()), (float, pa.float64())):
+        if isinstance(value, kind):
+            return column
+    return pa.string()
+
+
+def _common_type(one: pa.DataType, other: pa.DataType) -> pa.DataType:
+    """Returns a column type that can store the values of both types."""
+    if one == other or pa.types.is_null(other):
+        return one
+    if pa.types.is_null(one):
+        return other
+    return pa.float64() if {one, other} == {pa.int64(), pa.float64()} else pa.string()
+
+
+def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
+    if kind == pa.string():
+        values = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+    elif kind == pa.float64():
+        values = [None if value is None else float(value) for value in values]
+    return pa.array(values, kind)

@@ -1,0 +1,251 @@
+"""Runs a study: flies the surveys on many workers, logs one row per survey, and writes the table and the report."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
+from twin.errors import TwinError
+from twin.studies.agreement_report import write_document
+from twin.studies.analysis import StudyAnalysis
+from twin.studies.design import samples, seeds_of_sample
+from twin.studies.engine import Engine, Outcome
+from twin.studies.flight import Row, fly, refused_row, row_of
+from twin.studies.progress import StudyProgress
+from twin.studies.report import write_report
+from twin.studies.results_log import JOURNAL_FILE, ResultsLog, write_parquet
+from twin.studies.study_file import Study
+from twin.studies.surveys import Survey, refusals, survey_keys, surveys
+from twin.studies.worker import TaskLimits
+
+
+class Throughput(NamedTuple):
+    """Number of surveys flown, elapsed wall time [s], and sum of the run times of these surveys on the workers [s]."""
+
+    surveys: int
+    wall_s: float
+    worker_s: float
+
+
+class StudyResult(NamedTuple):
+    """Outcome of `run_study`.
+
+    Args:
+        analysis: statistics of the surveys.
+        page: file of the report.
+        write_errors: messages of the errors that occurred while the results were written.
+        interrupted: whether Ctrl-C ended the study.
+        throughput: number of surveys flown by this call, and their run times.
+    """
+
+    analysis: StudyAnalysis
+    page: Path
+    write_errors: list[str]
+    interrupted: bool
+    throughput: Throughput
+
+
+def run_study(
+    study: Study,
+    folder: Path,
+    resume: bool,
+    engine: Engine,
+    progress: StudyProgress,
+    function: Callable[[Survey], Row] = fly,
+) -> StudyResult:
+    """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
+
+    For a study that compares rendered and surrogate surveys, agreement.md and its figure are written too. Ctrl-C ends
+    the study early; the results obtained until then are written.
+
+    Args:
+        study: the study.
+        folder: results folder, new or empty unless `resume` is set.
+        resume: continue the study whose results are in the folder.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
+        function: flies one survey; must be importable by name on the workers.
+
+    Raises:
+        TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written,
+            or belongs to another study; or the engine lost its connection.
+        ScenarioError: no sample has a valid scenario; nothing was flown.
+    """
+    refused = refusals(study)
+    with open_folder(folder, resume) as log:
+        return _run_study(study, folder, refused, log, engine, progress, function)
+
+
+def _run_study(
+    study: Study,
+    folder: Path,
+    refused: dict[int, str],
+    log: ResultsLog,
+    engine: Engine,
+    progress: StudyProgress,
+    function: Callable[[Survey], Row],
+) -> StudyResult:
+    """Runs a study as `run_study` does, with the log of its folder and the errors of its invalid samples."""
+    check_results(log, _identities(study, folder, refused))
+    done, planned = log.done(), set(survey_keys(study))
+    if done and done.isdisjoint(planned):
+        raise _another_study(log)
+    for row in _refused_rows(study, refused):
+        if (row["sample"], row["seed"]) not in done:
+            log.add(row)
+    done = log.done() if refused else done
+    if refused:
+        progress.print_line(refusal_notice(refused))
+    progress.begin(len(planned - done))
+    missing = (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
+    run_times_s: list[float] = []
+
+    def add_row(row: Row) -> None:
+        run_times_s.append(row.get("timing.survey_s") or 0.0)
+        log.add(row)
+
+    start = time.perf_counter()
+    interrupted = not fly_surveys(study, missing, add_row, engine, progress, function)
+    throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
+
+    analysis = StudyAnalysis(log.table(planned), study, len(planned))
+    page = folder / "study.html"
+    write_errors = _write_errors(
+        log.flush,
+        lambda: write_parquet(analysis.rows, folder / "results.parquet"),
+        lambda: write_report(study, analysis, page),
+        lambda: write_document(analysis, folder),
+    )
+    return StudyResult(analysis, page, write_errors, interrupted, throughput)
+
+
+def _identities(study: Study, folder: Path, refused: dict[int, str]) -> Iterator[tuple[tuple[int, int], str]]:
+    """Yields ((sample, seed), scenario hash) of every survey; the hash is empty for the surveys of a refused sample."""
+    yield from ((survey.key, survey.scenario_hash) for survey in surveys(study, folder, without=refused))
+    yield from (((row["sample"], row["seed"]), "") for row in _refused_rows(study, refused))
+
+
+def _refused_rows(study: Study, refused: dict[int, str]) -> Iterator[Row]:
+    for sample in samples(study) if refused else ():
+        if sample.number in refused:
+            yield from (refused_row(sample, seed, refused[sample.number]) for seed in seeds_of_sample(study, sample))
+
+
+def refusal_notice(refused: dict[int, str]) -> str:
+    """Returns a line with the number of refused samples, and the number and reason of the first one.
+
+    Args:
+        refused: reason of each refused sample, by sample number.
+    """
+    number, reason = min(refused.items())
+    if len(refused) == 1:
+        return f"1 sample cannot be flown and is left out: sample {number}: {reason}"
+    return f"{len(refused)} samples cannot be flown and are left out, e.g. sample {number}: {reason}"
+
+
+@contextmanager
+def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[ResultsLog]:
+    """Locks a new folder or, with `resume`, that of an earlier run, and yields its results log.
+
+    Creates the folder if it does not exist, and deletes unfinished run folders.
+
+    Args:
+        folder: results folder.
+        resume: whether the folder may contain results.
+        search: whether the results are those of a search, not of a study.
+
+    Raises:
+        TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written, or
+            has other contents than results of this kind.
+    """
+    with sole_writer(folder, used=resume, allowed=f"{NEW_FOLDER}, or --resume"):
+        log = ResultsLog(folder)
+        names = {path.name for path in folder.iterdir()} - {LOCK_FILE}
+        if names and not _is_results_folder(names, log, search):
+            kind = "search" if search else "study"
+            raise TwinError("--resume", f"{folder} is not the folder of a {kind}", f"the folder of this {kind}")
+        try:
+            log.file.touch()
+            (folder / "runs").mkdir(exist_ok=True)
+        except OSError as error:
+            raise TwinError("--out", f"{folder} cannot be written: {error}", "a writable folder") from None
+        for leftover in (folder / "runs").glob(".*"):
+            shutil.rmtree(leftover, ignore_errors=True)
+        yield log
+
+
+def _is_results_folder(names: set[str], log: ResultsLog, search: bool) -> bool:
+    """Returns whether these are the files of a search, which has its journal before its first row, or of a study."""
+    has_journal = JOURNAL_FILE in names
+    return log.file.name in names and (has_journal == search or (search and not any(log.rows())))
+
+
+def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]]) -> None:
+    """Raises TwinError if the log has a row of another scenario.
+
+    Args:
+        log: results log.
+        planned: ((sample, seed), scenario hash) of each survey of the study.
+    """
+    hashes = {(row["sample"], row["seed"]): row["scenario_hash"] for row in log.rows()}
+    for key, scenario_hash in planned if hashes else ():
+        if hashes.get(key, scenario_hash) != scenario_hash:
+            raise _another_study(log)
+
+
+def _another_study(log: ResultsLog) -> TwinError:
+    problem = f"{log.file.parent} contains the results of another study"
+    return TwinError("--resume", problem, "the folder of this study")
+
+
+def fly_surveys(
+    study: Study,
+    missing: Iterable[Survey],
+    add_row: Callable[[Row], None],
+    engine: Engine,
+    progress: StudyProgress,
+    function: Callable[[Survey], Row] = fly,
+) -> bool:
+    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True.
+
+    Args:
+        study: study with the timeout and the number of retries.
+        missing: surveys to fly.
+        add_row: called with the row of each survey that has ended.
+        engine: runs the surveys in parallel.
+        progress: display of the progress.
+        function: flies one survey; must be importable by name on the workers.
+
+    Raises:
+        TwinError: the engine lost its connection.
+    """
+    try:
+        for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
+            row = row_of_outcome(outcome)
+            add_row(row)
+            progress.add(row)
+    except KeyboardInterrupt:
+        return False
+    return True
+
+
+def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
+    """Returns the row of a survey from the outcome of its task, with status "failed" if the task failed."""
+    row = outcome.result or row_of(outcome.task, "failed", outcome.failure)
+    return row | {"timing.attempts": outcome.attempts}
+
+
+def _write_errors(*writes: Callable[[], object]) -> list[str]:
+    """Calls every function, also after one has raised an OSError, and returns the messages of these errors."""
+    errors = []
+    for write in writes:
+        try:
+            write()
+        except OSError as error:
+            errors.append(str(error))
+    return errors

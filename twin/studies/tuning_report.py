@@ -1,0 +1,252 @@
+"""Report of a search: tuning.html, pareto.png and recommended.toml."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.metadata import version
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from twin.core.user_files import read_text
+from twin.report.figures import log_axis, to_data_uri
+from twin.report.html import render_page
+from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.wording import percent, plain
+from twin.scenario.file import dump_toml
+from twin.studies import wording
+from twin.studies.candidates import Candidate, pareto_front, required_probability
+from twin.studies.figures import axis_label, make_panels, spans_decades, unit_axis
+from twin.studies.study_file import Study, TuningConfig
+from twin.studies.tuning import TuningResult
+from twin.studies.verification import Verification
+
+NOT_VERIFIED = (
+    "Not verified: the plan has no rendered surveys (verify = 0), and the surrogate's prediction may not hold."
+)
+_LARGE_RATIO = 1.5  # a median ratio rendered / surrogate above this value, or below its inverse, gives a warning
+FRONT, FEASIBLE, INFEASIBLE = COLOURS["final"], COLOURS["link"], COLOURS["f2f"]
+
+
+def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult, folder: Path) -> None:
+    """Writes tuning.html, pareto.png and, if a plan is recommended, recommended.toml to a folder."""
+    shown = [candidate for candidate in result.candidates if candidate.has_metrics]
+    with matplotlib.rc_context(FIGURE_STYLE):
+        trade_off = trade_off_figure(shown, result, config)
+        figures = {}
+        if shown:
+            keys = searched_keys_figure(shown, result, config)
+            figures = {"trade_off": to_data_uri(trade_off), "searched_keys": to_data_uri(keys)}
+        trade_off.savefig(folder / "pareto.png")
+    page = {
+        "study": study,
+        "config": config,
+        "result": result,
+        "front": pareto_front(result.candidates, config),
+        "wording": wording,
+        "headline": headline(study, config, result),
+        "warnings": warnings(result),
+        "figures": figures,
+        "recommended": recommended_toml(study, config, result),
+        "text": read_text(study.source.path),
+        "version": version("seabed-twin"),
+    }
+    (folder / "tuning.html").write_text(render_page("twin.studies", "tuning.html.j2", page), encoding="utf-8")
+    if page["recommended"]:
+        (folder / "recommended.toml").write_text(page["recommended"], encoding="utf-8")
+
+
+def headline(study: Study, config: TuningConfig, result: TuningResult) -> str:
+    """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
+    count = f"{len(result.candidates)} plans were evaluated"
+    if n_rendered := len(result.verifications):
+        count += f", {n_rendered} of them also in rendered surveys"
+    if (chosen := result.recommended) is None:
+        return f"No plan is recommended: {_missing_plan(study, result, count)}"
+    values = ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
+    passing = f"pass probability with new seeds {wording.confidence(chosen.pass_probability)}"
+    if (verification := result.recommended_verification) is None:
+        objectives = ", ".join(
+            f"{wording.metric_name(name)} {wording.metric_value(name, value)}"
+            for name, value in (*zip(config.objectives, chosen.objectives, strict=True), *chosen.completeness)
+            if name != "risk"
+        )
+        unverified = f" {NOT_VERIFIED}" if result.needs_rendering else ""
+        return f"Recommended plan: {values}. Medians: {objectives}; {passing}. {count}.{unverified}"
+    medians = ", ".join(
+        f"{wording.metric_name(name)} {_metric(name, rendered)} ({_metric(name, surrogate)})"
+        for name, (surrogate, rendered) in verification.medians.items()
+    )
+    return (
+        f"Recommended plan: {values}. {verification.n_passed} of {verification.surveys} rendered surveys were "
+        f"completed and met every requirement ({wording.confidence(verification.rendered.pass_probability)}). Medians "
+        f"rendered (surrogate): {medians}; by the surrogate, {passing}. {count}."
+    )
+
+
+def _metric(name: str, value: float | None) -> str:
+    return wording.metric_value(name, value)
+
+
+def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
+    """Returns the reason why no plan is recommended, as text that follows a colon.
+
+    Args:
+        study: the study.
+        result: result of the search.
+        count: phrase with the number of evaluated plans.
+    """
+    if result.interrupted:
+        return f"{count}, and the search was interrupted before a plan was confirmed."
+    if result.verifications:
+        surveys = sum(v.surveys - v.n_failed for v in result.verifications)
+        passed = sum(v.n_passed for v in result.verifications)
+        n_failed = sum(v.n_failed for v in result.verifications)
+        failed = (
+            f"; {n_failed} more failed because of the computer or the program, --resume flies them" if n_failed else ""
+        )
+        return (
+            f"no plan of the search passed in rendered surveys. {count}; {passed} of {surveys} rendered surveys "
+            f"passed{failed}."
+        )
+    required = f"the required pass probability of {percent(required_probability(study))}"
+    return f"{count}, and none reached {required} when flown again with new seeds."
+
+
+def warnings(result: TuningResult) -> list[str]:
+    """Returns the warnings of a search.
+
+    They concern a plan that was not verified, large errors of the surrogate, refused plans, and the warnings of
+    surveys.
+    """
+    texts = []
+    if result.recommended and result.needs_rendering and result.recommended_verification is None:
+        texts.append(NOT_VERIFIED)
+    verified = [result.recommended_verification] if result.recommended_verification else result.verifications
+    for verification in verified:
+        for name, ratio in verification.ratio.ratios.items():
+            if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
+                surrogate, rendered = (_metric(name, value) for value in verification.medians[name])
+                texts.append(
+                    f"Plan {verification.surrogate.number}: the surrogate is wrong about the "
+                    f"{wording.metric_name(name)}: {surrogate} expected, {rendered} in rendered surveys."
+                )
+        texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
+    texts += [
+        f"{n} of {len(result.candidates)} plans could not be flown in the search: {reason}"
+        for reason, n in result.refused.items()
+    ]
+    return texts + [f"{text} (in {n} surveys of the finalists by the surrogate)" for text, n in result.warnings.items()]
+
+
+def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[str, Any]:
+    """Returns the summary that `--json` prints: candidates, the recommended plan, verifications and warnings."""
+    chosen, verification = result.recommended, result.recommended_verification
+    recommended = chosen and {
+        "values": chosen.values,
+        "objectives": dict(zip(config.objectives, chosen.objectives, strict=True)),
+        "probability": chosen.pass_probability._asdict(),
+        "verified": not result.needs_rendering or verification is not None,
+        "rendered": verification and _rendered(verification),
+    }
+    return {
+        "name": study.name,
+        "candidates": len(result.candidates),
+        "interrupted": result.interrupted,
+        "recommended": recommended,
+        "verifications": [_rendered(one) for one in result.verifications],
+        "warnings": warnings(result),
+        "headline": headline(study, config, result),
+    }
+
+
+def _rendered(verification: Verification) -> dict[str, Any]:
+    """Returns a verification as JSON values: verdict, numbers of rendered surveys, plan, and medians with ratios."""
+    medians = {
+        name: {"surrogate": surrogate, "rendered": rendered, "ratio": verification.ratio.ratios[name]}
+        for name, (surrogate, rendered) in verification.medians.items()
+    }
+    counts = {"surveys": verification.surveys, "n_passed": verification.n_passed, "n_failed": verification.n_failed}
+    plan = {"plan": verification.surrogate.number, "round": verification.search_round, "passed": verification.passed}
+    return plan | counts | {"values": verification.surrogate.values, "medians": medians}
+
+
+def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -> str:
+    """Returns the recommended plan as the text of a scenario file; "" if no plan is recommended.
+
+    Comments at the start contain the headline and the warnings. The scenario selects rendered images, even if the
+    search used the surrogate.
+    """
+    if result.scenario is None:
+        return ""
+    imaging = result.scenario.imaging.model_copy(update={"fidelity": "rendered"})
+    comments = [f"twin tune of {study.name}", headline(study, config, result)]
+    comments += [f"Warning: {text}" for text in warnings(result)]
+    scenario = result.scenario.model_copy(update={"imaging": imaging})
+    return "".join(f"# {' '.join(line.split())}\n" for line in comments) + dump_toml(scenario)
+
+
+def trade_off_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
+    """Returns a scatter plot of the candidates for each pair of objectives.
+
+    A single objective is plotted against the trial number.
+    """
+    pairs = list(combinations(range(len(config.objectives)), 2)) or [(None, 0)]
+    figure, panels = make_panels(len(pairs))
+    for (x_index, y_index), axes in zip(pairs, panels, strict=True):
+        for candidates, style in _groups(shown, result, config):
+            x = [c.number if x_index is None else c.objectives[x_index] for c in candidates]
+            axes.plot(x, [c.objectives[y_index] for c in candidates], **style)
+        for axis, set_scale, k in ((axes.xaxis, axes.set_xscale, x_index), (axes.yaxis, axes.set_yscale, y_index)):
+            if k is not None:
+                values = np.array([c.objectives[k] for c in shown])
+                if spans_decades(values):
+                    log_axis(axis, set_scale)
+                _format_axis(axis, config.objectives[k])
+        if x_index is None:
+            axes.set_xlabel("trial")
+    panels[0].legend(fontsize=8)
+    return figure
+
+
+def searched_keys_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
+    """Returns a scatter plot of each objective against each searched key."""
+    cells = [(k, key) for k in range(len(config.objectives)) for key in config.search]
+    figure, panels = make_panels(len(cells), columns=min(len(config.search), 4))
+    for (k, key), axes in zip(cells, panels, strict=True):
+        for candidates, style in _groups(shown, result, config):
+            axes.plot([c.values[key] for c in candidates], [c.objectives[k] for c in candidates], **style)
+        if config.search[key].kind == "log_uniform":
+            log_axis(axes.xaxis, axes.set_xscale)
+        axes.set_xlabel(key)
+        _format_axis(axes.yaxis, config.objectives[k])
+    return figure
+
+
+def _groups(
+    shown: list[Candidate], result: TuningResult, config: TuningConfig
+) -> Iterator[tuple[list[Candidate], dict[str, Any]]]:
+    """Yields each group of candidates with its plot style: infeasible, feasible, Pareto-optimal, recommended."""
+    front = pareto_front(result.candidates, config)
+    chosen = {result.recommended.number} if result.recommended else set()
+    dot: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4}
+    infeasible = dot | {"color": INFEASIBLE, "alpha": 0.5, "label": "pass probability too low"}
+    yield [c for c in shown if c.shortfall > 0], infeasible
+    feasible = dot | {"color": FEASIBLE, "label": "feasible"}
+    yield [c for c in shown if c.shortfall <= 0 and c not in front], feasible
+    yield front, dot | {"color": FRONT, "markersize": 5, "label": "Pareto-optimal"}
+    star = dot | {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": "recommended"}
+    yield [c for c in shown if c.number in chosen], star
+
+
+def _format_axis(axis: Any, objective: str) -> None:
+    """Labels an axis with an objective and formats its tick labels in the unit of the objective."""
+    unit_axis(axis, objective)
+    if axis.get_scale() == "linear":
+        axis.set_major_locator(MaxNLocator(4))  # few ticks, as their labels are long
+    axis.set_label_text(axis_label(objective))

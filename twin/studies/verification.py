@@ -1,0 +1,148 @@
+"""Verification of a plan: results of its rendered surveys compared with the surrogate, and their expected run time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from twin.studies.candidates import Candidate, CandidateSurveys, median_of
+from twin.studies.correction import PlanRatio, metric_ratio
+from twin.studies.flight import Row
+
+# Run time of a rendered frame on one CPU core of 2025: 0.023 s for 320 x 240 pixels, 0.07 s for 640 x 480 pixels.
+_FRAME_S = 0.008  # part that does not depend on the image size [s]
+_MEGAPIXEL_S = 0.2  # part per megapixel of one camera's image [s]
+
+
+class Verification(NamedTuple):
+    """Comparison of a plan's rendered surveys with its surrogate surveys.
+
+    Args:
+        surrogate: the plan, evaluated by surrogate surveys with new seeds.
+        rendered: the plan, evaluated by its rendered surveys.
+        surveys: number of rendered surveys required.
+        n_passed: number of rendered surveys that were completed and met every requirement.
+        n_failed: number of rendered surveys without a result, because the computer or the program failed.
+        medians: for each metric, the median (surrogate, rendered); None if no survey has a value.
+        ratio: ratio rendered / surrogate of each median, and the fraction of the rendered surveys that were completed.
+        search_round: round of the search, from 0.
+        warnings: for each warning, the number of rendered surveys that have it.
+    """
+
+    surrogate: Candidate
+    rendered: Candidate
+    surveys: int
+    n_passed: int
+    n_failed: int
+    medians: dict[str, tuple[float | None, float | None]]
+    ratio: PlanRatio
+    search_round: int
+    warnings: dict[str, int]
+
+    @property
+    def passed(self) -> bool:
+        """Returns whether all rendered surveys were completed and met every requirement."""
+        return self.n_passed == self.surveys
+
+    def notice(self) -> str:
+        """Returns the result in one line."""
+        failed = f", {self.n_failed} failed because of the computer or the program" if self.n_failed else ""
+        return f"Plan {self.surrogate.number}: {self.n_passed} of {self.surveys} rendered surveys passed{failed}"
+
+
+def verification_of(
+    rendered: CandidateSurveys, confirmation: CandidateSurveys, surrogate: Candidate, search_round: int
+) -> Verification:
+    """Returns the verification of a plan whose rendered surveys have been flown.
+
+    Args:
+        rendered: rendered surveys of the candidates.
+        confirmation: surrogate surveys with new seeds, which confirm plans.
+        surrogate: the plan, evaluated by `confirmation`.
+        search_round: round of the search, from 0.
+    """
+    number, values = surrogate.number, surrogate.values
+    scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
+    medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
+    n_failed = rendered.n_failed(number, values)
+    n_complete = sum(score.status == "complete" for score in scores)
+    ratio = PlanRatio(
+        values,
+        {name: metric_ratio(name, flown, expected) for name, (expected, flown) in medians.items()},
+        n_complete / len(scores) if scores else 1.0,
+    )
+    return Verification(
+        surrogate,
+        rendered.evaluate(number, values),
+        len(scores) + n_failed,
+        sum(score.passed for score in scores),
+        n_failed,
+        medians,
+        ratio,
+        search_round,
+        rendered.warnings([surrogate]),
+    )
+
+
+class ExpectedTime(NamedTuple):
+    """Expected run time of one rendered survey on one CPU core.
+
+    Args:
+        survey_s: run time [s].
+        measured: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate.
+    """
+
+    survey_s: float
+    measured: bool
+
+    def notice(self, number: int, surveys: int, most_surveys: int) -> str:
+        """Returns a line that announces rendered surveys of a plan with their expected run time.
+
+        Args:
+            number: number of the plan.
+            surveys: number of surveys to fly for this plan.
+            most_surveys: largest number of rendered surveys until the end of the search, including these.
+        """
+        source = "as measured" if self.measured else "a rough estimate"
+        return (
+            f"Flying plan {number} rendered: {surveys} surveys of about {duration(self.survey_s)} on one core each "
+            f"({source}), {duration(surveys * self.survey_s)} of core time; at most {most_surveys} surveys and "
+            f"{duration(most_surveys * self.survey_s)} until the end of the search"
+        )
+
+
+def expected_time(
+    trials: CandidateSurveys, rendered: CandidateSurveys, plan: Candidate, rows: Iterable[Row]
+) -> ExpectedTime:
+    """Returns the expected run time of a rendered survey of a plan.
+
+    It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second. The
+    run time per simulated second is measured in the rendered surveys flown so far; before the first one, it is
+    estimated from the frame rate and the image size.
+
+    Args:
+        trials: surrogate surveys of the candidates.
+        rendered: rendered surveys of the candidates.
+        plan: the plan.
+        rows: rows of all surveys flown so far.
+    """
+    run_s = simulated_s = longest = 0.0
+    own = set(trials.keys(plan.number, plan.values))
+    for row in rows:
+        duration_s = row.get("timing.simulated_s") or 0.0
+        if row.get("fidelity") == "rendered" and duration_s:
+            run_s, simulated_s = run_s + (row.get("timing.survey_s") or 0.0), simulated_s + duration_s
+        if (row["sample"], row["seed"]) in own:
+            longest = max(longest, duration_s)
+    if run_s and simulated_s:
+        return ExpectedTime(longest * run_s / simulated_s, measured=True)
+    rig = rendered.scenario(plan).rig
+    frame_s = _FRAME_S + _MEGAPIXEL_S * 1e-6 * rig.image_width_px * rig.image_height_px
+    return ExpectedTime(longest * rig.frame_rate_hz * frame_s, measured=False)
+
+
+def duration(time_s: float) -> str:
+    """Returns a duration as text in s, min or h."""
+    if time_s < 90:
+        return f"{time_s:.0f} s"
+    return f"{time_s / 60:.0f} min" if time_s < 5400 else f"{time_s / 3600:.1f} h"
