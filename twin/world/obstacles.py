@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -42,7 +43,7 @@ class Obstacles:
                 return f"an object (objects.{item.group})"
         return ""
 
-    def _near(self, world_from_body: Array) -> Array:
+    def _near(self, world_from_body: Array) -> NDArray[np.intp]:
         """Returns the numbers of the objects whose bounding sphere meets that of the hull."""
         centre_m = geometry.transform(world_from_body, CENTRE_M[None])[0]
         reach_m = self._radii_m + np.linalg.norm(HALF_M)
