@@ -94,7 +94,7 @@ def _effect(name: str, error_m: float, sigma_m: float, where: str) -> _Effect:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields findings for lost frames, for nodes without links to the previous node or to any, for failed links."""
+    """Yields findings for lost frames, for nodes without a link to the previous node or to any, for failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
