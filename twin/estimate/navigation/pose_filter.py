@@ -45,8 +45,8 @@ class PoseFilter:
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
-        self.world_from_camera = world_from_camera
-        self.cov = np.diag([1e-8] * 3 + [1e-8] * 3)
+        self.world_from_camera: Array = world_from_camera
+        self.cov: Array = np.diag([1e-8] * 3 + [1e-8] * 3)
         self.rig, self.noise = rig, noise
         camera_from_body = geometry.inverse(rig.body_from_camera)
         self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
