@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.judge.require import more_is_better
-from twin.report.wording import DASH, length, percent, plain
+from twin.report.wording import DASH, length, percent, with_unit
 from twin.study.analysis import KeyComparison, StudyAnalysis
 from twin.study.answers import Answer
 from twin.study.statistics import LEVEL, Interval
@@ -43,7 +43,7 @@ def metric_value(metric: str, value: float | None) -> str:
         return DASH
     if metric.endswith("_m"):
         return length(value)
-    return plain(float(value)) + (" s" if metric.endswith("_s") else "")
+    return with_unit(metric, float(value))
 
 
 def metric_interval(metric: str, interval: Interval) -> str:
