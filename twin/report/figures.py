@@ -134,13 +134,15 @@ class _RoundNumbers(LogLocator):
 
     def tick_values(self, vmin: float, vmax: float) -> Any:
         axis: Any = self.axis
-        space = axis.get_tick_space() // (2 if axis.axis_name == "x" else 1)  # labels are broader than high
-        for steps in ((1.0, 2.0, 5.0), (1.0, 3.0), (1.0,)):
-            self.set_params(subs=steps, numticks=max(space, 2))
-            ticks = np.asarray(super().tick_values(vmin, vmax))
-            if np.count_nonzero((ticks >= vmin) & (ticks <= vmax)) <= space:
+        space = max(axis.get_tick_space() // (2 if axis.axis_name == "x" else 1), 1)  # labels are broader than high
+        decades = 10.0 ** np.arange(np.floor(np.log10(vmin)), np.log10(vmax) + 1)
+        shown = decades
+        for steps in ((1, 2, 5), (1, 3), (1,)):
+            ticks = np.outer(decades, steps).ravel()
+            shown = ticks[(ticks >= vmin) & (ticks <= vmax)]
+            if 0 < len(shown) <= space:
                 break
-        return ticks
+        return shown[:: -(-len(shown) // space) or 1]
 
 
 def log_axis(axis: Any, label: Callable[[float], str] = "{:g}".format) -> None:
