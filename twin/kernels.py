@@ -11,17 +11,20 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import uuid
 from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, overload
 
 import llvmlite.binding
 import numba
 import platformdirs
+from numba.core import config
 
 _ROOT = Path(__file__).parents[1]
+_HOST_AND_START = uuid.uuid4().hex[:8]  # with the process number, which a fork changes
 _VERSIONS_KEPT = 8  #: of each module; those of the least recent processes are removed
 
 # `from .a.b import c, d`, also with its names in brackets over several lines, and `import a.b`
@@ -29,16 +32,23 @@ _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\.*)([\w.]*)[ \t]+)?import[ \t]+(\([
 _NAME = re.compile(r"[\w.]+")
 
 
-def kernel(function: Callable[..., Any] | None = None, /, **options: Any) -> Any:
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+@overload
+def kernel(function: Function, /) -> Function: ...
+@overload
+def kernel(**options: Any) -> Callable[[Function], Function]: ...
+def kernel(function: Any = None, /, **options: Any) -> Any:
     """Compiles a function with `numba.njit` without the interpreter's lock and keeps the machine code on disk.
 
     Args:
         function: the function, where the decorator is used without options.
-        options: of `numba.njit`; `nogil` is True unless given.
+        options: of `numba.njit`, apart from `cache` and `nogil`.
     """
     if function is None:
         return lambda decorated: kernel(decorated, **options)
-    dispatcher = numba.njit(**{"nogil": True, **options})(function)
+    dispatcher: Any = numba.njit(nogil=True, **options)(function)
     if _cache_folder(Path(function.__code__.co_filename).resolve()) is not None:
         _enable_caching(dispatcher)
     return dispatcher
@@ -125,12 +135,24 @@ def _last_use(folder: Path) -> float:
 
 def _enable_caching(dispatcher: Any) -> None:
     """Sets `KernelLocator` for this function alone; numba's setting is one for all packages of the process."""
-    before = numba.config.CACHE_LOCATOR_CLASSES  # pyright: ignore[reportAttributeAccessIssue]
-    numba.config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"  # pyright: ignore[reportAttributeAccessIssue]
+    before = config.CACHE_LOCATOR_CLASSES  # pyright: ignore[reportAttributeAccessIssue]
+    config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"  # pyright: ignore[reportAttributeAccessIssue]
     try:
         dispatcher.enable_caching()
+        _use_own_file_names(dispatcher)
     finally:
-        numba.config.CACHE_LOCATOR_CLASSES = before  # pyright: ignore[reportAttributeAccessIssue]
+        config.CACHE_LOCATOR_CLASSES = before  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _use_own_file_names(dispatcher: Any) -> None:
+    """Puts a name of this process into the names of its files of machine code.
+
+    numba numbers the files of a function. Two processes that compile it at once for different types of arguments would
+    write the same file, and later load code for the wrong types. Names of their own cost an entry of the index at most.
+    """
+    file = dispatcher._cache._cache_file
+    name = file._data_name_pattern.replace("{number:d}", "{process}.{number:d}")
+    file._data_name = lambda number: name.format(process=f"{_HOST_AND_START}-{os.getpid()}", number=number)
 
 
 def _reachable(file: Path) -> set[Path]:
