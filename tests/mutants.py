@@ -1,3 +1,4 @@
+# ruff: noqa: E501
 """Mutation check, run by hand: changes one line at a time in a copy of the project and runs the tests that should fail.
 
     python tests/mutants.py                 # all mutants (hours: each recompiles the kernels that it changes)
@@ -40,7 +41,7 @@ MUTANTS = [
         ("twin/core/georeference.py", "easting = self.easting + np.asarray(x_m, np.float64) / self.metres_per_unit", "easting = self.easting + np.asarray(x_m, np.float64) * self.metres_per_unit", "terrains_georeference"),
         ("twin/core/pressure.py", "_WATER_KG_M3 * _GRAVITY_MPS2", "_WATER_KG_M3 / _GRAVITY_MPS2", "exchange_ros2"),
         ("twin/core/braking.py", "math.exp(-interval_s / BRAKING_S)", "math.exp(-interval_s * BRAKING_S / 2)", "session_mission_actions estimate_motion_filter"),
-        ("twin/core/map_slopes.py", "return np.asarray(east, np.float64), -np.asarray(south, np.float64)", "return np.asarray(east, np.float64), np.asarray(south, np.float64)", "estimate_elevation orthomosaic judge_true_map"),
+        ("twin/core/map_slopes.py", "return np.asarray(east, np.float64), -np.asarray(south, np.float64)", "return np.asarray(east, np.float64), np.asarray(south, np.float64)", "interpolation"),
         # terrains and their objects
         ("terrains/generate.py", "west_m, south_m = -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2", "west_m, south_m = -nx * grid_m / 2, -(ny - 1) * grid_m / 2", "terrains_floor"),
         ("terrains/load.py", "read.values[::-1] * upward_m", "read.values * upward_m", "terrains_load"),
