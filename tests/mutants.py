@@ -5,7 +5,8 @@
     python tests/mutants.py judge 40-45     # mutants whose file contains "judge", and mutants 40 to 45
     python tests/mutants.py --check         # only whether each text to replace still occurs exactly once
 
-A mutant that survives is a fault that no test would notice. The exit status is 1 if one survives or is out of date.
+A mutant that survives is a fault that no test would notice. The exit status is 1 unless all are
+killed.
 """
 
 import os
@@ -14,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,7 +111,7 @@ MUTANTS = [
         # exchange
         ("twin/exchange/ros2.py", "return air_pa + PASCAL_PER_METRE * (surface_m - height_m)", "return air_pa + PASCAL_PER_METRE * (height_m - surface_m)", "exchange_ros2"),
         ("twin/exchange/geotiff.py", "cell = grid.cell_m / origin.metres_per_unit", "cell = grid.cell_m * origin.metres_per_unit", "exchange_map terrains_georeference"),
-        ("twin/exchange/attitude.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_products"),
+        ("twin/exchange/attitude.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_datasets"),
         # plug-ins, world, surrogate, sessions
         ("twin/plugin/guard.py", "max(error, turned) > _ROTATION_TOLERANCE", "error > _ROTATION_TOLERANCE", "plugin_guard"),
         ("twin/plugin/guard.py", "function(*copy.deepcopy(arguments))", "function(*arguments)", "plugin_guard"),
@@ -158,15 +160,24 @@ def is_current(mutant):
 
 
 def verdict_on(mutant):
-    """Returns "killed", "survived" or "out of date" of a mutant, whose tests run in a copy of the project."""
+    """Returns "killed", "survived", "out of date", or "broken" where the tests fail without the mutant too."""
     if not is_current(mutant):
         return "out of date"
+    if not tests_pass(mutant.tests):
+        return "broken"
+    return "survived" if tests_pass(mutant.tests, mutant) else "killed"
+
+
+@cache
+def tests_pass(tests, mutant=None):
+    """Returns whether test modules pass in a copy of the project, with a mutant if one is given."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "project"
         shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache"))
-        file = copy / mutant.file
-        file.write_text(file.read_text(encoding="utf-8").replace(mutant.old, mutant.new), encoding="utf-8")
-        modules = [f"tests/test_{name}.py" for name in mutant.tests.split()]
+        if mutant:
+            file = copy / mutant.file
+            file.write_text(file.read_text(encoding="utf-8").replace(mutant.old, mutant.new), encoding="utf-8")
+        modules = [f"tests/test_{name}.py" for name in tests.split()]
         data = os.environ.get("TWIN_DATA", str(ROOT / "../shared/data"))
         done = subprocess.run(
             [sys.executable, "-m", "pytest", "-x", "-q", "-n", "0", "-m", "not slow", "--basetemp", folder + "/tmp", *modules],
@@ -174,7 +185,7 @@ def verdict_on(mutant):
         )  # fmt: skip
     if done.returncode not in (0, 1):
         sys.exit(done.stdout + done.stderr)
-    return "killed" if done.returncode else "survived"
+    return done.returncode == 0
 
 
 def main(words):
@@ -182,7 +193,7 @@ def main(words):
     bad = 0
     for number, mutant in chosen([word for word in words if word != "--check"]):
         found = verdict(mutant)
-        bad += found in ("survived", "out of date")
+        bad += found not in ("killed", "current")
         print(f"{number:3} {found:12} {mutant.file}: {mutant.old}  ->  {mutant.new}", flush=True)
     return int(bad > 0)
 

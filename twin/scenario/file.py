@@ -234,7 +234,7 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
 
 
 def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:
-    """Removes objects that a tree has from its base, in place, if its floor is another one: they lie at places of it."""
+    """Removes objects that a tree has from its base, in place, if its floor is another: that is where they lie."""
     floors = [terrain if isinstance(terrain := one.get("terrain"), dict) else {} for one in (tree, base)]
     other_floor = any(floors[0].get(key) != floors[1].get(key) for key in _FLOOR_KEYS)
     if other_floor and tree.get("objects") == base.get("objects"):
