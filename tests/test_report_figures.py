@@ -69,3 +69,16 @@ def test_bounds_of_a_range_have_no_exponent():
         "2000000",
     ]
     assert np.isfinite(float(rounded(-12345.6)))
+
+
+@pytest.mark.parametrize(
+    ("function", "value", "text"),
+    [
+        (wording.length, 0.00043, "0.43 mm"), (wording.length, 0.0064, "6.4 mm"), (wording.length, -0.083, "-8.3 cm"),
+        (wording.length, 1.0, "1.00 m"), (wording.milliradians, 0.1, "1.7 mrad"), (wording.angle, 0.1, "0.10°"),
+        (wording.percent, 0.9996, "> 99.9 %"), (wording.percent, 0.0004, "< 0.1 %"), (wording.percent, 0.5, "50 %"),
+    ],
+)  # fmt: skip
+def test_numbers_are_written_in_their_unit(function, value, text):
+    assert function(value) == text
+    assert function(None) == wording.DASH
