@@ -48,7 +48,9 @@ from twin.surrogate.map_model import (
 )
 from twin.surrogate.matchability import (
     NO_DEPENDENCE,
+    FloorImages,
     Matchability,
+    floor_albedos,
     lamp_share,
     position_dependence,
     precision,
@@ -107,10 +109,15 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
         assert np.isinf(FloorRayCaster(reef.terrain).depth_at(np.array([[160.0, 120.0]]), pose, reef.rig)).all()
 
 
+def bounds_px(m, depths_m):
+    images = FloorImages(m.scenario, m.illumination)
+    return precision(images, floor_albedos(images, m.terrain, depths_m), depths_m).bounds_px
+
+
 def test_the_matching_bound_grows_with_turbidity_depth_and_noise():
     def bound(depth_m, *sets):
         m = mission(*sets)
-        return precision(m.scenario, m.illumination, m.terrain, np.array([depth_m]))[0][0]
+        return bounds_px(m, np.array([depth_m]))[0]
 
     base = bound(2.0)
     assert bound(2.0, 'water.jerlov="3C"') > 2 * base
@@ -124,7 +131,7 @@ def test_the_matching_bound_grows_without_limit_as_the_floor_disappears():
 
     def bound(turbidity):
         m = mission('water.jerlov="III"', f"water.turbidity={turbidity}")
-        return precision(m.scenario, m.illumination, m.terrain, np.array([2.0]))[0][0]
+        return bounds_px(m, np.array([2.0]))[0]
 
     assert bound(15.0) > 100 > 1 > bound(2.0) > 2 * bound(1.2)
 
@@ -138,11 +145,7 @@ def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels
         matchability = Matchability(m.scenario, m.illumination, m.terrain)
         found.append((matchability.binning, matchability.medium_bound_px))
         depths = matchability.depths_m
-        unbinned.append(
-            np.interp(
-                np.sqrt(depths[0] * depths[-1]), depths, precision(m.scenario, m.illumination, m.terrain, depths)[0]
-            )
-        )
+        unbinned.append(np.interp(np.sqrt(depths[0] * depths[-1]), depths, bounds_px(m, depths)))
     assert [binning for binning, _ in found] == [1, 2, 4]
     assert found[0][1] == pytest.approx(unbinned[0])
     assert all(px * binning < 0.9 * full for (binning, px), full in zip(found[1:], unbinned[1:], strict=True))
@@ -187,7 +190,7 @@ def test_tracking_is_lost_where_too_few_points_would_be_matched_between_frames(r
 def test_the_lamp_share_decreases_with_sunlight():
     def share(lux, *sets):
         m = mission(f"sun.illuminance_lx={lux}", *sets)
-        return lamp_share(m.scenario, m.illumination)
+        return lamp_share(FloorImages(m.scenario, m.illumination))
 
     lamps = "lamps=[{position_m=[0.3, 0.3, 0.0], intensity_cd=500.0}]"
     shares = [share(lux, lamps) for lux in (0, 100, 1000, 10_000)]
@@ -199,7 +202,7 @@ def test_the_lamp_share_decreases_with_sunlight():
     dark = mission("sun.illuminance_lx=1000", lamps, "water.turbidity=100")
     plan = dark.scenario.plan.model_copy(update={"altitude_m": 1000.0})
     high = dark.scenario.model_copy(update={"plan": plan})
-    assert lamp_share(high, dark.illumination) == 1  # no light returns
+    assert lamp_share(FloorImages(high, dark.illumination)) == 1  # no light returns
 
 
 def test_unevenness_equals_the_deviation_of_a_curved_floor_from_its_plane():
@@ -717,7 +720,7 @@ LAMPS = "lamps=[{position_m=[0.25, 0.35, -0.05], pan_deg=-8.0}, {position_m=[0.2
 
 def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_daylight_does_not():
     lit, sunlit = (
-        position_dependence(m.scenario, m.illumination, 2.0).bounds
+        position_dependence(FloorImages(m.scenario, m.illumination), 2.0).bounds
         for m in (mission(LAMPS, "sun.illuminance_lx=0"), mission("lamps=[]", "sun.illuminance_lx=1000"))
     )
     assert lit[:, [0, -1]].min() > 1.1 > 0.9 > lit[2:4, 3:5].max()
@@ -727,7 +730,7 @@ def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_dayl
 def test_the_relative_bound_is_that_of_random_textures_in_crops_of_the_image():
     """Oracle: bounds from gradients and noise of other textures (white noise) in each quarter of the image."""
     m = mission(LAMPS, "sun.illuminance_lx=0", "water.jerlov=III")
-    table = position_dependence(m.scenario, m.illumination, 2.0).bounds
+    table = position_dependence(FloorImages(m.scenario, m.illumination), 2.0).bounds
     rng, rig = np.random.default_rng(7), m.scenario.believed_rig()
     formation = ImageFormation(m.scenario, m.illumination, None, rng)
     shape = rig.height_px, rig.width_px
@@ -752,7 +755,7 @@ def block_means(values, rows, cols):
 
 def test_no_light_from_the_floor_gives_equal_bounds_over_the_image():
     m = mission("water.turbidity=100", "lamps=[]", "sun.illuminance_lx=1000")
-    assert position_dependence(m.scenario, m.illumination, 1000.0) is NO_DEPENDENCE
+    assert position_dependence(FloorImages(m.scenario, m.illumination), 1000.0) is NO_DEPENDENCE
 
 
 def test_rough_cells_have_more_holes(vision, no_errors):
@@ -1148,24 +1151,12 @@ def test_every_point_is_matched_in_the_model_with_which_images_are_compared():
     ("content", "message"),
     [
         ("n_surveys = 3\n", "imaging.error_model.*twin fit-surrogate"),
-        ("surveys = 3\n", "surveys was renamed to n_surveys"),
-        ("[model]\nsteady = 0.5\n", "steady was renamed to match_bias_fraction"),
-        ("[model]\nf2f_sigma_px = { floor = 0.1, rise = 1 }\n", "floor was renamed to floor_px, rise was renamed"),
-        ("[misfit]\nplace_px = 0.1\n", "place_px was renamed to match_sigma_px"),
-        ("[model]\ndepth_cell_scatter = 1\n", "depth_cell_scatter was renamed to depth_texture_scatter"),
     ],
 )
 def test_a_file_that_is_not_an_error_model_is_rejected(content, message, tmp_path):
     (tmp_path / "other.toml").write_text(content)
     with pytest.raises(TwinError, match=message):
         error_model_file.load(tmp_path / "other.toml")
-
-
-def test_former_names_of_the_error_model_lead_to_present_ones():
-    laws = [law for law in ErrorModel._field_defaults.values() if hasattr(law, "_fields")]
-    present = {"n_surveys", *ErrorModel._fields, *(name for law in laws for name in law._fields)}
-    assert set(error_model_file._RENAMED.values()) <= present
-    assert not set(error_model_file._RENAMED) & present
 
 
 @pytest.mark.long

@@ -18,7 +18,7 @@ from twin.studies.surveys import Survey, surveys
 from twin.surrogate import error_model_file
 from twin.surrogate.coverage import QUANTITIES, quantities_outside_fit
 from twin.surrogate.error_model import ErrorModel
-from twin.surrogate.matchability import precision
+from twin.surrogate.matchability import FloorImages, floor_albedos, precision
 from twin.surrogate.measured_rows import MeasuredRows
 from twin.surrogate.measured_view import IDEAL_VIEW, measured_view
 from twin.surrogate.snow_noise import snow_effect
@@ -184,10 +184,10 @@ def test_the_share_of_matches_falls_with_the_part_of_the_image_that_flakes_cover
 
 
 def test_more_snow_gives_less_precise_and_fewer_matches():
-    mission = prepare(scenario())
+    mission, depths_m = prepare(scenario()), np.array([1.8])
+    views = [FloorImages(scenario(f"snow.density_per_m3={n}"), mission.illumination) for n in (0, 400, 1600)]
     bounds_px, clear = np.transpose([
-        precision(scenario(f"snow.density_per_m3={density}"), mission.illumination, mission.terrain, np.array([1.8]))
-        for density in (0, 400, 1600)
+        precision(images, floor_albedos(images, mission.terrain, depths_m), depths_m) for images in views
     ])[0]  # fmt: skip
     assert bounds_px[0] < bounds_px[1] < bounds_px[2]
     assert clear[0] == 1 > clear[1] > clear[2]

@@ -50,19 +50,6 @@ class Sensitivity(NamedTuple):
     explained: float
 
 
-class KeyComparison(NamedTuple):
-    """Medians of a key over the surveys that passed and over the surveys that did not pass.
-
-    `superiority` is the probability that the key has a greater value in a survey that did not pass than in one that
-    passed; ties count half.
-    """
-
-    key: str
-    passed: float
-    not_passed: float
-    superiority: float
-
-
 class FailureReason(NamedTuple):
     """Status of surveys that did not pass, the reason, and the number of surveys with this status and reason."""
 
@@ -326,22 +313,6 @@ class StudyAnalysis:
         """
         counts = count_similar(self.reason[self.refused])
         return [FailureReason("refused", reason, count) for reason, count in counts.items()][:_MAX_REASONS]
-
-    @cached_property
-    def key_comparisons(self) -> list[KeyComparison]:
-        """Returns, for each numeric key, a comparison of the evaluated surveys that passed with those that did not.
-
-        The greatest difference comes first. Empty if all of these surveys passed or none did.
-        """
-        comparisons = []
-        for key in self.keys:
-            x = self.key_numbers(key)
-            if x is not None:
-                good, bad = x[self.evaluated & self.passed], x[self.evaluated & ~self.passed]
-                if len(good) and len(bad):
-                    superiority = statistics.probability_of_superiority(bad, good)
-                    comparisons.append(KeyComparison(key, float(np.median(good)), float(np.median(bad)), superiority))
-        return sorted(comparisons, key=lambda c: -abs(c.superiority - 0.5))
 
     @cached_property
     def failure_reasons(self) -> list[FailureReason]:

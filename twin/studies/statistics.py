@@ -265,14 +265,3 @@ def group_indices(x: ArrayLike) -> NDArray[np.int64]:
         return index.astype(np.int64)
     bins = int(np.clip(len(values) // 6, 2, 10))
     return (stats.rankdata(values, method="ordinal") - 1).astype(np.int64) * bins // max(len(values), 1)
-
-
-def probability_of_superiority(x: ArrayLike, y: ArrayLike) -> float:
-    """Returns the probability that a value of x exceeds a value of y, with ties counting half; NaN if x or y is empty.
-
-    It is U / (n_x n_y) for n_x and n_y values, with the statistic U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
-    """
-    a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if len(a) == 0 or len(b) == 0:
-        return float("nan")
-    return float(stats.mannwhitneyu(a, b).statistic) / (len(a) * len(b))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from twin.judge.require import more_is_better
 from twin.report.wording import DASH, length, percent, plain
-from twin.studies.analysis import KeyComparison, StudyAnalysis, count_similar
+from twin.studies.analysis import StudyAnalysis, count_similar
 from twin.studies.answers import Answer
 from twin.studies.statistics import LEVEL, Interval
 from twin.studies.study_file import Study
@@ -288,15 +288,6 @@ def _failed(analysis: StudyAnalysis) -> str:
         f" {subject} failed because of the computer or the program and {'is' if n == 1 else 'are'} not counted; if "
         f"{none} passed, the pass probability would be {lowest}. Use --resume to fly {again} again."
     )
-
-
-def superiority(comparison: KeyComparison) -> str:
-    """Returns a phrase on whether a key has higher or lower values in surveys that did not pass than in the others."""
-    higher = comparison.superiority >= 0.5
-    probability = comparison.superiority if higher else 1 - comparison.superiority
-    if probability < 0.6:
-        return "no clear difference"
-    return f"{'higher' if higher else 'lower'} in surveys that did not pass, in {percent(probability)} of pairs"
 
 
 def independence_note(analysis: StudyAnalysis) -> str:
