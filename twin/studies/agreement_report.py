@@ -117,10 +117,7 @@ def _verdict(agrees: bool) -> str:
 
 
 def _draw_pairs(axes: Axes, metric: str, rendered: Array, surrogate: Array) -> None:
-    """Plots surrogate against rendered values (n,), with the line of equal values and the limits on the medians.
-
-    Infinite values are drawn at the edge. Without finite values, the axes stay empty.
-    """
+    """Plots surrogate against rendered values (n,), with the line of equal values and the limits on the medians."""
     finite = np.concatenate([rendered[np.isfinite(rendered)], surrogate[np.isfinite(surrogate)]])
     if len(finite) == 0:
         return

@@ -120,10 +120,7 @@ class StudyAnalysis:
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
 
     def _has_values(self, metric: str) -> bool:
-        """Returns whether the metric is in the table, and is required or has a finite value in some survey.
-
-        Surveys by the surrogate, for example, have no contrast.
-        """
+        """Returns whether the metric is in the table, and is required or has a finite value in some survey."""
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
@@ -198,7 +195,6 @@ class StudyAnalysis:
         """Groups surveys by the value of a key; see `statistics.group_indices` for numbers.
 
         Args:
-            key: the varied key.
             chosen: (n,) mask of the surveys to group.
 
         Returns:
@@ -261,10 +257,7 @@ class StudyAnalysis:
         }
 
     def _mean_of_samples(self, metric: str) -> Array:
-        """Returns the mean of a metric over the surveys of each sample, by sample number.
-
-        It is NaN unless all surveys of the sample are complete and have a value.
-        """
+        """Returns the mean of a metric over the surveys of each sample, by sample number."""
         values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)

@@ -116,7 +116,6 @@ def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
 
     Args:
         names: (n,) value of the key in each survey, numbers or text.
-        record: results of the surveys.
     """
     values = np.asarray(names)
     numeric = np.issubdtype(values.dtype, np.number)
@@ -139,7 +138,6 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
 
     Args:
         x: (n,) value of the key in each survey.
-        record: results of the surveys.
     """
     if len(x) == 0:
         return []
@@ -225,11 +223,7 @@ def _decided_runs(
 
 
 def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], required: float) -> bool:
-    """Returns whether the verdict on a range of consecutive bins (first, last) is supported by these bins.
-
-    The verdict must be decided, the observed fractions of the first and the last bin must agree with it, and no range
-    of bins within this one may have the opposite verdict.
-    """
+    """Returns whether the verdict on a range of consecutive bins (first, last) is supported by these bins."""
     verdict = runs[run].verdict
     if verdict == "undecided":
         return False

@@ -52,16 +52,7 @@ def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
 
 
 def _slurm_cluster(jobs: int) -> Any:
-    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration.
-
-    Where they give no cores or no memory, a job has one core or 4 GB.
-
-    Args:
-        jobs: number of SLURM jobs.
-
-    Raises:
-        TwinError: dask-jobqueue is not installed.
-    """
+    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration."""
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError:

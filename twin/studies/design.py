@@ -68,9 +68,6 @@ def _saltelli(pairs: Array) -> Array:
 
     Saltelli et al. 2010, Comput. Phys. Commun. 181, 259.
 
-    Args:
-        pairs: (n, 2 d), the points of A in the first d columns and those of B in the others.
-
     Returns:
         (n (d + 2), d), the matrices stacked in the order that `statistics.sobol_indices` expects.
     """

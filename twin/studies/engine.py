@@ -41,7 +41,5 @@ class Engine(Protocol):
         Args:
             function: function of one task. The workers must be able to import it by name, as well as the classes of
                 the tasks and results.
-            tasks: picklable arguments of `function`.
-            limits: timeout and number of retries of each task.
         """
         ...

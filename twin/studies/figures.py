@@ -70,10 +70,7 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
 
 
 def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
-    """Shades the ranges of a key that reach the required pass probability (green) or miss it (orange).
-
-    The required pass probability is drawn as a horizontal line.
-    """
+    """Shades the ranges of a key that reach the required pass probability (green) or miss it (orange)."""
     answers = analysis.answers.get(key, [])
     if answers:
         axes.axhline(analysis.required_probability or 0.0, color=LIMIT, linestyle=":", linewidth=1)
@@ -85,17 +82,7 @@ def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
 
 
 def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]) -> Array:
-    """Formats the x axis for a key and returns the x position of each group of surveys.
-
-    The position is the median of the key within the group, or the index of the group if the key is text.
-
-    Args:
-        axes: axes to format.
-        values: values of the key; None if it is text.
-        chosen: (n,) mask of the surveys shown.
-        groups: group index of each chosen survey.
-        names: names of the groups.
-    """
+    """Formats the x axis for a key and returns the x position of each group of surveys."""
     if values is None:
         rotation = 25 if max(len(name) for name in names) > 8 else 0
         axes.set_xticks(range(len(names)), names, rotation=rotation)

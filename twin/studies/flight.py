@@ -52,10 +52,7 @@ def fly(survey: Survey) -> Row:
 
 
 def _move_kept_files(scratch: Path, survey: Survey) -> None:
-    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name.
-
-    A folder that already has this name is deleted first. If no file is kept, `scratch` stays; the caller deletes it.
-    """
+    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name."""
     shutil.rmtree(survey.folder, ignore_errors=True)
     if survey.keep == "none":
         return
@@ -77,11 +74,9 @@ def row_of(survey: Survey, status: str, reason: str) -> Row:
     """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason, values of the varied keys.
 
     Args:
-        survey: the survey.
         status: "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
             "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
             computer failed.
-        reason: why the status is not "complete"; else "".
     """
     identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}
     identity["fidelity"] = survey.scenario.imaging.fidelity

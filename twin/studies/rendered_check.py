@@ -96,12 +96,7 @@ def check(
     Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
 
     Args:
-        study: the study.
-        analysis: results of the study.
-        n: largest number of surveys to compare.
         folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
 
     Raises:
         TwinError: the subfolder cannot be written, or contains the results of another study; or the engine lost its
@@ -145,10 +140,6 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     The distance of a metric from its limit is the number of surveys whose value lies between the two, so that metrics
     of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
     or else closest to it. Surveys without a finite value of every required metric are left out.
-
-    Args:
-        analysis: results of the study.
-        n: largest number of surveys.
     """
     is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
     chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
@@ -162,10 +153,7 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
 
 
 def _excess(values: Array, limit: float) -> Array:
-    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit.
-
-    Of the values that are equal to the value itself, half are counted.
-    """
+    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit."""
     ascending = np.sort(values)
     rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
     return rank - np.searchsorted(ascending, limit, "right")

@@ -63,14 +63,6 @@ def run_study(
     For a study that compares rendered and surrogate surveys, agreement.md and its figure are written too. Ctrl-C ends
     the study early; the results obtained until then are written.
 
-    Args:
-        study: the study.
-        folder: results folder, new or empty unless `resume` is set.
-        resume: continue the study whose results are in the folder.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey; must be importable by name on the workers.
-
     Raises:
         TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written,
             or belongs to another study; or the engine lost its connection.
@@ -137,11 +129,7 @@ def _refused_rows(study: Study, refused: dict[int, str]) -> Iterator[Row]:
 
 
 def refusal_notice(refused: dict[int, str]) -> str:
-    """Returns a line with the number of refused samples, and the number and reason of the first one.
-
-    Args:
-        refused: reason of each refused sample, by sample number.
-    """
+    """Returns a line with the number of refused samples, and the number and reason of the first one."""
     number, reason = min(refused.items())
     if len(refused) == 1:
         return f"1 sample cannot be flown and is left out: sample {number}: {reason}"
@@ -153,11 +141,6 @@ def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[Re
     """Locks a new folder or, with `resume`, that of an earlier run, and yields its results log.
 
     Creates the folder if it does not exist, and deletes unfinished run folders.
-
-    Args:
-        folder: results folder.
-        resume: whether the folder may contain results.
-        search: whether the results are those of a search, not of a study.
 
     Raises:
         TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written, or
@@ -189,7 +172,6 @@ def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]
     """Raises TwinError if the log has a row of another scenario.
 
     Args:
-        log: results log.
         planned: ((sample, seed), scenario hash) of each survey of the study.
     """
     hashes = {(row["sample"], row["seed"]): row["scenario_hash"] for row in log.rows()}
@@ -212,14 +194,6 @@ def fly_surveys(
     function: Callable[[Survey], Row] = fly,
 ) -> bool:
     """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True.
-
-    Args:
-        study: study with the timeout and the number of retries.
-        missing: surveys to fly.
-        add_row: called with the row of each survey that has ended.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey; must be importable by name on the workers.
 
     Raises:
         TwinError: the engine lost its connection.

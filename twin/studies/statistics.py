@@ -33,8 +33,6 @@ def wilson_interval(successes: float, n: float, level: float = LEVEL, unknown: i
     and the normal quantile z of (1 + level) / 2. Without trials, the proportion is NaN and the interval is 0 to 1.
 
     Args:
-        successes: number of successes.
-        n: number of trials, or effective number of trials.
         level: confidence level, 0 to 1.
         unknown: number of further trials whose outcome is unknown: they count as failures at the lower bound and as
             successes at the upper bound.
@@ -107,7 +105,6 @@ def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, l
         passed: (n,) whether each survey passed.
         clusters: (n,) cluster label of each survey.
         required: required proportion r, 0 to 1.
-        level: confidence level of the interval.
 
     Returns:
         The number of surveys, at least 1; infinite if p equals r, if r is 1, or if no survey is given.
@@ -129,7 +126,6 @@ def bootstrap_interval(
 
     Args:
         values: (n,) data.
-        statistic: maps an array to its statistic along the last axis, ignoring NaN.
         clusters: (n,) label of the cluster of each value; None if the values are independent.
 
     Returns:
@@ -234,7 +230,6 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
     Args:
         values: (n (n_axes + 2),) metric at the n design points of each block A, B, AB_1, AB_2, ..., where AB_k is A
             with column k of B (`design.design_points`).
-        n_axes: number of sampled axes.
     """
     blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, 1, -1)
     given: Any = {"f_A": blocks[0], "f_B": blocks[1], "f_AB": blocks[2:]}

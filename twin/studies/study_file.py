@@ -177,10 +177,6 @@ class Study(Section):
 def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     """Reads and validates a study file and the scenario file that it names.
 
-    Args:
-        path: a file, or a name in scenes/studies/.
-        allow_plugins: whether study and scenario may name a plug-in as module:Class.
-
     Raises:
         ScenarioError: a file does not exist or is not valid; lists the errors of the study file or, if it has none,
             those of the scenario file, each as `FILE:LINE: key: problem (allowed: ...)`.
@@ -207,9 +203,6 @@ def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
 def find_study(path: str | Path) -> Path:
     """Returns the path of a study file.
 
-    Args:
-        path: a file, or a name in scenes/studies/.
-
     Raises:
         ScenarioError: there is neither such a file nor such a name.
     """
@@ -224,12 +217,7 @@ def find_study(path: str | Path) -> Path:
 
 
 def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value.
-
-    Args:
-        tree: nested tables.
-        prefix: text before every key.
-    """
+    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
             yield from flatten_keys(value, f"{prefix}{key}.")

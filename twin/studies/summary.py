@@ -16,12 +16,7 @@ _STATUSES = ("complete", "degraded", "aborted", "refused", "failed")
 
 
 def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the summary of a study as JSON values.
-
-    Args:
-        analysis: statistics of the study.
-        identity: entries to put at the start of the summary, such as the name of the study.
-    """
+    """Returns the summary of a study as JSON values."""
     probability = _as_dict(analysis.pass_probability) | {"required": analysis.required_probability}
     metrics = {
         metric.name: {

@@ -67,11 +67,6 @@ class SampleSource(Source):
 def surveys(study: Study, folder: Path, without: Container[int] = ()) -> Iterator[Survey]:
     """Yields every survey of the study, sample by sample.
 
-    Args:
-        study: the study.
-        folder: results folder of the study; the run folders are created in its subfolder `runs`.
-        without: numbers of the samples to leave out.
-
     Raises:
         ScenarioError: the scenario of a sample is not valid.
     """
@@ -99,8 +94,6 @@ def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) ->
     The limits of the study, if it has any, replace the section [require] of the scenario file.
 
     Args:
-        study: the study.
-        base: contents of the study's scenario file.
         sample: the sample, whose values replace those of `base` and of the section [set] of the study.
 
     Raises:

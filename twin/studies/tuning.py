@@ -82,10 +82,6 @@ class TuningFlights(NamedTuple):
     def fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
         """Flies those surveys of the given plans that have no result yet.
 
-        Args:
-            surveys: the surveys of all plans; the new results are added to them.
-            plans: values of the searched keys, by number of the plan.
-
         Raises:
             KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
             TwinError: the engine lost its connection.
@@ -112,12 +108,7 @@ def tune(
     """Searches for the best plan as specified in `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
     Args:
-        study: the study.
-        folder: results folder, new or empty unless `resume` is set.
         resume: continue the search whose results are in the folder; surveys with a result are not flown again.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey; must be importable by name on the workers.
 
     Raises:
         TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, is written by
@@ -217,12 +208,7 @@ class Tuning:
         self.plans |= dict(search.finished())
 
     def _verify_front(self, search_round: int) -> None:
-        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
-
-        Repeats this until the cheapest confirmed plan is one that has passed verification, until no plan is confirmed,
-        or until `config.plans` plans were verified. If plans are not to be verified, only determines the cheapest
-        confirmed plan.
-        """
+        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans."""
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()
             if chosen is None or not self.is_verifying or chosen.number in self.verifications:
@@ -230,10 +216,7 @@ class Tuning:
             self._verify(chosen, (self.config.rounds - search_round + 2) * self.config.plans - k, search_round)
 
     def _verify_cheaper(self, search_round: int) -> None:
-        """Verifies plans cheaper than the recommended one, until one does not pass or `config.plans` were verified.
-
-        The surrogate may be pessimistic, so a plan that it rejects can still pass.
-        """
+        """Verifies plans cheaper than the recommended one, until one does not pass or `config.plans` were verified."""
         for k in range(self.config.plans if self.is_verifying else 0):
             if (cheaper := self._next_cheaper()) is None:
                 return
@@ -243,13 +226,7 @@ class Tuning:
                 return
 
     def _next_cheaper(self) -> Candidate | None:
-        """Returns the next plan to verify that is cheaper than the recommended one.
-
-        The costs of all plans, including the recommended one, are the corrected results of the search. The candidates
-        are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those that are not
-        verified, the one with the smallest shortfall of the pass probability is returned; of several with the same
-        shortfall, the most expensive one. Returns None if no plan is recommended, or if all candidates are verified.
-        """
+        """Returns the next plan to verify that is cheaper than the recommended one."""
         if self.recommended is None:
             return None
         sign, cost = objective_signs(self.config), cost_index(self.config)
@@ -260,13 +237,7 @@ class Tuning:
         return min(front, key=lambda one: (one.shortfall, -one.objectives[cost] * sign[cost]), default=None)
 
     def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
-        """Flies the rendered surveys of a plan and compares them with its surrogate surveys.
-
-        Args:
-            plan: the plan; it is one of the finalists.
-            most_plans: largest number of plans still to be verified in the search, including this one.
-            search_round: round of the search, from 0.
-        """
+        """Flies the rendered surveys of a plan and compares them with its surrogate surveys."""
         self._announce(plan, most_plans)
         self.flights.fly(self.rendered, {plan.number: plan.values})
         surrogate = self.finalists[plan.number]
@@ -276,21 +247,13 @@ class Tuning:
 
     def _announce(self, plan: Candidate, most_plans: int) -> None:
         """Prints how many rendered surveys of a plan are to be flown, and their expected run time; nothing if none are.
-
-        Args:
-            plan: the plan.
-            most_plans: largest number of plans still to be verified in the search, including this one.
         """
         if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
             times = expected_time(self.trials, self.rendered, plan, self.flights.log.rows())
             self.flights.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
 
     def _cheapest_confirmed(self) -> Candidate | None:
-        """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
-
-        Bisects the front, because a more expensive plan usually has a higher pass probability, and flies the surveys
-        that this requires. Returns None if no plan evaluated in the bisection reaches the required pass probability.
-        """
+        """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds."""
         front, found = pareto_front(self._candidates(), self.config), None
         first, end = 0, len(front)
         while first < end:
@@ -314,10 +277,7 @@ class Tuning:
         return [self._evaluate(self.trials, number, values) for number, values in self.plans.items()]
 
     def _evaluate(self, surveys: CandidateSurveys, number: int, values: dict[str, Any]) -> Candidate:
-        """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans.
-
-        If the plan itself was verified by rendered surveys, these alone determine whether it is feasible.
-        """
+        """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans."""
         candidate = surveys.evaluate(number, values, self._correction(values))
         if (verification := self.verifications.get(number)) is None:
             return candidate

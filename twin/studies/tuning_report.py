@@ -94,13 +94,7 @@ def _metric(name: str, value: float | None) -> str:
 
 
 def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
-    """Returns the reason why no plan is recommended, as text that follows a colon.
-
-    Args:
-        study: the study.
-        result: result of the search.
-        count: phrase with the number of evaluated plans.
-    """
+    """Returns the reason why no plan is recommended, as text that follows a colon."""
     if result.interrupted:
         return f"{count}, and the search was interrupted before a plan was confirmed."
     if result.verifications:

@@ -53,14 +53,7 @@ class Verification(NamedTuple):
 def verification_of(
     rendered: CandidateSurveys, confirmation: CandidateSurveys, surrogate: Candidate, search_round: int
 ) -> Verification:
-    """Returns the verification of a plan whose rendered surveys have been flown.
-
-    Args:
-        rendered: rendered surveys of the candidates.
-        confirmation: surrogate surveys with new seeds, which confirm plans.
-        surrogate: the plan, evaluated by `confirmation`.
-        search_round: round of the search, from 0.
-    """
+    """Returns the verification of a plan whose rendered surveys have been flown."""
     number, values = surrogate.number, surrogate.values
     scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
     medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
@@ -96,13 +89,7 @@ class ExpectedTime(NamedTuple):
     measured: bool
 
     def notice(self, number: int, surveys: int, most_surveys: int) -> str:
-        """Returns a line that announces rendered surveys of a plan with their expected run time.
-
-        Args:
-            number: number of the plan.
-            surveys: number of surveys to fly for this plan.
-            most_surveys: largest number of rendered surveys until the end of the search, including these.
-        """
+        """Returns a line that announces rendered surveys of a plan with their expected run time."""
         source = "as measured" if self.measured else "a rough estimate"
         return (
             f"Flying plan {number} rendered: {surveys} surveys of about {duration(self.survey_s)} on one core each "
@@ -119,12 +106,6 @@ def expected_time(
     It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second. The
     run time per simulated second is measured in the rendered surveys flown so far; before the first one, it is
     estimated from the frame rate and the image size.
-
-    Args:
-        trials: surrogate surveys of the candidates.
-        rendered: rendered surveys of the candidates.
-        plan: the plan.
-        rows: rows of all surveys flown so far.
     """
     run_s = simulated_s = longest = 0.0
     own = set(trials.keys(plan.number, plan.values))

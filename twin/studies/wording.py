@@ -110,11 +110,6 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     """Returns a sentence on the values of a key at which enough surveys pass, too few pass, or more must be flown.
 
     It names only values that were flown.
-
-    Args:
-        key: the varied key.
-        answers: verdict for each range or value of the key.
-        required: required pass probability.
     """
     if not answers:
         return f"{key}: no survey could be evaluated."
@@ -150,10 +145,7 @@ def _count(surveys: int) -> str:
 
 
 def _more(undecided: list[Answer]) -> str:
-    """Returns a phrase with the number of further surveys that would decide all undecided answers.
-
-    The number is rounded up to two significant digits. If it is infinite, the phrase gives the reason instead.
-    """
+    """Returns a phrase with the number of further surveys that would decide all undecided answers."""
     total = sum(answer.more_surveys for answer in undecided)
     if np.isinf(total):
         if any(answer.unknown for answer in undecided):
@@ -167,7 +159,6 @@ def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
     """Returns a phrase with the number of surveys flown, their rate, and their mean run time.
 
     Args:
-        surveys: number of surveys flown.
         wall_s: wall time [s].
         worker_s: sum of the surveys' run times on the workers [s].
     """
@@ -182,10 +173,7 @@ def _labelled(low: str, high: str) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence, after a space, on the surveys that have a warning; "" if none has.
-
-    It has their number, without surveys that repeat others, and the text of the most frequent warning.
-    """
+    """Returns a sentence, after a space, on the surveys that have a warning; "" if none has."""
     different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)
     warned = int((different != "").sum())
     return f" Warning in {warned} of {len(different)} surveys: {texts[0].rstrip('.')}." if texts else ""
@@ -210,8 +198,6 @@ def limit_relation(metric: str) -> str:
 
 def _requirement(analysis: StudyAnalysis) -> str:
     """Returns a sentence on whether the pass probability reaches the required one, and whether more surveys are needed.
-
-    Returns "" if the study requires no pass probability.
     """
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None:

@@ -98,10 +98,7 @@ class Worker:
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns how the process ended (signal or exit status), and a line of its output if there is any.
-
-        The line is the last one before the first blank line.
-        """
+        """Returns how the process ended (signal or exit status), and a line of its output if there is any."""
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)
@@ -178,7 +175,6 @@ def main(pipe: int, core: int | None) -> None:
     """Main loop of the worker process: answers each pickled (function, task) with a `Reply`, until the pipe closes.
 
     Args:
-        pipe: file descriptor of the worker's end of the pipe.
         core: CPU core to which the process is pinned; None: not pinned.
     """
     if core is not None:
@@ -202,11 +198,7 @@ def _run_request(request: bytes) -> bytes:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """Ends this process within about a second after its parent process has ended.
-
-    Args:
-        parent: process identifier of the parent.
-    """
+    """Ends this process within about a second after its parent process has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)

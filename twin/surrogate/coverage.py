@@ -49,10 +49,6 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
     """Returns the smallest and the largest value of each quantity in a survey, by name.
 
     An overlap is left out if no pair of planned images has one.
-
-    Args:
-        mission: the survey.
-        matchability: matchability of its floor.
     """
     overlap = planned_overlap(mission, _OVERLAP_PAIRS)._asdict()
     overlaps = {f"overlap_{name}": (value, value) for name, value in overlap.items() if value is not None}
@@ -97,10 +93,6 @@ def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str,
 
     The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; an end
     that is not named is unlimited. Quantities without a fitted range are not checked.
-
-    Args:
-        conditions: smallest and largest value of each quantity in the survey, by name.
-        fitted: smallest and largest value of each quantity in the surveys of the fit, by name.
     """
     found = []
     for name in [name for name in fitted if name in conditions]:

@@ -84,7 +84,6 @@ class DepthLaw(NamedTuple):
 
         Args:
             bound_px: Cramér-Rao bound [px].
-            lamp_share: fraction of the reflected light that comes from the lamps.
         """
         lamp_factor = np.hypot(1, self.lamp_growth * np.asarray(lamp_share))
         return np.hypot(self.floor_px, self.slope * np.asarray(bound_px)) * lamp_factor
@@ -100,7 +99,6 @@ class DepthLaw(NamedTuple):
         """Returns the variance after n keyframes, divided by that of one keyframe.
 
         Args:
-            n_views: number of keyframes.
             step_baselines: distance between consecutive keyframes [stereo baselines].
             bound_px: Cramér-Rao bound [px].
         """

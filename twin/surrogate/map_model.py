@@ -254,11 +254,8 @@ class MapModel:
         that observed a cell determine the standard deviation of its height and whether it has one.
 
         Args:
-            observed: cells that the keyframe observes.
             following: cells that the next keyframe observes; None for the last one.
             cov: (6, 6) covariance of the estimated pose, in camera axes.
-            errors: distribution of the depth errors, and their part that is common to all keyframes.
-            rng: random generator of the depth errors that are independent between keyframes.
 
         Returns:
             The patch, or None if the field of view does not overlap the grid.
@@ -286,18 +283,12 @@ class MapModel:
         )
 
     def _poses_of(self, true: Array) -> Array:
-        """Returns three matrices (3, 4, 4) for a pose (4, 4) of the left camera.
-
-        They are camera_from_world and world_from_camera of the left camera, and world_from_camera of the right camera.
-        """
+        """Returns three matrices (3, 4, 4) for a pose (4, 4) of the left camera."""
         right_from_left = geometry.pose(np.eye(3), np.array([self._rig.baseline_m, 0.0, 0.0]))
         return np.stack([geometry.inverse(true), true, true @ right_from_left])
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
         """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive.
-
-        They cover the footprint of the image on a plane at the lowest height of the floor, or the whole grid if the
-        image (nearly) shows the horizon.
         """
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
@@ -332,9 +323,7 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
     Their standard deviation exceeds 1 if the array has fewer rows or columns than the window.
 
     Args:
-        shape: number of rows and columns.
         window_cells: side of the window [cells].
-        rng: random generator.
     """
     noise = rng.standard_normal(shape, np.float32)
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
@@ -358,10 +347,7 @@ def _border_of(camera, x, y, disparity):
 
 @kernel
 def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
-    """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error.
-
-    Used only with calibration errors or an approximated port: pose errors alone are much smaller than a cell.
-    """
+    """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error."""
     x, y, z = point
     px, py, _ = _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z)
     return 2 * x - px, 2 * y - py, z + slope[0] * (x - px) + slope[1] * (y - py)
@@ -395,11 +381,6 @@ def _estimated_position(camera_from_world, camera, view, estimated_from_true, x,
 
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
     """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast.
-
-    A cell may be hidden if part of the floor rises above a line that starts at the cell with slope `_HIDING_SLOPE`.
-    Lower floor can hide it only from rays more than 45 deg from the vertical; this is neglected. The floor is
-    searched in square windows whose size doubles, up to the distance at which the range of the heights is too small to
-    reach the line.
     """
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m))
     hidden, radius, relief_m = np.zeros(height.shape, np.bool_), 1, float(np.ptp(height))
@@ -416,7 +397,6 @@ def roughness(height_m: Map, window_cells: float) -> Map:
 
     Args:
         height_m: (rows, cols) heights; NaN is replaced by the lowest height.
-        window_cells: side of the window in cells; rounded to an odd number, at least 3.
     """
     side = _odd(window_cells)
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
@@ -441,7 +421,6 @@ def step_slope(height_m: Map, cell_m: float) -> Map:
 
     Args:
         height_m: (rows, cols) heights; NaN is replaced by the lowest height.
-        cell_m: side of a cell.
     """
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
     steps = []
@@ -465,7 +444,6 @@ def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     Args:
         roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
         slope: (rows, cols) slope of the cells [m/m]; see `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
-        window_cells: side of the matching window in cells; rounded to an odd number, at least 3.
     """
     side = _odd(window_cells)
     near_wall = maximum_filter(slope, side) > WALL_SLOPE
@@ -480,7 +458,6 @@ def edge_border_factor(border_px: Array, height_px: int) -> Array:
 
     Args:
         border_px: (n,) distances.
-        height_px: height of the images.
     """
     return 1 + EDGE_BORDER_SHARE * np.exp(-EDGE_BORDER_DECAY * border_px / height_px)
 
@@ -552,8 +529,6 @@ def _observe(out, row, col, cells, camera, view, image_information, poses, estim
 @kernel(inline="always")
 def _information_at(table, camera, x, y):
     """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation.
-
-    The values hold at the centres of the blocks; beyond the centres of the outermost blocks they are constant.
     """
     focal, cx, cy, right, bottom, _ = camera
     rows, cols = table.shape
@@ -588,12 +563,7 @@ def _sample_patch(
     out, variance, systematic, floor, runs, fused, observed, following, step, camera, view,
     camera_from_world, estimated_from_true, position, cov, depth_noise, errors,
 ):  # fmt: skip
-    """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m].
-
-    Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
-    the lateral error and walls to `systematic`. Updates the arrays of `runs` and `fused`. The mean depth is over the
-    cells that have a height; 0 without any. A height that is not finite raises a FloatingPointError: it is no hole.
-    """
+    """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m]."""
     (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px, information) = floor, observed
     next_row, next_col, next_depth_m = following
     views, step_baselines, best_border_px, border_distance_px, bound_ratio = fused
@@ -678,7 +648,6 @@ def relief_error_px(rough_px, gain, limit_px):
 
     Args:
         rough_px: roughness of the cell [px of disparity].
-        gain, limit_px: `ErrorModel.relief_error_gain` and `ErrorModel.relief_error_limit_px`.
     """
     share = (gain * rough_px / max(limit_px, 1e-9)) ** 2
     return limit_px * share / np.sqrt(1 + share**2)
@@ -695,10 +664,7 @@ def _relative_variance(law, n_views, step_baselines, noise_share):
 
 @kernel(inline="always")
 def _interval(ascending, value):
-    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it.
-
-    A value outside the table is replaced by the nearest end of the table.
-    """
+    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it."""
     k = 0
     while k < len(ascending) - 2 and value > ascending[k + 1]:
         k += 1

@@ -201,12 +201,7 @@ class Matchability:
         return float(np.sqrt(self.depths_m[0] * self.depths_m[-1]))
 
     def _set_image_scale(self, images: FloorImages, albedos: list[Image]) -> None:
-        """Sets `binning`, `bounds_px` and `clear_share`.
-
-        As in `image_scale.choose_binning`, the binning is the smallest one at which enough corners are matched, i.e.
-        whose bound at the medium depth is below `_CORNERS_BOUND_PX`, or else the one with the smallest such bound; 1 if
-        these bounds are infinite.
-        """
+        """Sets `binning`, `bounds_px` and `clear_share`."""
         best_px = np.inf
         for binning in BINNINGS:
             if images.rig.width_px % binning or images.rig.height_px % binning:
@@ -365,8 +360,6 @@ def unevenness_px(
     limit the influence of matches with large residuals.
 
     Args:
-        scenario: description of the survey.
-        terrain: true floor.
         depths_m: (n,) depths of the floor along the optical axis [m].
         locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
             centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
@@ -398,10 +391,7 @@ def floor_albedos(images: FloorImages, terrain: terrains.Terrain, depths_m: Arra
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns the texture of the floor's photos or mesh, or else a generated one, and its texel size [m].
-
-    The generated one has the side `extent_m`, limited by the size of the terrain.
-    """
+    """Returns the texture of the floor's photos or mesh, or else a generated one, and its texel size [m]."""
     t = scenario.terrain
     if t.texture_file is not None or t.orthophoto_file is not None or t.kind == "mesh":
         return terrain.texture, terrain.texture_px_m
@@ -414,10 +404,7 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
 
 
 def _painted_centre(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns the generated texture of the central part of a floor from a file, and its texel size [m].
-
-    The part has at least 5 x 5 nodes, where the floor has as many.
-    """
+    """Returns the generated texture of the central part of a floor from a file, and its texel size [m]."""
     n_cells = max(4, math.ceil(extent_m / terrain.spacing_m))
     first = [max(0, (n - 1 - n_cells) // 2) for n in terrain.height_m.shape]
     height_m = terrain.height_m[first[0] :, first[1] :][: n_cells + 1, : n_cells + 1]

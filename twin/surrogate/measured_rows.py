@@ -53,7 +53,6 @@ class MeasuredRows:
         """Adds the row differences of a stereo pair.
 
         Args:
-            observation: stereo observation of the pair, without row differences.
             points: (n, 3) true normalised (x, y, disparity) of points that are matched; they represent
                 `observation.n_points` points.
             sigma_px: standard deviation of a match in one image [px].
@@ -78,13 +77,7 @@ class MeasuredRows:
         return self._calibration.report()
 
     def _add(self, points: Array, rows_px: Array, sigma_px: float) -> None:
-        """Updates the estimate of the rectification errors with the row differences (n,) [px] of true points (n, 3).
-
-        Args:
-            points: (n, 3) true normalised (x, y, disparity).
-            rows_px: (n,) row of the right image minus row of the left image [px].
-            sigma_px: standard deviation of the row differences [px].
-        """
+        """Updates the estimate of the rectification errors with the row differences (n,) [px] of true points (n, 3)."""
         n, (left, _) = len(points), self._positions_px(points)
         cov = np.tile(np.eye(3) * (sigma_px / 2 / self._rig.focal_px) ** 2, (n, 1, 1))
         measured, zeros = self._view.measure(points), np.zeros((n, 2))
@@ -94,11 +87,7 @@ class MeasuredRows:
         self._calibration.add(pair, self._rig, self._patch_px)
 
     def _positions_px(self, points: Array) -> tuple[Array, Array]:
-        """Returns the measured positions (n, 2) of points in the left and the right image [px].
-
-        Args:
-            points: (n, 3) true normalised (x, y, disparity).
-        """
+        """Returns the measured positions (n, 2) of points in the left and the right image [px]."""
         measured, rows = self._view.measure(points), self._view.row_difference(points)
         centre = [self._rig.cx_px, self._rig.cy_px]
         left = np.column_stack([measured[:, 0], measured[:, 1] - rows / 2])

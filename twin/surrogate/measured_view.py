@@ -115,8 +115,6 @@ def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> Meas
     """Returns the measured view of a stereo rig.
 
     Args:
-        cameras: geometry of the true cameras.
-        rig: believed calibration.
         depths_m: (m,) ascending depths of the floor [m].
     """
     if cameras.sampling is None and cameras.rendered_rig.baseline_m == rig.baseline_m:
@@ -155,11 +153,7 @@ def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, A
 
 
 def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
-    """Returns the rectification errors (4,) that the estimators remove from the right image: `MeasuredView.removed`.
-
-    They are fitted to the row differences of the points at the middle disparity that lie inside both images. They are
-    zero if there are too few points, or if they change no row by more than `NOTICEABLE_PX`.
-    """
+    """Returns the rectification errors (4,) that the estimators remove from the right image: `MeasuredView.removed`."""
     middle = _SHAPE[0] // 2
     left, right = left[middle].reshape(-1, 2), right[middle].reshape(-1, 2)
     half = np.array([rig.width_px, rig.height_px]) / 2 / rig.focal_px
@@ -231,10 +225,7 @@ def measure_point(table, x, y, disparity):
 
 @kernel(inline="always")
 def _interval(position, n):
-    """Returns the index of the grid interval that contains a position, and the relative position in it.
-
-    The grid has n points. The relative position is 0 to 1 inside the grid, and below 0 or above 1 outside.
-    """
+    """Returns the index of the grid interval that contains a position, and the relative position in it."""
     k = min(max(int(np.floor(position)), 0), n - 2)
     return k, position - k
 

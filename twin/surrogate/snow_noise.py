@@ -55,9 +55,7 @@ def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patc
 
     Args:
         clean: noise-free images of the same floor without snow, one for each view [grey levels].
-        snowy: the same images with snow.
         noise: standard deviation of the image noise [grey levels].
-        patch_px: side of the matched patches.
     """
     weights, errors, n_patches = [], [], 0
     for k in range(len(clean)):
@@ -81,12 +79,6 @@ def _patches(
     """Returns how patches at every second pixel are matched.
 
     Three arrays (n,): variance of the matched position [px^2], its error due to snow [px], whether it is matched.
-
-    Args:
-        clean: noise-free image without snow.
-        snow: change of the grey levels by snow in each of the two images.
-        noise: standard deviation of the image noise.
-        patch_px: side of the patches.
     """
     n = patch_px**2
     gradient = np.gradient(clean, axis=1)

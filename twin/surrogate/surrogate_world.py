@@ -103,11 +103,7 @@ class SurrogateWorld(World):
 
 
 def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Matchability) -> tuple[str, ...]:
-    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`.
-
-    Raises:
-        UnmodelledError: the survey lies outside this range, and `imaging.extrapolate` is not set.
-    """
+    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`."""
     found = fitted.quantities_outside_fit(survey_conditions(mission, matchability))
     if not found:
         return ()
@@ -146,10 +142,7 @@ def surrogate_vision(
     """Returns the `SurrogateVision` of a mission.
 
     Args:
-        mission: the survey to fly.
-        model: error model of the measurements.
         true_pose: function that returns the current true world_from_camera (4, 4) of the left camera.
-        stopwatch: timer of the stages.
 
     Raises:
         UnmodelledError: marine snow prevents all matches at `Matchability.medium_depth_m`.

@@ -307,31 +307,17 @@ class SurrogateVision:
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
     def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
-        """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image.
-
-        Args:
-            indices: (n,) indices of the points in the raster.
-            depth_m: depth of every point of the raster [m].
-        """
+        """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image."""
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
     def _matchable(self, indices: NDArray[np.int64], depth_m: Array) -> float:
-        """Returns the fraction of the given raster points whose measured positions satisfy the epipolar constraint.
-
-        Args:
-            indices: (n,) indices of the points in the raster.
-            depth_m: depth of every point of the raster [m].
-        """
+        """Returns the fraction of the given raster points whose measured positions satisfy the epipolar constraint."""
         if self._rows is None:
             return 1.0
         return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the points whose patches lie inside both images and satisfy the epipolar constraint.
-
-        Args:
-            indices: (n,) indices of the points in the raster.
-            depth_m: depth of every point of the raster [m].
         """
         points = self._true_points(indices, depth_m)
         measured = self.scene.view.measure(points)
@@ -356,11 +342,7 @@ class SurrogateVision:
         self.last_normals, self._tracking_cov = np.zeros(6), cov
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow.
-
-        Args:
-            sigma_px: standard deviation of a flow vector.
-        """
+        """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow."""
         assert self._latest is not None
         sigma = sigma_px / self.rig.focal_px
         return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2
@@ -404,13 +386,7 @@ class SurrogateVision:
             self._keyframes.pop(number, None)
 
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
-        """Returns links as `measure_motions` does, sampled from the given error model.
-
-        Args:
-            node: the later keyframe of all links.
-            others: the earlier keyframes.
-            model: error model of the measurements.
-        """
+        """Returns links as `measure_motions` does, sampled from the given error model."""
         with self.stopwatch("network"):
             assert self._latest is not None
             later = self._keyframes.get(node.number, self._latest)
@@ -420,15 +396,6 @@ class SurrogateVision:
         self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
         """Samples the motion between two keyframes; None if the number or the fraction of matched points is too small.
-
-        The motion is estimated from noisy points by least squares, starting at the true motion: in one iteration, or in
-        several if `TrueScene.view` is not ideal. The random numbers that belong to the link alone depend only on the
-        two keyframe numbers, not on the order in which links are measured.
-
-        Args:
-            later, earlier: the two keyframes.
-            number, other: their numbers, in the same order.
-            model: error model of the measurements.
         """
         bound_px = max(later.bound_px, earlier.bound_px)
         n = len(later.points)
@@ -505,10 +472,7 @@ class SurrogateVision:
 
     @np.errstate(invalid="raise")
     def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
-        """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells.
-
-        `CellErrors` holds their random numbers and standard deviations.
-        """
+        """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells."""
         lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
         cells = self.scene.map_model.correlated_cells
         relief_noise, cell_noise, wall_noise = (window_noise(shape, cells, self._rng) for _ in range(3))
@@ -537,10 +501,7 @@ class SurrogateVision:
         )  # fmt: skip
 
     def _bound_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
-        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and two arrays of factors (q,).
-
-        The factors are those on the true and on the reported standard deviation of depth at these ratios.
-        """
+        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and two arrays of factors (q,)."""
         scene = self.scene.matchability
         medium_px = scene.medium_bound_px * scene.texture.median_ratio
         laws = model.depth_laws(self.binning)
@@ -561,7 +522,6 @@ def match_sigma_px(model: ErrorModel, bound_px: float, stereo_parallax_px: float
     """Returns the reported standard deviation of a patch's position in one image [px].
 
     Args:
-        model: error model of the measurements.
         bound_px: Cramér-Rao bound [px].
         stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
     """
@@ -582,11 +542,6 @@ def overlap_inflation(n_points: float, rig: StereoRig, patch_px: int) -> float:
 
     It is the expected value of `matching.variance_inflation` for patches spread over the image at random, which share a
     fraction patch_px^2 / (width height) of their pixels on average.
-
-    Args:
-        n_points: number of patches.
-        rig: calibration, for the image size.
-        patch_px: side of the patches.
     """
     return 1 + n_points * patch_px**2 / (rig.width_px * rig.height_px)
 
@@ -599,10 +554,6 @@ def _parallax_px(keyframe: _KeyframeTruth, earlier_pose: Array, baseline_m: floa
 
 def _raster(rig: StereoRig, margin_px: float) -> Array:
     """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the part of the image with matches.
-
-    Args:
-        rig: calibration, for the image size.
-        margin_px: smallest distance of the centre of a matched patch from the image border.
     """
     sides = (rig.height_px, rig.width_px)
     rows, cols = (

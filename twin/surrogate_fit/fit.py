@@ -53,10 +53,6 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     """Returns the error model that reproduces the statistics of rendered surveys.
 
     `match_parallax_px` and `common_bias_px` are not fitted; they are those of the compared model.
-
-    Args:
-        surveys: statistics of each survey; all of them complete (`rendered_surveys.fit_to_surveys`).
-        compared: error model of the surrogate with which the surveys were compared.
     """
     bounds = np.array([np.median(s["bound_px"]) for s in surveys])
 
@@ -121,13 +117,7 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
 
 
 def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted: ErrorModel) -> dict[str, float]:
-    """Returns the RMS over surveys of ln(reported / fitted standard deviation), by name of the error model's field.
-
-    Args:
-        surveys: statistics of each survey.
-        compared: error model of the surrogate with which the surveys were compared.
-        fitted: error model fitted to the surveys.
-    """
+    """Returns the RMS over surveys of ln(reported / fitted standard deviation), by name of the error model's field."""
 
     def match_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
         return match_sigma_px(model, float(np.median(s["bound_px"])), float(np.median(s["stereo_parallax_px"])))
@@ -150,10 +140,7 @@ def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
-    """Returns the `SigmaLaw` fitted to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px].
-
-    Residuals are differences of logarithms.
-    """
+    """Returns the `SigmaLaw` fitted to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px]."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
@@ -163,15 +150,7 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
 
 
 def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarray) -> tuple[SigmaLaw, float]:
-    """Returns `match_sigma_px` and `stereo_relief_gain` of the error model, fitted to reported standard deviations.
-
-    Residuals are differences of logarithms.
-
-    Args:
-        bounds: (n,) Cramér-Rao bounds [px].
-        parallax: (n,) RMS parallax of the relief in a patch between the two cameras [px].
-        sigmas: (n,) reported standard deviations of a patch's position in one image [px].
-    """
+    """Returns `match_sigma_px` and `stereo_relief_gain` of the error model, fitted to reported standard deviations."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.sqrt(x[0] ** 2 + (x[1] * bounds) ** 2 + (x[2] * parallax) ** 2) / sigmas)
@@ -182,10 +161,7 @@ def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarra
 
 
 def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float = 1.0) -> FractionLaw:
-    """Returns the `FractionLaw` with exponent 4 fitted to fractions (n,) at Cramér-Rao bounds (n,) [px].
-
-    Residuals much larger than `outlier` have less weight.
-    """
+    """Returns the `FractionLaw` with exponent 4 fitted to fractions (n,) at Cramér-Rao bounds (n,) [px]."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.array([FractionLaw(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - fractions
@@ -220,25 +196,7 @@ class _LinkErrors(NamedTuple):
 def _fit_link_errors(
     surveys: Sequence[SurveyStatistics], match_ratios: np.ndarray, lamp_share: np.ndarray, compared: ErrorModel
 ) -> _LinkErrors:
-    """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe.
-
-    Errors due to relief grow with the unevenness of the floor and with the distance between the keyframes. The links of
-    each survey are therefore sorted by distance and divided into thirds. Match error ratio, relief gain and the growth
-    of both under lamps are fitted to the mean squared errors of all thirds of all surveys. Residuals are differences of
-    logarithms; large ones have less weight. Over smooth floors the errors do not determine the relief gain. The gain of
-    the compared model, or `RELIEF_GAIN` if that is larger, is therefore a weak prior.
-
-    Due to the bias of a keyframe, the errors of two consecutive links cancel partly, because the keyframe ends the
-    first link and starts the second. Relief causes equal errors in both. The bias fraction is fitted to the scalar
-    products of the errors of consecutive links. Loops of three keyframes do not determine the bias, because links from
-    the same keyframe have correlated errors.
-
-    Args:
-        surveys: statistics of n surveys.
-        match_ratios: (n,) ratio of the standard deviations of matches reported by images and by the compared model.
-        lamp_share: (n,) fraction of the reflected light that comes from the lamps.
-        compared: error model of the surrogate with which the surveys were compared.
-    """
+    """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe."""
     images, by_patches, by_relief = np.array([_squared_errors_by_distance(s) for s in surveys]).transpose(2, 0, 1)
     reported, share = np.square(match_ratios)[:, None], lamp_share[:, None]
     by_relief = by_relief / (RELIEF_GAIN**2 * (1 + (compared.lamp_error_growth * share) ** 2))
@@ -261,17 +219,7 @@ def _fit_link_errors(
 
 
 def _fit_lamp_growth(ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
-    """Fits c and k of the law c sqrt(1 + (k lamp_share)^2) to ratios of standard deviations.
-
-    Residuals are differences of logarithms; large ones have less weight.
-
-    Args:
-        ratios: (n,) ratios, one per survey.
-        lamp_share: (n,) fraction of the reflected light that comes from the lamps, one per survey.
-
-    Returns:
-        The ratio c without lamps, and its growth k.
-    """
+    """Fits c and k of the law c sqrt(1 + (k lamp_share)^2) to ratios of standard deviations."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return x[0] + np.log1p((x[1] * lamp_share) ** 2) / 2 - np.log(ratios)
@@ -282,11 +230,7 @@ def _fit_lamp_growth(ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float,
 
 
 def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
-    """Returns mean normalised squared link errors (3, 3), with a row per third of the links and a column per source.
-
-    The links are divided into thirds by distance. The sources are those of `_SOURCES`. The largest 5 % of the squared
-    errors in each third are excluded.
-    """
+    """Returns mean normalised squared link errors (3, 3), with a row per third of the links and a column per source."""
     errors = np.column_stack([statistics[f"link_nees_{name}"] for name in _SOURCES])
     order = np.argsort(statistics["link_distance"])
     thirds = (np.sort(errors[third], axis=0) for third in np.array_split(order, 3))
@@ -299,10 +243,6 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
     At distance zero, both stereo pairs of a link contribute the same variance. The contribution of the earlier pair is
     multiplied by 1 + (growth * distance)^2, so the variance of the link is multiplied by
     1 + (growth * distance)^2 / 2. The distance is computed by `SurrogateVision.distance_in_depths`.
-
-    Returns:
-        The growth; and, for each of n surveys, the ratio of the standard deviation of links reported for image
-        measurements to the one that the surrogate reports, extrapolated to distance zero.
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [
@@ -322,10 +262,7 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
 
 def _matched_without_relief(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
-    """Returns the median ratio (n,) of matched points, images / surrogate, of the links with the least parallax.
-
-    These are the links up to the median parallax of the survey.
-    """
+    """Returns the median ratio (n,) of matched points, images / surrogate, of the links with the least parallax."""
     ratios = []
     for s in surveys:
         parallax, matched = np.array(s["link_parallax_px"]), np.array(s["link_matched"])
@@ -350,11 +287,7 @@ def _fit_completeness(surveys: Sequence[SurveyStatistics], compared: FractionLaw
 
 
 def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> float:
-    """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey.
-
-    Surveys without smooth cells are left out. Returns the value of the compared model if none of the others has rough
-    cells.
-    """
+    """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey."""
     roughness, fractions, weights = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for s in surveys:
         if (smooth := _known_smooth_fraction(s)) is None:
@@ -372,13 +305,7 @@ def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> 
 
 
 def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErrorLaw) -> BorderErrorLaw:
-    """Fits the `BorderErrorLaw` to errors and reported standard deviations of cells near the image borders.
-
-    The data are the ratios of `border_error_ratio` and `border_sigma_ratio` (map from images / sampled map), relative
-    to the median of the ratios of the same survey farther than `_FAR_PX` from the border. Residuals are differences of
-    logarithms; large ones have less weight. The result is the compared law if no survey has cells both near the border
-    and far from it.
-    """
+    """Fits the `BorderErrorLaw` to errors and reported standard deviations of cells near the image borders."""
     rows = []
     for s in surveys:
         distance = np.array(s.get("border_distance_px", ()))
@@ -400,11 +327,7 @@ def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErro
 
 
 def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) -> BorderLaw:
-    """Fits the `BorderLaw` to the fractions of smooth cells without a height, by distance from the image border.
-
-    The fractions are relative to the smooth cells of the same survey away from the border. Every survey with such cells
-    has the same weight; without any, the result is the compared law.
-    """
+    """Fits the `BorderLaw` to the fractions of smooth cells without a height, by distance from the image border."""
     rows: list[tuple[float, ...]] = []
     for s in surveys:
         if (smooth := _known_smooth_fraction(s)) is None:
@@ -515,12 +438,7 @@ class _MapClasses(NamedTuple):
 
 
 def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClasses:
-    """Returns the classes of cells of all surveys, with the quantities of `comparison.MAP_STATISTICS`.
-
-    Args:
-        surveys: statistics of n surveys.
-        quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-    """
+    """Returns the classes of cells of all surveys, with the quantities of `comparison.MAP_STATISTICS`."""
     rows, conditions = [], []
     for number, s in enumerate(surveys):
         classes = [name for name in s if name.startswith(f"map_{quantity}_")]
@@ -537,27 +455,7 @@ def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClas
 
 
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
-    """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
-
-    The model variance of a class is that of the map with pose errors alone, plus one term for each of depth
-    (`DepthLaw`), lateral shift, relief within the matching window, and walls. The terms for depth, lateral shift and
-    walls are the variance that a unit error adds to a sampled map, times a fitted factor. The relief error is common to
-    all views of a cell, so the fusion of several tracks does not reduce it, and its variance follows from the height
-    per pixel of disparity. The reported variances of the map with pose errors alone already contain the effects of a
-    lateral shift and of relief.
-
-    The sum is not exact, because the map computes part of its variance from the heights around a cell, and errors of
-    these heights have the effect of relief. The model variance is therefore multiplied by the ratio of the variance in
-    the map sampled from the compared model to the model variance with the compared parameters. Repeated fits converge
-    if each uses the result of the previous fit as the compared model. Residuals are differences of logarithms. The
-    parameters of `_MapErrors.binned` are fitted to the surveys with binned images, after all others have been fitted to
-    the surveys without binning.
-
-    Args:
-        surveys: statistics of n surveys.
-        quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-        compared: compared error model; its values are the start of the fit and a weak prior of the parameters.
-    """
+    """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells."""
     is_error = quantity == "error"
     edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
     laws = (compared.depth_error, compared.depth_binned_error) if is_error else (
@@ -612,16 +510,7 @@ def _robust_scatter(departures: np.ndarray) -> float:
 
 
 def _fit_texture_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw) -> ScatterLaw:
-    """Fits the `ScatterLaw` of the reported standard deviation of depth over the cells of a map.
-
-    The scatter of a survey is the median over its classes of level cells. Returns the compared law if no survey has
-    such a class. Residuals much larger than `_OUTLIER` have less weight. Surveys with binned images are included: their
-    bounds and textures are those of the binned images.
-
-    Args:
-        surveys: statistics of n surveys.
-        compared: law of the compared model.
-    """
+    """Fits the `ScatterLaw` of the reported standard deviation of depth over the cells of a map."""
     rows = [
         (np.median(s["bound_px"]), s["texture_scatter"][0], np.median([s[x][0] for x in s if x.startswith(_LEVEL)]))
         for s in surveys
@@ -646,10 +535,6 @@ def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> 
     the ratio of the 90th percentile of their absolute values to the median grows in proportion to s^2 for small s. The
     tail of a survey is the median of this logarithm over its classes, minus that of normal errors. Returns the compared
     value if no sampled map has heavier tails than normal errors.
-
-    Args:
-        surveys: statistics of n surveys.
-        compared: value of the compared model.
     """
     tails = [
         np.median([np.log(np.divide(s[name], _NORMAL_TAIL)) for name in s if name.startswith(_LEVEL_TAILS)], axis=0)
