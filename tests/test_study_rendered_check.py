@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from study_surveys import study_of
 
+from twin.engines.engine import Outcome
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.engine import Outcome
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
 from twin.studies.rendered_check import FOLDER, RenderedCheck, check, nearest_surveys, summary

@@ -13,10 +13,10 @@ from twin.errors import ScenarioError, UnmodelledError
 from twin.studies import flight, wording
 from twin.studies.analysis import StudyAnalysis, mask_numbers
 from twin.studies.flight import row_of
+from twin.studies.report import summary as summary_of
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
 from twin.studies.statistics import wilson_interval
-from twin.studies.summary import summary as summary_of
 from twin.studies.surveys import survey_keys, surveys
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from twin.studies import statistics
-from twin.studies.design import design_points
+from twin.studies.surveys import design_points
 
 
 @pytest.mark.parametrize(("passed", "count"), [(0, 10), (3, 10), (10, 10), (86, 100), (1, 1)])

@@ -9,13 +9,13 @@ from study_surveys import SerialEngine, study_of
 
 from twin.app import study_command
 from twin.errors import ScenarioError
-from twin.studies import candidates, tuning_report
-from twin.studies.candidates import cost_index, tuning_config
-from twin.studies.correction import NO_CORRECTION, PlanRatio, correction_at, metric_ratio
 from twin.studies.distribution import Distribution
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
-from twin.studies.tuning import tune
+from twin.tuning import candidates, tuning_report
+from twin.tuning.candidates import cost_index, tuning_config
+from twin.tuning.correction import NO_CORRECTION, PlanRatio, correction_at, metric_ratio
+from twin.tuning.rounds import tune
 
 TUNING = """
 scenario = "reef"

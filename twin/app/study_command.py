@@ -12,14 +12,15 @@ from typing import NamedTuple
 from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.core.output_folder import sole_writer
+from twin.engines.engine import Engine, LocalEngine, default_jobs
 from twin.errors import TwinError
-from twin.studies import agreement, agreement_report, rendered_check, summary, tuning, tuning_report, wording
-from twin.studies.candidates import tuning_config
-from twin.studies.engine import Engine
-from twin.studies.local_engine import LocalEngine, default_jobs
+from twin.studies import agreement, rendered_check, report, wording
 from twin.studies.progress import study_progress
 from twin.studies.runner import StudyResult, run_study
 from twin.studies.study_file import Study, load_study
+from twin.tuning import rounds as tuning
+from twin.tuning import tuning_report
+from twin.tuning.candidates import tuning_config
 
 SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
@@ -71,7 +72,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
     if scheduler:
         if find_spec("distributed") is None:
             raise TwinError("--scheduler", "Dask is not installed", "pip install 'seabed-twin[cluster]'")
-        from twin.studies import dask_engine
+        from twin.engines import dask_engine
 
         is_slurm = scheduler == SLURM
         with dask_engine.start_slurm_jobs(jobs) if is_slurm else dask_engine.connect_scheduler(scheduler) as engine:
@@ -102,7 +103,7 @@ def run(file: str, options: StudyOptions) -> int:
     if options.as_json:
         identity = {"name": study.name, "out": str(folder), "throughput": result.throughput._asdict()}
         identity |= {} if checked is None else {"rendered_check": rendered_check.summary(checked)}
-        print(json.dumps(summary.summary(result.analysis, identity), indent=1))
+        print(json.dumps(report.summary(result.analysis, identity), indent=1))
     else:
         _print_result(study, result)
         if checked is not None:
@@ -181,7 +182,7 @@ def _print_result(study: Study, result: StudyResult) -> None:
     ]
     console.print_table(f"{study.name}: median and 95 % bound of the surveys", rows)
     if (compared := agreement.agreement(analysis)) is not None:
-        console.print_table(agreement_report.verdict_line(compared), agreement_report.table(compared))
+        console.print_table(agreement.verdict_line(compared), agreement.table(compared))
     if analysis.refusal_reasons:
         reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
         samples = wording.sample_count(len(analysis.refused_samples))

@@ -15,9 +15,9 @@ from twin.judge.map_error import with_completeness
 from twin.judge.require import more_is_better
 from twin.studies import statistics
 from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values
-from twin.studies.design import axis_names
 from twin.studies.statistics import Array, Interval, SobolIndex
 from twin.studies.study_file import Study
+from twin.studies.surveys import axis_names
 
 _MAX_REASONS = 12
 _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them

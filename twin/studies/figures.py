@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib
@@ -26,14 +26,15 @@ _MAX_POINTS = 3000
 _ROW_IN = 2.7
 
 
-def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
-    """Returns the figures for which the study has data, as a dictionary from figure name to data URI."""
+def draw_all(analysis: StudyAnalysis, further: Mapping[str, Callable[[StudyAnalysis], Figure]]) -> dict[str, str]:
+    """Returns the figures for which the study has data, and `further` ones, as {figure name: data URI}."""
     drawings: dict[str, Callable[[], Figure | None]] = {
         "pass_probability": lambda: pass_probability(analysis),
         "histograms": lambda: metric_histograms(analysis, analysis.metric_summaries),
         "sensitivity": lambda: sensitivity(analysis.sensitivities),
         "key_histograms": lambda: key_histograms(analysis),
     } | {f"metric.{metric}": lambda metric=metric: metric_by_key(analysis, metric) for metric in analysis.metrics}
+    drawings |= {name: lambda draw=draw: draw(analysis) for name, draw in further.items()}
     with matplotlib.rc_context(FIGURE_STYLE):
         figures = {name: draw() for name, draw in drawings.items()}
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}

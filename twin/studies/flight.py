@@ -11,8 +11,7 @@ from typing import Any
 from uuid import uuid4
 
 from twin.errors import ScenarioError, TwinError, UnmodelledError
-from twin.studies.design import Sample
-from twin.studies.surveys import Survey
+from twin.studies.surveys import Sample, Survey
 
 Row = dict[str, Any]
 #: Files of a run folder that are kept, by the value of the study's `keep`; "all" keeps every file, "none" no file.

@@ -11,17 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.engines.engine import Engine
 from twin.judge.require import more_is_better
 from twin.studies import wording
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.design import samples
-from twin.studies.engine import Engine
 from twin.studies.flight import Row, has_passed
 from twin.studies.progress import StudyProgress
 from twin.studies.runner import check_results, fly_surveys, open_folder
 from twin.studies.statistics import Array, Interval, wilson_interval
 from twin.studies.study_file import Study
-from twin.studies.surveys import Survey, surveys
+from twin.studies.surveys import Survey, samples, surveys
 
 FOLDER = "rendered"  #: subfolder of the results folder
 

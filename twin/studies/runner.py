@@ -10,18 +10,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
+from twin.engines.engine import Engine, Outcome
+from twin.engines.worker import TaskLimits
 from twin.errors import TwinError
-from twin.studies.agreement_report import write_document
+from twin.studies.agreement import write_document
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.design import samples, seeds_of_sample
-from twin.studies.engine import Engine, Outcome
 from twin.studies.flight import Row, fly, refused_row, row_of
 from twin.studies.progress import StudyProgress
 from twin.studies.report import write_report
 from twin.studies.results_log import JOURNAL_FILE, ResultsLog, write_parquet
 from twin.studies.study_file import Study
-from twin.studies.surveys import Survey, refusals, survey_keys, surveys
-from twin.studies.worker import TaskLimits
+from twin.studies.surveys import Survey, refusals, samples, seeds_of_sample, survey_keys, surveys
 
 
 class Throughput(NamedTuple):

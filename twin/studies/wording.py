@@ -197,8 +197,7 @@ def limit_relation(metric: str) -> str:
 
 
 def _requirement(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on whether the pass probability reaches the required one, and whether more surveys are needed.
-    """
+    """Returns a sentence on whether the required pass probability is reached, and whether more surveys are needed."""
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None:
         return ""

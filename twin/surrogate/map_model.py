@@ -288,8 +288,7 @@ class MapModel:
         return np.stack([geometry.inverse(true), true, true @ right_from_left])
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive.
-        """
+        """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive."""
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
@@ -380,8 +379,7 @@ def _estimated_position(camera_from_world, camera, view, estimated_from_true, x,
 
 
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
-    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast.
-    """
+    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast."""
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m))
     hidden, radius, relief_m = np.zeros(height.shape, np.bool_), 1, float(np.ptp(height))
     while radius * cell_m * _HIDING_SLOPE < relief_m:
@@ -528,8 +526,7 @@ def _observe(out, row, col, cells, camera, view, image_information, poses, estim
 
 @kernel(inline="always")
 def _information_at(table, camera, x, y):
-    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation.
-    """
+    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation."""
     focal, cx, cy, right, bottom, _ = camera
     rows, cols = table.shape
     row = min(max((focal * y + cy + 0.5) / (bottom + 1) * rows - 0.5, 0.0), rows - 1.0)

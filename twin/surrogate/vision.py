@@ -317,8 +317,7 @@ class SurrogateVision:
         return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the points whose patches lie inside both images and satisfy the epipolar constraint.
-        """
+        """Returns the mask (n,) of the points whose patches lie inside both images and satisfy the epipolar constraint."""
         points = self._true_points(indices, depth_m)
         measured = self.scene.view.measure(points)
         left_px = measured[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
@@ -395,8 +394,7 @@ class SurrogateVision:
     def _sample_link(
         self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes; None if the number or the fraction of matched points is too small.
-        """
+        """Samples the motion between two keyframes; None if the number or the fraction of matched points is too small."""
         bound_px = max(later.bound_px, earlier.bound_px)
         n = len(later.points)
         match_fraction = self._match_fraction(later, earlier, model)
@@ -553,8 +551,7 @@ def _parallax_px(keyframe: _KeyframeTruth, earlier_pose: Array, baseline_m: floa
 
 
 def _raster(rig: StereoRig, margin_px: float) -> Array:
-    """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the part of the image with matches.
-    """
+    """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the part of the image with matches."""
     sides = (rig.height_px, rig.width_px)
     rows, cols = (
         margin_px + (np.arange(n) + 0.5) / n * (side - 2 * margin_px) for n, side in zip(_RASTER, sides, strict=True)

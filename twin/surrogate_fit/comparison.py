@@ -296,8 +296,7 @@ class ComparisonVision:
         return height_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
 
     def _count_holes(self, elevation: ElevationMap) -> None:
-        """Adds the number of observed cells and the fraction of them with a height, by roughness and border distance.
-        """
+        """Adds the number of observed cells and the fraction of them with a height, by roughness and border distance."""
         map_model = self.surrogate.scene.map_model
         roughness = self._in_px(map_model.roughness_m)
         seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)

@@ -19,12 +19,21 @@ from twin.judge.require import meets_limit, more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies.analysis import count_similar
-from twin.studies.correction import NO_CORRECTION, PlanCorrection
-from twin.studies.design import Sample, axis_names, samples, seeds_of_sample
 from twin.studies.flight import Row, has_passed, refused_row
 from twin.studies.statistics import Interval, wilson_interval
 from twin.studies.study_file import Study, TuningConfig
-from twin.studies.surveys import Survey, merge_errors, refusals, scenario_of_sample, surveys_of_sample
+from twin.studies.surveys import (
+    Sample,
+    Survey,
+    axis_names,
+    merge_errors,
+    refusals,
+    samples,
+    scenario_of_sample,
+    seeds_of_sample,
+    surveys_of_sample,
+)
+from twin.tuning.correction import NO_CORRECTION, PlanCorrection
 
 _DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not set one
 _POWER_OF_2 = ("sobol", "saltelli")  # designs that need a power of 2 as number of samples

@@ -7,8 +7,15 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from twin.engines.engine import Engine
 from twin.scenario.model import Scenario
-from twin.studies.candidates import (
+from twin.studies.flight import Row, fly
+from twin.studies.progress import StudyProgress
+from twin.studies.results_log import ResultsLog, write_parquet
+from twin.studies.runner import fly_surveys, open_folder
+from twin.studies.study_file import Study, TuningConfig
+from twin.studies.surveys import Survey
+from twin.tuning.candidates import (
     Candidate,
     CandidateSurveys,
     check_bounds,
@@ -18,16 +25,9 @@ from twin.studies.candidates import (
     pareto_front,
     tuning_config,
 )
-from twin.studies.correction import PlanCorrection, correction_at
-from twin.studies.engine import Engine
-from twin.studies.flight import Row, fly
-from twin.studies.progress import StudyProgress
-from twin.studies.results_log import ResultsLog, write_parquet
-from twin.studies.runner import fly_surveys, open_folder
-from twin.studies.search import Search
-from twin.studies.study_file import Study, TuningConfig
-from twin.studies.surveys import Survey
-from twin.studies.verification import Verification, expected_time, verification_of
+from twin.tuning.correction import PlanCorrection, correction_at
+from twin.tuning.search import Search
+from twin.tuning.verification import Verification, expected_time, verification_of
 
 
 class TuningResult(NamedTuple):
@@ -246,8 +246,7 @@ class Tuning:
         self.flights.progress.print_line(verification.notice())
 
     def _announce(self, plan: Candidate, most_plans: int) -> None:
-        """Prints how many rendered surveys of a plan are to be flown, and their expected run time; nothing if none are.
-        """
+        """Prints the number and the expected run time of a plan's rendered surveys that are to be flown, if any."""
         if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
             times = expected_time(self.trials, self.rendered, plan, self.flights.log.rows())
             self.flights.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))

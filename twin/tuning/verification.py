@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from twin.studies.candidates import Candidate, CandidateSurveys, median_of
-from twin.studies.correction import PlanRatio, metric_ratio
 from twin.studies.flight import Row
+from twin.tuning.candidates import Candidate, CandidateSurveys, median_of
+from twin.tuning.correction import PlanRatio, metric_ratio
 
 # Run time of a rendered frame on one CPU core of 2025: 0.023 s for 320 x 240 pixels, 0.07 s for 640 x 480 pixels.
 _FRAME_S = 0.008  # part that does not depend on the image size [s]

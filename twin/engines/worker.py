@@ -62,7 +62,7 @@ class Worker:
         self._pipe, child_end = multiprocessing.Pipe()
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process)
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"from twin.studies import worker; worker.main({child_end.fileno()}, {core})"],
+            [sys.executable, "-P", "-c", f"from twin.engines import worker; worker.main({child_end.fileno()}, {core})"],
             env=os.environ | SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             pass_fds=[child_end.fileno()],
             stdin=subprocess.DEVNULL,

@@ -12,9 +12,9 @@ from typing import Any
 import dask.config
 from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
 
+from twin.engines.engine import Outcome, Result, Task
+from twin.engines.worker import Reply, TaskLimits, WorkerPool, describe_exception
 from twin.errors import TwinError
-from twin.studies.engine import Outcome, Result, Task
-from twin.studies.worker import Reply, TaskLimits, WorkerPool, describe_exception
 
 _CONNECT_TIMEOUT_S = 20
 _QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
