@@ -150,7 +150,10 @@ def test_workers_end_when_their_parent_process_is_killed():
     )
     folder = os.path.dirname(study_tasks.__file__)
     parent = subprocess.run(
-        [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": folder}, capture_output=True, text=True
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([folder, *sys.path])},
+        capture_output=True,
+        text=True,
     )
     worker = int(parent.stdout)
     deadline = time.monotonic() + 10

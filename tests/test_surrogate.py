@@ -109,6 +109,11 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
         assert np.isinf(FloorRayCaster(reef.terrain).depth_at(np.array([[160.0, 120.0]]), pose, reef.rig)).all()
 
 
+def raster_fraction(vision):
+    """Returns the number of raster points of the last keyframe per matched point."""
+    return len(vision.latest.points) / vision.latest.n_points
+
+
 def bounds_px(m, depths_m):
     images = FloorImages(m.scenario, m.illumination)
     return precision(images, floor_albedos(images, m.terrain, depths_m), depths_m).bounds_px
@@ -184,7 +189,7 @@ def test_tracking_is_lost_where_too_few_points_would_be_matched_between_frames(r
         observe_keyframes(vision, [reef.start], [reef.start])
         vision.restart_tracking()
         assert (vision.frame_errors is not None) == tracked
-        assert vision.bound_px == pytest.approx(0.01, rel=0.3)
+        assert vision.latest.bound_px == pytest.approx(0.01, rel=0.3)
 
 
 def test_the_lamp_share_decreases_with_sunlight():
@@ -288,9 +293,9 @@ def test_relief_makes_the_matches_of_a_stereo_pair_less_precise():
         model = ErrorModel(match_sigma_px=SigmaLaw(0.02, 0.0), stereo_relief_gain=gain)
         vision = surrogate_vision(rough, model, lambda: at, Stopwatch())
         cov = vision.observe_stereo(None, 0).cov
-        sigmas.append(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) * vision.raster_fraction))
-    baseline_in_depths = np.mean(vision._latest.points[:, 2])
-    parallax_px = vision._latest.unevenness_px * baseline_in_depths
+        sigmas.append(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) * raster_fraction(vision)))
+    baseline_in_depths = np.mean(vision.latest.points[:, 2])
+    parallax_px = vision.latest.unevenness_px * baseline_in_depths
     assert parallax_px > 0.01
     assert sigmas[1] / sigmas[0] == pytest.approx(np.hypot(0.02, 3.0 * parallax_px) / 0.02, rel=1e-6)
 
@@ -368,9 +373,9 @@ def test_stereo_points_lie_in_both_images(reef):
     pose = tilted(0, 0, 2.0)
     vision = surrogate_vision(reef, ErrorModel(), lambda: pose, Stopwatch())
     points = vision.observe_stereo(None, 0)
-    right_px = points.pixels[:, 0] - reef.rig.focal_px * vision._latest.points[:, 2]
+    right_px = points.pixels[:, 0] - reef.rig.focal_px * vision.latest.points[:, 2]
     assert right_px.min() >= reef.scenario.estimate.patch_px // 2
-    excluded = vision._pixels[~np.isin(np.arange(len(vision._pixels)), vision._latest.raster_indices)]
+    excluded = vision._pixels[~np.isin(np.arange(len(vision._pixels)), vision.latest.raster_indices)]
     assert len(excluded) and excluded[:, 0].max() < points.pixels[:, 0].max() / 2  # at the left border
 
 
@@ -1207,7 +1212,7 @@ class SimulatedImages:
 
     def observe_stereo(self, frame, row):
         points = self._vision.observe_stereo(frame, row)
-        return points._replace(cov=points.cov / self._vision.raster_fraction)
+        return points._replace(cov=points.cov / raster_fraction(self._vision))
 
 
 def compare_survey(flown, true, seed):

@@ -15,19 +15,12 @@ Result = TypeVar("Result")
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task.
+    """Outcome of one task."""
 
-    Args:
-        task: the task.
-        result: result of the function; None if the task failed.
-        failure: reason of the failure; "" if the task did not fail.
-        attempts: number of attempts.
-    """
-
-    task: Task
-    result: Result | None
-    failure: str
-    attempts: int
+    task: Task  #: the task
+    result: Result | None  #: result of the function; None if the task failed
+    failure: str  #: reason of the failure; "" if the task did not fail
+    attempts: int  #: number of attempts
 
 
 class Engine(Protocol):

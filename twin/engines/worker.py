@@ -40,18 +40,13 @@ class TaskLimits(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """Reply of a worker to one task.
+    """Reply of a worker to one task."""
 
-    Args:
-        kind: "done" if the function returned a value; "raised" if it raised an exception; "timeout" if it ran too long;
-            "killed" if the process ended or was killed.
-        value: the returned value, for the kind "done".
-        reason: why there is no value; "" for the kind "done".
-    """
-
+    #: "done" if the function returned a value; "raised" if it raised an exception; "timeout" if it ran too long;
+    #: "killed" if the process ended or was killed
     kind: Literal["done", "raised", "timeout", "killed"]
-    value: Any = None
-    reason: str = ""
+    value: Any = None  #: the returned value, for the kind "done"
+    reason: str = ""  #: why there is no value; "" for the kind "done"
 
 
 class Worker:

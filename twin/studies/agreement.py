@@ -38,23 +38,18 @@ class MetricAgreement(NamedTuple):
     """Comparison of one metric over the pairs in which both surveys were flown to their end.
 
     If `pairs` is 0, all other numbers are NaN.
-
-    Args:
-        metric: dotted name of the metric.
-        pairs: number of pairs with a value in both surveys; a missing value of a metric that is infinite if the map has
-            too many holes counts as infinite.
-        rendered: median over the rendered surveys.
-        surrogate: median over the surrogate surveys.
-        ratio: `surrogate` / `rendered`, with its confidence interval (percentile bootstrap of pairs); 1 if both medians
-            are infinite or zero.
-        p_value: p-value of the two-sample Kolmogorov-Smirnov test. The samples are paired, so the test is conservative.
     """
 
-    metric: str
+    metric: str  #: dotted name of the metric
+    #: number of pairs with a value in both surveys; a missing value of a metric that is infinite if the map has too
+    #: many holes counts as infinite
     pairs: int
-    rendered: float
-    surrogate: float
+    rendered: float  #: median over the rendered surveys
+    surrogate: float  #: median over the surrogate surveys
+    #: `surrogate` / `rendered`, with its confidence interval (percentile bootstrap of pairs); 1 if both medians are
+    #: infinite or zero
     ratio: Interval
+    #: p-value of the two-sample Kolmogorov-Smirnov test. The samples are paired, so the test is conservative.
     p_value: float
 
     @property
@@ -65,21 +60,14 @@ class MetricAgreement(NamedTuple):
 
 
 class Agreement(NamedTuple):
-    """Agreement of all pairs of a study.
+    """Agreement of all pairs of a study."""
 
-    Args:
-        pairs: number of pairs in which both surveys have a result.
-        metrics: comparison of each metric.
-        verdicts: fraction of the pairs in which both surveys pass or both do not pass, with its confidence interval.
-        only_rendered: number of pairs in which only the rendered survey passes.
-        only_surrogate: number of pairs in which only the surrogate survey passes.
-    """
-
-    pairs: int
-    metrics: list[MetricAgreement]
+    pairs: int  #: number of pairs in which both surveys have a result
+    metrics: list[MetricAgreement]  #: comparison of each metric
+    #: fraction of the pairs in which both surveys pass or both do not pass, with its confidence interval
     verdicts: Interval
-    only_rendered: int
-    only_surrogate: int
+    only_rendered: int  #: number of pairs in which only the rendered survey passes
+    only_surrogate: int  #: number of pairs in which only the surrogate survey passes
 
     @property
     def verdicts_agree(self) -> bool:

@@ -26,23 +26,14 @@ FOLDER = "rendered"  #: subfolder of the results folder
 
 
 class RenderedCheck(NamedTuple):
-    """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds.
+    """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds."""
 
-    Args:
-        rendered: (n,) whether each rendered survey was completed and met every requirement.
-        surrogate: (n,) whether each of the surrogate surveys was completed and met every requirement.
-        rows: result of each rendered survey.
-        interrupted: whether Ctrl-C ended the check, so that some of the rendered surveys are missing.
-        has_limits: whether the study has a limit, so that there are verdicts to check.
-        n_lost: number of rendered surveys that were refused or failed, and therefore have no verdict.
-    """
-
-    rendered: NDArray[np.bool_]
-    surrogate: NDArray[np.bool_]
-    rows: list[Row]
-    interrupted: bool = False
-    has_limits: bool = True
-    n_lost: int = 0
+    rendered: NDArray[np.bool_]  #: (n,) whether each rendered survey was completed and met every requirement
+    surrogate: NDArray[np.bool_]  #: (n,) whether each of the surrogate surveys was completed and met every requirement
+    rows: list[Row]  #: result of each rendered survey
+    interrupted: bool = False  #: whether Ctrl-C ended the check, so that some of the rendered surveys are missing
+    has_limits: bool = True  #: whether the study has a limit, so that there are verdicts to check
+    n_lost: int = 0  #: number of rendered surveys that were refused or failed, and therefore have no verdict
 
     @property
     def exit_status(self) -> int:

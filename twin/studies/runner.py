@@ -32,21 +32,13 @@ class Throughput(NamedTuple):
 
 
 class StudyResult(NamedTuple):
-    """Outcome of `run_study`.
+    """Outcome of `run_study`."""
 
-    Args:
-        analysis: statistics of the surveys.
-        page: file of the report.
-        write_errors: messages of the errors that occurred while the results were written.
-        interrupted: whether Ctrl-C ended the study.
-        throughput: number of surveys flown by this call, and their run times.
-    """
-
-    analysis: StudyAnalysis
-    page: Path
-    write_errors: list[str]
-    interrupted: bool
-    throughput: Throughput
+    analysis: StudyAnalysis  #: statistics of the surveys
+    page: Path  #: file of the report
+    write_errors: list[str]  #: messages of the errors that occurred while the results were written
+    interrupted: bool  #: whether Ctrl-C ended the study
+    throughput: Throughput  #: number of surveys flown by this call, and their run times
 
 
 def run_study(

@@ -118,25 +118,15 @@ _MAX_ERRORS = 20
 
 
 class Survey(NamedTuple):
-    """One survey of a study.
+    """One survey of a study."""
 
-    Args:
-        sample: number of the sample.
-        seed: seed of the survey.
-        values: values of the varied keys.
-        scenario: scenario with these values and this seed.
-        scenario_hash: fingerprint of the scenario.
-        folder: run folder.
-        keep: which files of the run folder to keep; see `flight.KEPT_FILES`.
-    """
-
-    sample: int
-    seed: int
-    values: dict[str, Any]
-    scenario: Scenario
-    scenario_hash: str
-    folder: Path
-    keep: str
+    sample: int  #: number of the sample
+    seed: int  #: seed of the survey
+    values: dict[str, Any]  #: values of the varied keys
+    scenario: Scenario  #: scenario with these values and this seed
+    scenario_hash: str  #: fingerprint of the scenario
+    folder: Path  #: run folder
+    keep: str  #: which files of the run folder to keep; see `flight.KEPT_FILES`
 
     @property
     def key(self) -> tuple[int, int]:

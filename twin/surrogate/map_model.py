@@ -24,7 +24,8 @@ from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
 from twin.kernels import kernel
-from twin.surrogate.error_model import DepthLaw
+from twin.surrogate.error_model import DepthLaw, ErrorModel
+from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import IDEAL_TABLE, ViewTable, measure_point
 from twin.world.coverage import DEPTH_TOLERANCE
 
@@ -47,6 +48,38 @@ _EVEN = np.ones((1, 1))  # relative bounds of an evenly lit image
 #: Rise over run of a line from a cell; floor below this line is taken not to hide the cell. This is exact for rays that
 #: are at most 45 deg from the vertical.
 _HIDING_SLOPE = 1.0
+
+
+class DepthErrors(NamedTuple):
+    """Errors of the filtered depth that an error model expects at the depths of a `Matchability`.
+
+    Args:
+        error_law, sigma_law: decrease of the true and of the reported variance with the number of keyframes.
+        error_px, sigma_px: (m,) true and reported standard deviation from one keyframe [px of disparity].
+        cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
+        completeness: (m,) fraction of the smooth cells away from the image border with a depth.
+        edge_error: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)].
+    """
+
+    error_law: DepthLaw
+    sigma_law: DepthLaw
+    error_px: Array
+    sigma_px: Array
+    cell_scatter: Array
+    completeness: Array
+    edge_error: Array
+
+
+def depth_errors(model: ErrorModel, matchability: Matchability) -> DepthErrors:
+    """Returns the expected errors of the filtered depth."""
+    laws, bounds_px = model.depth_laws(matchability.binning), matchability.bounds_px
+    return DepthErrors(
+        *laws,
+        *(law.sigma_px(matchability.window_bounds_px, matchability.lamp_share) for law in laws),
+        model.depth_texture_scatter(bounds_px, matchability.texture.scatter),
+        np.array([model.map_completeness(b) for b in bounds_px]),
+        np.array([model.edge_error(b) for b in bounds_px]),
+    )
 
 
 class CellErrors(NamedTuple):
@@ -288,7 +321,7 @@ class MapModel:
         return np.stack([geometry.inverse(true), true, true @ right_from_left])
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive."""
+        """Returns (first row, end row, first column, end column) of the cells that may be in view, without the ends."""
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
@@ -379,7 +412,7 @@ def _estimated_position(camera_from_world, camera, view, estimated_from_true, x,
 
 
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
-    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast."""
+    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; no rays are cast for others."""
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m))
     hidden, radius, relief_m = np.zeros(height.shape, np.bool_), 1, float(np.ptp(height))
     while radius * cell_m * _HIDING_SLOPE < relief_m:
@@ -526,7 +559,7 @@ def _observe(out, row, col, cells, camera, view, image_information, poses, estim
 
 @kernel(inline="always")
 def _information_at(table, camera, x, y):
-    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation."""
+    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), interpolated."""
     focal, cx, cy, right, bottom, _ = camera
     rows, cols = table.shape
     row = min(max((focal * y + cy + 0.5) / (bottom + 1) * rows - 0.5, 0.0), rows - 1.0)

@@ -103,11 +103,12 @@ class ComparisonVision:
         self._frames = []
         if points is not None and sampled is not None:
             self.statistics["point_fraction"].append(len(points.xyz) / self.surrogate.n_corners)
+            latest = self.surrogate.latest
             traces = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, sampled)]
-            sigma_ratio = np.sqrt(traces[0] / traces[1] * self.surrogate.raster_fraction)
+            sigma_ratio = np.sqrt(traces[0] / traces[1] * len(latest.points) / latest.n_points)
             self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
-            self.statistics["bound_px"].append(self.surrogate.bound_px)
-            self.statistics["stereo_parallax_px"].append(self.surrogate.stereo_parallax_px)
+            self.statistics["bound_px"].append(latest.bound_px)
+            self.statistics["stereo_parallax_px"].append(latest.stereo_parallax_px)
         return points
 
     def tracking_cov(self) -> Array | None:
@@ -169,14 +170,14 @@ class ComparisonVision:
         self.statistics["link_failed_images"].append(float(measured is None))
         self.statistics["link_failed_surrogate"].append(float(sampled is None))
         if sampled is not None:
-            self.statistics["link_parallax_px"].append(self.surrogate.parallax_px(self._poses[i]))
+            self.statistics["link_parallax_px"].append(self.surrogate.latest.parallax_px(self._poses[i]))
             n_points = 0 if measured is None else measured.n_points
             self.statistics["link_matched"].append(n_points / sampled.n_points)
         if measured is None or sampled is None:
             return
         self.statistics["link_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
         self.statistics["link_point_ratio"].append(measured.n_points / sampled.n_points)
-        self.statistics["link_distance"].append(self.surrogate.distance_in_depths(true))
+        self.statistics["link_distance"].append(self.surrogate.latest.distance_in_depths(true))
         errors = {name: geometry.log(geometry.inverse(true) @ m.a_from_b) for name, m in links.items() if m is not None}
         for name, error in errors.items():
             self.statistics[f"link_nees_{name}"].append(_chi2(error, sampled.cov) / 6)
@@ -296,7 +297,7 @@ class ComparisonVision:
         return height_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
 
     def _count_holes(self, elevation: ElevationMap) -> None:
-        """Adds the number of observed cells and the fraction of them with a height, by roughness and border distance."""
+        """Adds the number of observed cells and their fraction with a height, by roughness and border distance."""
         map_model = self.surrogate.scene.map_model
         roughness = self._in_px(map_model.roughness_m)
         seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)

@@ -10,9 +10,10 @@ measurements. Every survey has the same weight, except in the fits of `match_bia
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from twin.surrogate.error_model import (
@@ -86,7 +87,6 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         lamp_error_growth=links.lamp_error_growth,
         lamp_sigma_growth=lamp_sigma_growth,
         match_fraction=_fit_fraction_law(bounds, np.minimum(match_fractions, 1.0)),
-        match_parallax_px=compared.match_parallax_px,
         match_covariance_inflation=compared.match_covariance_inflation * inflation**2,
         match_bias_fraction=links.match_bias_fraction,
         distance_growth=distance_growth,
@@ -119,24 +119,29 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
 def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted: ErrorModel) -> dict[str, float]:
     """Returns the RMS over surveys of ln(reported / fitted standard deviation), by name of the error model's field."""
 
-    def match_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
-        return match_sigma_px(model, float(np.median(s["bound_px"])), float(np.median(s["stereo_parallax_px"])))
+    def sigma_px(name: str, model: ErrorModel, s: SurveyStatistics) -> float:
+        bound_px = float(np.median(s["bound_px"]))
+        if name == "match_sigma_px":
+            return match_sigma_px(model, bound_px, float(np.median(s["stereo_parallax_px"])))
+        return getattr(model, name)(bound_px)
 
-    def misfit(ratio: str, sigma_px: Callable[[ErrorModel, SurveyStatistics], float]) -> float:
-        logs = [np.log(np.median(s[ratio]) * sigma_px(compared, s) / sigma_px(fitted, s)) for s in surveys]
+    def misfit(name: str) -> float:
+        ratio = name.replace("_px", "_ratio")
+        logs = [np.log(np.median(s[ratio]) * sigma_px(name, compared, s) / sigma_px(name, fitted, s)) for s in surveys]
         return float(np.sqrt(np.mean(np.square(logs))))
 
-    def f2f_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
-        return model.f2f_sigma_px(float(np.median(s["bound_px"])))
+    return {name: misfit(name) for name in ("match_sigma_px", "f2f_sigma_px", "mosaic_sigma_px")}
 
-    def mosaic_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
-        return model.mosaic_sigma_px(float(np.median(s["bound_px"])))
 
-    return {
-        "match_sigma_px": misfit("match_sigma_ratio", match_sigma),
-        "f2f_sigma_px": misfit("f2f_sigma_ratio", f2f_sigma),
-        "mosaic_sigma_px": misfit("mosaic_sigma_ratio", mosaic_sigma),
-    }
+def _solve(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    start: ArrayLike,
+    limits: tuple[ArrayLike, ArrayLike],
+    outlier: float | None = None,
+) -> list[float]:
+    """Returns the parameters, within limits, of least squares; residuals beyond `outlier` have less weight."""
+    loss: dict[str, Any] = {} if outlier is None else {"loss": "soft_l1", "f_scale": outlier}
+    return least_squares(residuals, start, bounds=limits, **loss).x.tolist()
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
@@ -145,8 +150,7 @@ def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
 
-    solution = least_squares(residuals, [sigmas.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
-    return SigmaLaw(float(solution.x[0]), float(solution.x[1]))
+    return SigmaLaw(*_solve(residuals, [sigmas.min() / 2, 1.0], ([1e-4, 0.0], [10.0, 100.0])))
 
 
 def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarray) -> tuple[SigmaLaw, float]:
@@ -156,7 +160,7 @@ def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarra
         return np.log(np.sqrt(x[0] ** 2 + (x[1] * bounds) ** 2 + (x[2] * parallax) ** 2) / sigmas)
 
     limits = [1e-4, 0.0, 0.0], [10.0, 100.0, 10.0]
-    floor_px, slope, gain = least_squares(residuals, [sigmas.min() / 2, 1.0, 0.3], bounds=limits).x.tolist()
+    floor_px, slope, gain = _solve(residuals, [sigmas.min() / 2, 1.0, 0.3], limits)
     return SigmaLaw(floor_px, slope), gain
 
 
@@ -168,8 +172,8 @@ def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float 
 
     start = [min(float(fractions.max()), 0.9999), np.log(4 * bounds.max())]
     limits = ([0.01, np.log(bounds.min())], [1.0, np.log(100 * bounds.max())])
-    solution = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=outlier)
-    return FractionLaw(float(solution.x[0]), float(np.exp(solution.x[1])), 4.0)
+    maximum, log_half_px = _solve(residuals, start, limits, outlier)
+    return FractionLaw(maximum, float(np.exp(log_half_px)), 4.0)
 
 
 def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
@@ -207,7 +211,7 @@ def _fit_link_errors(
         return np.append(logs.ravel(), _PRIOR * (x[2] / max(compared.relief_gain, RELIEF_GAIN) - 1))
 
     start, limits = [1.0, 0.5, max(compared.relief_gain, RELIEF_GAIN)], ([1e-3, 0.0, 0.0], [100.0, 10.0, 100.0])
-    ratio, growth, gain = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x.tolist()
+    ratio, growth, gain = _solve(residuals, start, limits, _OUTLIER)
     relief = gain**2 * (1 + (growth * share) ** 2)
     patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
     products = np.array([[np.mean(s[f"consecutive_product_{name}"]) for name in _SOURCES] for s in surveys])
@@ -225,8 +229,8 @@ def _fit_lamp_growth(ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float,
         return x[0] + np.log1p((x[1] * lamp_share) ** 2) / 2 - np.log(ratios)
 
     start = [float(np.median(np.log(ratios))), 0.5]
-    found = least_squares(residuals, start, bounds=([-10.0, 0.0], [10.0, 10.0]), loss="soft_l1", f_scale=_OUTLIER).x
-    return float(np.exp(found[0])), float(found[1])
+    log_ratio, growth = _solve(residuals, start, ([-10.0, 0.0], [10.0, 10.0]), _OUTLIER)
+    return float(np.exp(log_ratio)), growth
 
 
 def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
@@ -256,8 +260,7 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.concatenate([(ratios - np.median(ratios)) / np.sqrt(len(ratios)) for ratios in log_ratios(x)])
 
-    start = [max(compared_growth, 1.0)]
-    solution = least_squares(residuals, start, bounds=([0.0], [30.0]), loss="soft_l1", f_scale=0.02).x
+    solution = np.array(_solve(residuals, [max(compared_growth, 1.0)], ([0.0], [30.0]), 0.02))
     return float(solution[0]), np.exp([np.median(ratios) / 2 for ratios in log_ratios(solution)])
 
 
@@ -321,9 +324,7 @@ def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErro
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(BorderErrorLaw(*x)(distance)) - target
 
-    limits = [0.0, 0.5], [10.0, 20.0]
-    x = least_squares(residuals, [1.0, 3.0], bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x
-    return BorderErrorLaw(*x.tolist())
+    return BorderErrorLaw(*_solve(residuals, [1.0, 3.0], ([0.0, 0.5], [10.0, 20.0]), _OUTLIER))
 
 
 def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) -> BorderLaw:
@@ -345,8 +346,7 @@ def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) 
         return weight * (x[0] * np.exp(-distance / BorderLaw(*x).width_px(bounds, lamps)) - hole)
 
     limits = [0.0, 0.05, 1.0, 0.0], [1.0, 20.0, 1000.0, 3.0]
-    x = least_squares(residuals, [0.5, 1.0, 50.0, 1.0], bounds=limits, loss="soft_l1", f_scale=_HOLE_OUTLIER).x
-    return BorderLaw(*x.tolist())
+    return BorderLaw(*_solve(residuals, [0.5, 1.0, 50.0, 1.0], limits, _HOLE_OUTLIER))
 
 
 class _Limits(NamedTuple):
@@ -359,25 +359,16 @@ class _Limits(NamedTuple):
 
 
 class _MapErrors(NamedTuple):
-    """Parameters of the errors of maps, or of their reported variances.
+    """Parameters of the errors of maps, or of their reported variances."""
 
-    Args:
-        depth: law of the standard deviation of depth.
-        lateral_sigma_px: standard deviation of the lateral shift [px].
-        relief_gain, relief_limit_px: gain, and limit [px of disparity], of the error due to relief
-            (`map_model.relief_error_px`).
-        edge: law of the standard deviation per `map_model.edge_strength`.
-        binned: change of the law for binned images.
-        departures: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its
-            classes of cells, because a class may consist of a few cells at one spot of the floor.
-    """
-
-    depth: DepthLaw
-    lateral_sigma_px: float
-    relief_gain: float
-    relief_limit_px: float
-    edge: SigmaLaw
-    binned: BinnedDepthLaw
+    depth: DepthLaw  #: law of the standard deviation of depth
+    lateral_sigma_px: float  #: standard deviation of the lateral shift [px]
+    relief_gain: float  #: gain of the error due to relief (`map_model.relief_error_px`)
+    relief_limit_px: float  #: limit of this error [px of disparity]
+    edge: SigmaLaw  #: law of the standard deviation per `map_model.edge_strength`
+    binned: BinnedDepthLaw  #: change of the law for binned images
+    #: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its classes of cells,
+    #: because a class may consist of a few cells at one spot of the floor
     departures: np.ndarray
 
     def variance(self, classes: _MapClasses) -> np.ndarray:
@@ -391,41 +382,24 @@ class _MapErrors(NamedTuple):
 
 
 class _MapClasses(NamedTuple):
-    """Variances of maps [m^2] and conditions, of m classes of cells.
+    """Variances of maps [m^2] and conditions, of m classes of cells."""
 
-    Args:
-        images: (m,) variance in the map from images.
-        sampled: (m,) variance in the map sampled from the compared model.
-        pose: (m,) variance due to pose errors alone.
-        depth: (m,) variance that an error of depth of 1 px adds.
-        lateral: (m,) variance that a lateral shift of 1 px adds.
-        edge: (m,) variance that errors near walls add if their gain is 1.
-        views, step_baselines: (m,) mean number of keyframes, and distance between them [stereo baselines].
-        roughness_px: (m,) roughness of the cells [px of disparity].
-        bound_px, window_px: (m,) Cramér-Rao bound of the image, and of the median window [px].
-        lamp_share: (m,) fraction of the reflected light that comes from the lamps.
-        metres_per_px: (m,) height per pixel of disparity.
-        binning: (m,) binning of the images.
-        survey: (m,) number of the survey.
-        weight: (m,) weights of the residuals, with which every survey has the same total weight.
-    """
-
-    images: np.ndarray
-    sampled: np.ndarray
-    pose: np.ndarray
-    depth: np.ndarray
-    lateral: np.ndarray
-    edge: np.ndarray
-    views: np.ndarray
-    step_baselines: np.ndarray
-    roughness_px: np.ndarray
-    bound_px: np.ndarray
-    window_px: np.ndarray
-    lamp_share: np.ndarray
-    metres_per_px: np.ndarray
-    binning: np.ndarray
-    survey: np.ndarray
-    weight: np.ndarray
+    images: np.ndarray  #: (m,) variance in the map from images
+    sampled: np.ndarray  #: (m,) variance in the map sampled from the compared model
+    pose: np.ndarray  #: (m,) variance due to pose errors alone
+    depth: np.ndarray  #: (m,) variance that an error of depth of 1 px adds
+    lateral: np.ndarray  #: (m,) variance that a lateral shift of 1 px adds
+    edge: np.ndarray  #: (m,) variance that errors near walls add if their gain is 1
+    views: np.ndarray  #: (m,) mean number of keyframes
+    step_baselines: np.ndarray  #: (m,) mean distance between keyframes [stereo baselines]
+    roughness_px: np.ndarray  #: (m,) roughness of the cells [px of disparity]
+    bound_px: np.ndarray  #: (m,) Cramér-Rao bound of the image [px]
+    window_px: np.ndarray  #: (m,) Cramér-Rao bound of the median window [px]
+    lamp_share: np.ndarray  #: (m,) fraction of the reflected light that comes from the lamps
+    metres_per_px: np.ndarray  #: (m,) height per pixel of disparity
+    binning: np.ndarray  #: (m,) binning of the images
+    survey: np.ndarray  #: (m,) number of the survey
+    weight: np.ndarray  #: (m,) weights of the residuals, with which every survey has the same total weight
 
     def depth_of(self, law: DepthLaw) -> np.ndarray:
         """Returns the variance (m,) that errors of depth with the given law add [m^2]."""
@@ -479,7 +453,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
             prior = _PRIOR * (x - start) / np.maximum(start, typical)
             return np.concatenate([weight * departures(model_of(x), chosen), prior])
 
-        return model_of(least_squares(residuals, start, bounds=(lowest, highest), loss="soft_l1", f_scale=_OUTLIER).x)
+        return model_of(np.array(_solve(residuals, start, (lowest, highest), _OUTLIER)))
 
     def full(x: np.ndarray) -> _MapErrors:
         lateral_px, gain, limit_px = x[7:10].tolist() if is_error else (0.0, 0.0, 1.0)
@@ -523,9 +497,7 @@ def _fit_texture_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterL
     def residuals(x: np.ndarray) -> np.ndarray:
         return ScatterLaw(*x)(bounds, textures) - scatters
 
-    limits = [0.0, 1e-3], [20.0, 1.0]
-    x = least_squares(residuals, [2.0, 0.02], bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x
-    return ScatterLaw(*x.tolist())
+    return ScatterLaw(*_solve(residuals, [2.0, 0.02], ([0.0, 1e-3], [20.0, 1.0]), _OUTLIER))
 
 
 def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> float:

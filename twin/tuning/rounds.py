@@ -31,30 +31,22 @@ from twin.tuning.verification import Verification, expected_time, verification_o
 
 
 class TuningResult(NamedTuple):
-    """Result of a search.
+    """Result of a search."""
 
-    Args:
-        candidates: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if
-            any were flown.
-        finalists: plans that were evaluated again with new samples and seeds, without correction.
-        verifications: plans that were verified by rendered surveys, in the order of flight.
-        recommended: the cheapest plan whose rendered surveys all passed or, if plans are not verified, the cheapest
-            plan confirmed with new samples and seeds; None if there is none or the search was interrupted.
-        scenario: scenario of the recommended plan; None if there is none.
-        interrupted: whether Ctrl-C ended the search.
-        needs_rendering: whether the search used the surrogate, so its results need to be verified by rendered surveys.
-        warnings: for each warning, the number of the finalists' surveys with new seeds that have it.
-        refused: for each reason, the number of plans whose surveys were all refused in the search.
-    """
-
+    #: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if any were
+    #: flown
     candidates: list[Candidate]
-    finalists: list[Candidate]
-    verifications: list[Verification]
+    finalists: list[Candidate]  #: plans that were evaluated again with new samples and seeds, without correction
+    verifications: list[Verification]  #: plans that were verified by rendered surveys, in the order of flight
+    #: the cheapest plan whose rendered surveys all passed or, if plans are not verified, the cheapest plan confirmed
+    #: with new samples and seeds; None if there is none or the search was interrupted
     recommended: Candidate | None
-    scenario: Scenario | None
-    interrupted: bool
+    scenario: Scenario | None  #: scenario of the recommended plan; None if there is none
+    interrupted: bool  #: whether Ctrl-C ended the search
+    #: whether the search used the surrogate, so its results need to be verified by rendered surveys
     needs_rendering: bool
-    warnings: dict[str, int]
+    warnings: dict[str, int]  #: for each warning, the number of the finalists' surveys with new seeds that have it
+    #: for each reason, the number of plans whose surveys were all refused in the search
     refused: Mapping[str, int] = MappingProxyType({})
 
     @property
@@ -65,19 +57,12 @@ class TuningResult(NamedTuple):
 
 
 class TuningFlights(NamedTuple):
-    """Runs the surveys of a search and logs their results.
+    """Runs the surveys of a search and logs their results."""
 
-    Args:
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey.
-        log: log of the results.
-    """
-
-    engine: Engine
-    progress: StudyProgress
-    function: Callable[[Survey], Row]
-    log: ResultsLog
+    engine: Engine  #: runs the surveys in parallel
+    progress: StudyProgress  #: display of the progress
+    function: Callable[[Survey], Row]  #: flies one survey
+    log: ResultsLog  #: log of the results
 
     def fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
         """Flies those surveys of the given plans that have no result yet.

@@ -15,29 +15,19 @@ _MEGAPIXEL_S = 0.2  # part per megapixel of one camera's image [s]
 
 
 class Verification(NamedTuple):
-    """Comparison of a plan's rendered surveys with its surrogate surveys.
+    """Comparison of a plan's rendered surveys with its surrogate surveys."""
 
-    Args:
-        surrogate: the plan, evaluated by surrogate surveys with new seeds.
-        rendered: the plan, evaluated by its rendered surveys.
-        surveys: number of rendered surveys required.
-        n_passed: number of rendered surveys that were completed and met every requirement.
-        n_failed: number of rendered surveys without a result, because the computer or the program failed.
-        medians: for each metric, the median (surrogate, rendered); None if no survey has a value.
-        ratio: ratio rendered / surrogate of each median, and the fraction of the rendered surveys that were completed.
-        search_round: round of the search, from 0.
-        warnings: for each warning, the number of rendered surveys that have it.
-    """
-
-    surrogate: Candidate
-    rendered: Candidate
-    surveys: int
-    n_passed: int
-    n_failed: int
+    surrogate: Candidate  #: the plan, evaluated by surrogate surveys with new seeds
+    rendered: Candidate  #: the plan, evaluated by its rendered surveys
+    surveys: int  #: number of rendered surveys required
+    n_passed: int  #: number of rendered surveys that were completed and met every requirement
+    n_failed: int  #: number of rendered surveys without a result, because the computer or the program failed
+    #: for each metric, the median (surrogate, rendered); None if no survey has a value
     medians: dict[str, tuple[float | None, float | None]]
+    #: ratio rendered / surrogate of each median, and the fraction of the rendered surveys that were completed
     ratio: PlanRatio
-    search_round: int
-    warnings: dict[str, int]
+    search_round: int  #: round of the search, from 0
+    warnings: dict[str, int]  #: for each warning, the number of rendered surveys that have it
 
     @property
     def passed(self) -> bool:
@@ -78,14 +68,10 @@ def verification_of(
 
 
 class ExpectedTime(NamedTuple):
-    """Expected run time of one rendered survey on one CPU core.
+    """Expected run time of one rendered survey on one CPU core."""
 
-    Args:
-        survey_s: run time [s].
-        measured: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate.
-    """
-
-    survey_s: float
+    survey_s: float  #: run time [s]
+    #: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate
     measured: bool
 
     def notice(self, number: int, surveys: int, most_surveys: int) -> str:
