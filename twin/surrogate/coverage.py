@@ -15,20 +15,14 @@ _OVERLAP_PAIRS = 40  # largest number of pairs of images whose overlap is comput
 
 
 class Quantity(NamedTuple):
-    """Condition of a survey on which the error model depends.
+    """Condition of a survey on which the error model depends."""
 
-    Args:
-        label: name in messages.
-        unit: unit in messages, with a leading space; "" for a ratio.
-        factor: largest allowed ratio of a value to the upper end of the fitted range, and of the lower end to a value.
-        limits: ends of the fitted range that restrict the use of the error model. Beyond an end that is not named, the
-            functions of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free
-            images.
-    """
-
-    label: str
-    unit: str
+    label: str  #: name in messages
+    unit: str  #: unit in messages, with a leading space; "" for a ratio
+    #: largest allowed ratio of a value to the upper end of the fitted range, and of the lower end to a value
     factor: float = 1.0
+    #: ends of the fitted range that restrict the use of the error model. Beyond an end that is not named, the functions
+    #: of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free images.
     limits: Literal["both", "lower", "upper"] = "both"
 
 
@@ -62,17 +56,11 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
 
 
 class QuantityOutsideFit(NamedTuple):
-    """Quantity whose values in a survey lie outside the range in which the error model may be used.
+    """Quantity whose values in a survey lie outside the range in which the error model may be used."""
 
-    Args:
-        quantity: the quantity.
-        values: smallest and largest value in the survey.
-        allowed: smallest and largest allowed value; infinite on a side without limit.
-    """
-
-    quantity: Quantity
-    values: Range
-    allowed: Range
+    quantity: Quantity  #: the quantity
+    values: Range  #: smallest and largest value in the survey
+    allowed: Range  #: smallest and largest allowed value; infinite on a side without limit
 
     @property
     def value_text(self) -> str:

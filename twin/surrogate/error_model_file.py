@@ -19,21 +19,16 @@ DEFAULT_FILE = Path(__file__).with_name("error_model.toml")
 
 @dataclass(frozen=True)
 class FittedErrorModel:
-    """Error model with the record of its fit.
+    """Error model with the record of its fit."""
 
-    Args:
-        model: fitted parameters.
-        n_surveys: number of rendered surveys to which the model was fitted.
-        misfit: root mean square over the surveys of ln(reported / fitted standard deviation), for each fitted
-            parameter that is a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`).
-        fitted_range: smallest and largest value of each of `coverage.QUANTITIES` in these surveys, by name. The upper
-            end of the Cramér-Rao bound is infinite if a survey with a larger bound than all fitted ones lost too many
-            frames or links to be fitted. Without an entry for the bound, its range is `ErrorModel.bound_range_px`.
-    """
-
-    model: ErrorModel
-    n_surveys: int
+    model: ErrorModel  #: fitted parameters
+    n_surveys: int  #: number of rendered surveys to which the model was fitted
+    #: root mean square over the surveys of ln(reported / fitted standard deviation), for each fitted parameter that is
+    #: a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`)
     misfit: Mapping[str, float]
+    #: smallest and largest value of each of `coverage.QUANTITIES` in these surveys, by name. The upper end of the
+    #: Cramér-Rao bound is infinite if a survey with a larger bound than all fitted ones lost too many frames or links
+    #: to be fitted. Without an entry for the bound, its range is `ErrorModel.bound_range_px`.
     fitted_range: Mapping[str, Range] = field(default_factory=dict)
 
     def quantities_outside_fit(self, conditions: Mapping[str, Range]) -> list[QuantityOutsideFit]:

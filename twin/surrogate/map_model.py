@@ -51,23 +51,15 @@ _HIDING_SLOPE = 1.0
 
 
 class DepthErrors(NamedTuple):
-    """Errors of the filtered depth that an error model expects at the depths of a `Matchability`.
+    """Errors of the filtered depth that an error model expects at the depths of a `Matchability`."""
 
-    Args:
-        error_law, sigma_law: decrease of the true and of the reported variance with the number of keyframes.
-        error_px, sigma_px: (m,) true and reported standard deviation from one keyframe [px of disparity].
-        cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
-        completeness: (m,) fraction of the smooth cells away from the image border with a depth.
-        edge_error: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)].
-    """
-
-    error_law: DepthLaw
-    sigma_law: DepthLaw
-    error_px: Array
-    sigma_px: Array
-    cell_scatter: Array
-    completeness: Array
-    edge_error: Array
+    error_law: DepthLaw  #: decrease of the true and of the reported variance with the number of keyframes
+    sigma_law: DepthLaw  #: decrease of the true and of the reported variance with the number of keyframes
+    error_px: Array  #: (m,) true and reported standard deviation from one keyframe [px of disparity]
+    sigma_px: Array  #: (m,) true and reported standard deviation from one keyframe [px of disparity]
+    cell_scatter: Array  #: (m,) standard deviation over cells of the logarithm of the reported standard deviation
+    completeness: Array  #: (m,) fraction of the smooth cells away from the image border with a depth
+    edge_error: Array  #: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)]
 
 
 def depth_errors(model: ErrorModel, matchability: Matchability) -> DepthErrors:
@@ -83,100 +75,70 @@ def depth_errors(model: ErrorModel, matchability: Matchability) -> DepthErrors:
 
 
 class CellErrors(NamedTuple):
-    """Errors of the filtered depth: random numbers and standard deviations.
+    """Errors of the filtered depth: random numbers and standard deviations."""
 
-    Args:
-        lateral_noise: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell.
-        relief_noise: (rows, cols) standard normal samples of the error due to relief within the matching window, shared
-            by all views of a cell; see `window_noise`.
-        edge_noise: (rows, cols) samples of the error near walls, of zero mean and unit variance, shared by all views of
-            a cell; see `heavy_tailed`.
-        cell_noise: (rows, cols) standard normal samples of the logarithm of the standard deviation of depth, shared by
-            all views of a cell and correlated over a window; see `cell_scatter`.
-        dropout: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which
-            is multiplied by factors for the roughness and for the image border.
-        lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the next four fields are tabulated, and also `edge_error`,
-            `border_width_px`, `error_noise_share` and `sigma_noise_share` [m].
-        depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
-        depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
-        cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
-        completeness: (m,) fraction of the smooth cells away from the image border for which the filter provides a
-            depth.
-        error_law: decrease of the true variance with the number of keyframes.
-        sigma_law: decrease of the reported variance with the number of keyframes.
-        relief_error_gain: `ErrorModel.relief_error_gain`.
-        relief_error_limit_px: `ErrorModel.relief_error_limit_px`.
-        edge_error: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)].
-        edge_sigma_gain: `ErrorModel.edge_sigma_gain`.
-        edge_half_px: `ErrorModel.edge_half_px`.
-        border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
-        border_width_px: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px].
-        error_scatter_share: `ErrorModel.error_scatter_share`.
-        border_distances_px: (r,) ascending distances from the image border at which the next two fields are
-            tabulated.
-        border_depth: (r,) factor on the true and on the reported standard deviation of depth.
-        border_edge: (r,) factor on the error near walls; see `edge_border_factor`.
-        bound_ratios: (q,) ascending ratios of the Cramér-Rao bound of a cell to that of the whole image, at which the
-            next two fields are tabulated; see `MapModel.bound_ratio`.
-        bound_error: (q,) factor on the true standard deviation of depth.
-        bound_sigma: (q,) factor on the reported standard deviation of depth.
-        error_noise_share: (m,) fraction of the true variance of depth that image noise causes
-            (`DepthLaw.noise_share`).
-        sigma_noise_share: (m,) fraction of the reported variance of depth that image noise causes.
-    """
-
-    lateral_noise: Map
+    lateral_noise: Map  #: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell
+    #: (rows, cols) standard normal samples of the error due to relief within the matching window, shared by all views
+    #: of a cell; see `window_noise`
     relief_noise: Map
+    #: (rows, cols) samples of the error near walls, of zero mean and unit variance, shared by all views of a cell; see
+    #: `heavy_tailed`
     edge_noise: Map
+    #: (rows, cols) standard normal samples of the logarithm of the standard deviation of depth, shared by all views of
+    #: a cell and correlated over a window; see `cell_scatter`
     cell_noise: Map
+    #: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which is
+    #: multiplied by factors for the roughness and for the image border
     dropout: Map
-    lateral_sigma_px: float
+    lateral_sigma_px: float  #: standard deviation of the lateral error [px]
+    #: (m,) ascending depths at which the next four fields are tabulated, and also `edge_error`, `border_width_px`,
+    #: `error_noise_share` and `sigma_noise_share` [m]
     depths_m: Array
-    depth_error_px: Array
-    depth_sigma_px: Array
-    cell_scatter: Array
+    depth_error_px: Array  #: (m,) true standard deviation of the depth from one keyframe [px of disparity]
+    depth_sigma_px: Array  #: (m,) reported standard deviation of the depth from one keyframe [px of disparity]
+    cell_scatter: Array  #: (m,) standard deviation over cells of the logarithm of the reported standard deviation
+    #: (m,) fraction of the smooth cells away from the image border for which the filter provides a depth
     completeness: Array
-    error_law: DepthLaw = ONE_KEYFRAME
-    sigma_law: DepthLaw = ONE_KEYFRAME
-    relief_error_gain: float = 0.0
-    relief_error_limit_px: float = 1.0
+    error_law: DepthLaw = ONE_KEYFRAME  #: decrease of the true variance with the number of keyframes
+    sigma_law: DepthLaw = ONE_KEYFRAME  #: decrease of the reported variance with the number of keyframes
+    relief_error_gain: float = 0.0  #: `ErrorModel.relief_error_gain`
+    relief_error_limit_px: float = 1.0  #: `ErrorModel.relief_error_limit_px`
+    #: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)]
     edge_error: Array = np.zeros(2)
-    edge_sigma_gain: float = 0.0
-    edge_half_px: float = np.inf
+    edge_sigma_gain: float = 0.0  #: `ErrorModel.edge_sigma_gain`
+    edge_half_px: float = np.inf  #: `ErrorModel.edge_half_px`
+    #: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`
     border_share: float = 0.0
+    #: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px]
     border_width_px: Array = np.ones(2)
-    error_scatter_share: float = 1.0
+    error_scatter_share: float = 1.0  #: `ErrorModel.error_scatter_share`
+    #: (r,) ascending distances from the image border at which the next two fields are tabulated
     border_distances_px: Array = np.array([0.0, 1.0])
-    border_depth: Array = np.ones(2)
-    border_edge: Array = np.ones(2)
+    border_depth: Array = np.ones(2)  #: (r,) factor on the true and on the reported standard deviation of depth
+    border_edge: Array = np.ones(2)  #: (r,) factor on the error near walls; see `edge_border_factor`
+    #: (q,) ascending ratios of the Cramér-Rao bound of a cell to that of the whole image, at which the next two fields
+    #: are tabulated; see `MapModel.bound_ratio`
     bound_ratios: Array = np.array([0.0, 1.0])
-    bound_error: Array = np.ones(2)
-    bound_sigma: Array = np.ones(2)
+    bound_error: Array = np.ones(2)  #: (q,) factor on the true standard deviation of depth
+    bound_sigma: Array = np.ones(2)  #: (q,) factor on the reported standard deviation of depth
+    #: (m,) fraction of the true variance of depth that image noise causes (`DepthLaw.noise_share`)
     error_noise_share: Array = np.zeros(2)
-    sigma_noise_share: Array = np.zeros(2)
+    sigma_noise_share: Array = np.zeros(2)  #: (m,) fraction of the reported variance of depth that image noise causes
 
 
 class ObservedCells(NamedTuple):
-    """Cells that both cameras of a keyframe see, in a rectangular window of the grid.
+    """Cells that both cameras of a keyframe see, in a rectangular window of the grid."""
 
-    Args:
-        row, col: grid position of the first (north-west) cell of the window.
-        depth_m: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen.
-        border_px: (rows, cols) distance of this point from the nearest border of the two images [px]; 0 if it is not
-            seen.
-        information: (rows, cols) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left
-            image to that of the whole image; 0 if it is not seen.
-        true, estimated: (4, 4) poses of the keyframe.
-    """
-
-    row: int
-    col: int
-    depth_m: Map
+    row: int  #: grid position of the first (north-west) cell of the window
+    col: int  #: grid position of the first (north-west) cell of the window
+    depth_m: Map  #: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen
+    #: (rows, cols) distance of this point from the nearest border of the two images [px]; 0 if it is not seen
     border_px: Map
+    #: (rows, cols) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left image to that of
+    #: the whole image; 0 if it is not seen
     information: Map
-    true: Array
-    estimated: Array
+    true: Array  #: (4, 4) poses of the keyframe
+    estimated: Array  #: (4, 4) poses of the keyframe
 
 
 class MapModel:
@@ -572,20 +534,13 @@ def _information_at(table, camera, x, y):
 
 
 class _Runs(NamedTuple):
-    """Consecutive keyframes that observe each cell, up to the current one.
+    """Consecutive keyframes that observe each cell, up to the current one."""
 
-    Args:
-        views: (rows, cols) number of these keyframes.
-        squared_steps: (rows, cols) sum of the squared distances between neighbours in this series, in squared stereo
-            baselines.
-        border_px: (rows, cols) largest distance from the image border over these keyframes [px].
-        information: (rows, cols) sum of `ObservedCells.information` over these keyframes.
-    """
-
-    views: NDArray[np.int16]
+    views: NDArray[np.int16]  #: (rows, cols) number of these keyframes
+    #: (rows, cols) sum of the squared distances between neighbours in this series, in squared stereo baselines
     squared_steps: Map
-    border_px: Map
-    information: Map
+    border_px: Map  #: (rows, cols) largest distance from the image border over these keyframes [px]
+    information: Map  #: (rows, cols) sum of `ObservedCells.information` over these keyframes
 
 
 @kernel

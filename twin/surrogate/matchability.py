@@ -50,15 +50,10 @@ _PATCHES, _SAMPLES = 300, 9  # patches sampled for the unevenness; height sample
 
 
 class PositionDependence(NamedTuple):
-    """Dependence of matching on the position in the image, in blocks (rows, cols) that divide the image evenly.
+    """Dependence of matching on the position in the image, in blocks (rows, cols) that divide the image evenly."""
 
-    Args:
-        bounds: Cramér-Rao bound in a block, divided by that of the whole image.
-        gradients: RMS gradient of an even texture in a block, divided by that of the whole image.
-    """
-
-    bounds: Array
-    gradients: Array
+    bounds: Array  #: Cramér-Rao bound in a block, divided by that of the whole image
+    gradients: Array  #: RMS gradient of an even texture in a block, divided by that of the whole image
 
 
 NO_DEPENDENCE = PositionDependence(np.ones((1, 1)), np.ones((1, 1)))

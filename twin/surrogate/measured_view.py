@@ -30,37 +30,26 @@ _INVERSE_ITERATIONS = 8
 
 
 class ViewTable(NamedTuple):
-    """Measured (x, y, disparity) on a regular grid of true (disparity, y, x).
+    """Measured (x, y, disparity) on a regular grid of true (disparity, y, x)."""
 
-    Args:
-        values: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are
-            measured at their true positions.
-        first: (3,) true disparity, y and x of the first grid point.
-        step: (3,) spacing of the grid.
-    """
-
+    #: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are measured
+    #: at their true positions.
     values: Array
-    first: Array
-    step: Array
+    first: Array  #: (3,) true disparity, y and x of the first grid point
+    step: Array  #: (3,) spacing of the grid
 
 
 IDEAL_TABLE = ViewTable(np.zeros((0, 0, 0, 3)), np.zeros(3), np.ones(3))
 
 
 class MeasuredView(NamedTuple):
-    """Measured positions and row differences of true points after the estimators have removed rectification errors.
+    """Measured positions and row differences of true points after the estimators have removed rectification errors."""
 
-    Args:
-        table: measured positions on a grid of true positions; without values if all points are measured at their true
-            positions.
-        row_table: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of
-            `table`.
-        removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove.
-    """
-
+    #: measured positions on a grid of true positions; without values if all points are measured at their true positions
     table: ViewTable
+    #: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of `table`
     row_table: Array
-    removed: Array
+    removed: Array  #: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove
 
     @property
     def is_ideal(self) -> bool:

@@ -27,15 +27,10 @@ _VIEWS = 3  # number of views with different particles
 
 
 class SnowEffect(NamedTuple):
-    """Effect of marine snow on the matching of patches between two images.
+    """Effect of marine snow on the matching of patches between two images."""
 
-    Args:
-        variance_px2: variance of the weighted mean of n matches, times n [px^2]; includes the image noise.
-        matched_share: fraction of the patches that are matched in spite of the snow.
-    """
-
-    variance_px2: float
-    matched_share: float
+    variance_px2: float  #: variance of the weighted mean of n matches, times n [px^2]; includes the image noise
+    matched_share: float  #: fraction of the patches that are matched in spite of the snow
 
 
 def snow_poses(pose: StampedPose) -> list[StampedPose]:

@@ -60,37 +60,22 @@ _RESIDUAL_GROWTH = 2.0
 
 
 class KeyframeTruth(NamedTuple):
-    """True geometry and sampled noise of a keyframe.
+    """True geometry and sampled noise of a keyframe."""
 
-    Args:
-        pose: (4, 4) true pose.
-        points: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images.
-        raster_indices: (n,) index of each point in the raster.
-        noise: (rows, cols, 3) standard normal samples of the stereo errors of the raster points.
-        bound_px: Cramér-Rao bound of a patch's position [px].
-        unevenness_px: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`.
-        n_points: number of matched points that the raster points represent.
-        baseline_m: stereo baseline [m].
-        unit_cov: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation.
-        unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
-        cells: (n,) floor cells of the points.
-        clear_share: fraction of the matches that remain in the presence of marine snow.
-        noise_ratio: ratio of the scatter of the row differences to that expected from noise (`measured_rows`).
-    """
-
-    pose: Array
-    points: Array
-    raster_indices: NDArray[np.int64]
-    noise: Array
-    bound_px: float
-    unevenness_px: float
-    n_points: float
-    baseline_m: float
+    pose: Array  #: (4, 4) true pose
+    points: Array  #: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images
+    raster_indices: NDArray[np.int64]  #: (n,) index of each point in the raster
+    noise: Array  #: (rows, cols, 3) standard normal samples of the stereo errors of the raster points
+    bound_px: float  #: Cramér-Rao bound of a patch's position [px]
+    unevenness_px: float  #: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`
+    n_points: float  #: number of matched points that the raster points represent
+    baseline_m: float  #: stereo baseline [m]
+    #: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation
     unit_cov: Array
-    unit_root: Array
-    cells: Cells
-    clear_share: float
-    noise_ratio: float
+    unit_root: Array  #: (6, 6) lower Cholesky factor of `unit_cov`
+    cells: Cells  #: (n,) floor cells of the points
+    clear_share: float  #: fraction of the matches that remain in the presence of marine snow
+    noise_ratio: float  #: ratio of the scatter of the row differences to that expected from noise (`measured_rows`)
 
     @property
     def stereo_parallax_px(self) -> float:
@@ -108,38 +93,24 @@ class KeyframeTruth(NamedTuple):
 
 
 class FrameErrors(NamedTuple):
-    """Distribution of the errors of frame-to-frame motions until the next keyframe.
+    """Distribution of the errors of frame-to-frame motions until the next keyframe."""
 
-    Args:
-        root: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion.
-        cov: (6, 6) reported covariance of a motion.
-        anticorrelation: fraction of the independent error of a motion that the next motion cancels.
-        gain: (6, 6) matrix that maps the twist of the true motion to that of the measured one, to model calibration
-            errors and an approximated port; empty without these.
-    """
-
-    root: Array
-    cov: Array
-    anticorrelation: float
+    root: Array  #: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion
+    cov: Array  #: (6, 6) reported covariance of a motion
+    anticorrelation: float  #: fraction of the independent error of a motion that the next motion cancels
+    #: (6, 6) matrix that maps the twist of the true motion to that of the measured one, to model calibration errors and
+    #: an approximated port; empty without these
     gain: Array
 
 
 class TrueScene(NamedTuple):
-    """True scene from which measurements are sampled.
+    """True scene from which measurements are sampled."""
 
-    Args:
-        left_camera: function that returns the current true pose (4, 4) of the left camera.
-        floor: ray caster against the true floor.
-        matchability: Cramér-Rao bound and unevenness of the floor.
-        map_model: model of the elevation map, with the true heights on its grid.
-        view: positions at which the estimators measure true points.
-    """
-
-    left_camera: Callable[[], Array]
-    floor: FloorRayCaster
-    matchability: Matchability
-    map_model: MapModel
-    view: MeasuredView = IDEAL_VIEW
+    left_camera: Callable[[], Array]  #: function that returns the current true pose (4, 4) of the left camera
+    floor: FloorRayCaster  #: ray caster against the true floor
+    matchability: Matchability  #: Cramér-Rao bound and unevenness of the floor
+    map_model: MapModel  #: model of the elevation map, with the true heights on its grid
+    view: MeasuredView = IDEAL_VIEW  #: positions at which the estimators measure true points
 
 
 class SurrogateVision:
