@@ -29,7 +29,7 @@ def study(tmp_path):
 
 
 def run_study(study, folder, engine=None, resume=False, function=study_surveys.fly):
-    return runner.run_study(study, folder, resume, engine or SerialEngine(), StudyProgress(), function)
+    return runner.run_study(study, folder, resume, runner.Fleet(engine or SerialEngine(), StudyProgress(), function))
 
 
 def rows(folder):

@@ -16,10 +16,9 @@ from twin.engines.engine import Engine, LocalEngine, default_jobs
 from twin.errors import TwinError
 from twin.studies import agreement, rendered_check, report, wording
 from twin.studies.progress import study_progress
-from twin.studies.runner import StudyResult, run_study
+from twin.studies.runner import Fleet, StudyResult, run_study
 from twin.studies.study_file import Study, load_study
-from twin.tuning import rounds as tuning
-from twin.tuning import tuning_report
+from twin.tuning import rounds, tuning_report
 from twin.tuning.candidates import tuning_config
 
 SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
@@ -94,10 +93,10 @@ def run(file: str, options: StudyOptions) -> int:
     study = load(file, options)
     folder = _folder(options, "study", study)  # workers run in other folders
     with options.engine() as engine, study_progress(options.live) as progress:
-        result = run_study(study, folder, options.resume, engine, progress)
+        result = run_study(study, folder, options.resume, Fleet(engine, progress))
         checked = None
         if options.verify and not result.interrupted:
-            checked = rendered_check.check(study, result.analysis, options.verify, folder, engine, progress)
+            checked = rendered_check.check(study, result.analysis, options.verify, folder, Fleet(engine, progress))
     for error in result.write_errors:
         console.print_error(f"{folder}: {error}; free some disk space and continue with --resume")
     if options.as_json:
@@ -129,7 +128,7 @@ def tune(file: str, options: StudyOptions) -> int:
         study = study.model_copy(update={"tune": config})
     folder = _folder(options, "tune", study)
     with options.engine() as engine, study_progress(options.live) as progress:
-        result = tuning.tune(study, folder, options.resume, engine, progress)
+        result = rounds.tune(study, folder, options.resume, Fleet(engine, progress))
     with sole_writer(folder, used=True):
         tuning_report.write_tuning_report(study, config, result, folder)
     if options.as_json:

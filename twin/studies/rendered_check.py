@@ -11,13 +11,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.engines.engine import Engine
 from twin.judge.require import more_is_better
 from twin.studies import wording
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import Row, has_passed
-from twin.studies.progress import StudyProgress
-from twin.studies.runner import check_results, fly_surveys, open_folder
+from twin.studies.runner import Fleet, check_results, open_folder
 from twin.studies.statistics import Array, Interval, wilson_interval
 from twin.studies.study_file import Study
 from twin.studies.surveys import Survey, samples, surveys
@@ -78,9 +76,7 @@ class RenderedCheck(NamedTuple):
         )
 
 
-def check(
-    study: Study, analysis: StudyAnalysis, n: int, folder: Path, engine: Engine, progress: StudyProgress
-) -> RenderedCheck:
+def check(study: Study, analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> RenderedCheck:
     """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
 
     Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
@@ -101,8 +97,8 @@ def check(
     with open_folder(folder / FOLDER, True) as log:
         check_results(log, ((key, survey.scenario_hash) for key, survey in chosen.items()))
         done = log.done()
-        progress.begin(progress.done + len(set(keys) - done))
-        completed = fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
+        fleet.progress.begin(fleet.progress.done + len(set(keys) - done))
+        completed = fleet.fly(study, (chosen[key] for key in keys if key not in done), log.add)
         log.flush()
     rows = {(row["sample"], row["seed"]): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]

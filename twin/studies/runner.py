@@ -41,14 +41,30 @@ class StudyResult(NamedTuple):
     throughput: Throughput  #: number of surveys flown by this call, and their run times
 
 
-def run_study(
-    study: Study,
-    folder: Path,
-    resume: bool,
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row] = fly,
-) -> StudyResult:
+class Fleet(NamedTuple):
+    """Workers that fly surveys in parallel."""
+
+    engine: Engine  #: runs the surveys
+    progress: StudyProgress  #: display of the progress
+    function: Callable[[Survey], Row] = fly  #: flies one survey; must be importable by name on the workers
+
+    def fly(self, study: Study, missing: Iterable[Survey], add_row: Callable[[Row], None]) -> bool:
+        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C.
+
+        Raises:
+            TwinError: the engine lost its connection.
+        """
+        try:
+            for outcome in self.engine.run_many(self.function, missing, TaskLimits(study.timeout_s, study.retries)):
+                row = row_of_outcome(outcome)
+                add_row(row)
+                self.progress.add(row)
+        except KeyboardInterrupt:
+            return False
+        return True
+
+
+def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyResult:
     """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
     For a study that compares rendered and surrogate surveys, agreement.md and its figure are written too. Ctrl-C ends
@@ -59,52 +75,44 @@ def run_study(
             or belongs to another study; or the engine lost its connection.
         ScenarioError: no sample has a valid scenario; nothing was flown.
     """
-    refused = refusals(study)
+    refused, planned, run_times_s = refusals(study), set(survey_keys(study)), []
     with open_folder(folder, resume) as log:
-        return _run_study(study, folder, refused, log, engine, progress, function)
+        missing = _missing(study, folder, refused, log)
+        if refused:
+            fleet.progress.print_line(refusal_notice(refused))
+        fleet.progress.begin(len(planned - log.done()))
+
+        def add_row(row: Row) -> None:
+            run_times_s.append(row.get("timing.survey_s") or 0.0)
+            log.add(row)
+
+        start = time.perf_counter()
+        interrupted = not fleet.fly(study, missing, add_row)
+        throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
+        analysis, page = StudyAnalysis(log.table(planned), study, len(planned)), folder / "study.html"
+        write_errors = _write_errors(
+            log.flush,
+            lambda: write_parquet(analysis.rows, folder / "results.parquet"),
+            lambda: write_report(study, analysis, page),
+            lambda: write_document(analysis, folder),
+        )
+        return StudyResult(analysis, page, write_errors, interrupted, throughput)
 
 
-def _run_study(
-    study: Study,
-    folder: Path,
-    refused: dict[int, str],
-    log: ResultsLog,
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row],
-) -> StudyResult:
-    """Runs a study as `run_study` does, with the log of its folder and the errors of its invalid samples."""
+def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLog) -> Iterator[Survey]:
+    """Logs the refused surveys and returns the others that have no result.
+
+    Raises:
+        TwinError: the log has the results of another study.
+    """
     check_results(log, _identities(study, folder, refused))
-    done, planned = log.done(), set(survey_keys(study))
-    if done and done.isdisjoint(planned):
+    done = log.done()
+    if done and done.isdisjoint(survey_keys(study)):
         raise _another_study(log)
     for row in _refused_rows(study, refused):
         if (row["sample"], row["seed"]) not in done:
             log.add(row)
-    done = log.done() if refused else done
-    if refused:
-        progress.print_line(refusal_notice(refused))
-    progress.begin(len(planned - done))
-    missing = (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
-    run_times_s: list[float] = []
-
-    def add_row(row: Row) -> None:
-        run_times_s.append(row.get("timing.survey_s") or 0.0)
-        log.add(row)
-
-    start = time.perf_counter()
-    interrupted = not fly_surveys(study, missing, add_row, engine, progress, function)
-    throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
-
-    analysis = StudyAnalysis(log.table(planned), study, len(planned))
-    page = folder / "study.html"
-    write_errors = _write_errors(
-        log.flush,
-        lambda: write_parquet(analysis.rows, folder / "results.parquet"),
-        lambda: write_report(study, analysis, page),
-        lambda: write_document(analysis, folder),
-    )
-    return StudyResult(analysis, page, write_errors, interrupted, throughput)
+    return (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
 
 
 def _identities(study: Study, folder: Path, refused: dict[int, str]) -> Iterator[tuple[tuple[int, int], str]]:
@@ -174,29 +182,6 @@ def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]
 def _another_study(log: ResultsLog) -> TwinError:
     problem = f"{log.file.parent} contains the results of another study"
     return TwinError("--resume", problem, "the folder of this study")
-
-
-def fly_surveys(
-    study: Study,
-    missing: Iterable[Survey],
-    add_row: Callable[[Row], None],
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row] = fly,
-) -> bool:
-    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True.
-
-    Raises:
-        TwinError: the engine lost its connection.
-    """
-    try:
-        for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
-            row = row_of_outcome(outcome)
-            add_row(row)
-            progress.add(row)
-    except KeyboardInterrupt:
-        return False
-    return True
 
 
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:

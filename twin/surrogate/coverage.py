@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
@@ -56,24 +55,10 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
 
 
 class QuantityOutsideFit(NamedTuple):
-    """Quantity whose values in a survey lie outside the range in which the error model may be used."""
+    """Quantity whose values in a survey lie outside the range in which the error model may be used, as texts."""
 
-    quantity: Quantity  #: the quantity
-    values: Range  #: smallest and largest value in the survey
-    allowed: Range  #: smallest and largest allowed value; infinite on a side without limit
-
-    @property
-    def value_text(self) -> str:
-        """Returns the quantity and its range of values in the survey as text."""
-        return f"{self.quantity.label} of {_text(self.values)}{self.quantity.unit}"
-
-    @property
-    def allowed_text(self) -> str:
-        """Returns the allowed range of the quantity as text."""
-        if self.quantity.limits == "both":
-            return f"{_text(self.allowed)}{self.quantity.unit}"
-        side = "at most" if self.quantity.limits == "upper" else "at least"
-        return f"{side} {self.allowed[self.quantity.limits == 'upper']:.3g}{self.quantity.unit}"
+    value_text: str  #: the quantity and its range of values in the survey
+    allowed_text: str  #: the allowed range
 
 
 def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[QuantityOutsideFit]:
@@ -84,12 +69,13 @@ def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str,
     """
     found = []
     for name in [name for name in fitted if name in conditions]:
-        quantity, (low, high), (smallest, largest) = QUANTITIES[name], conditions[name], fitted[name]
-        lowest = -math.inf if quantity.limits == "upper" else smallest / quantity.factor
-        highest = math.inf if quantity.limits == "lower" else largest * quantity.factor
-        allowed = lowest, highest
-        if not allowed[0] <= low <= high <= allowed[1]:
-            found.append(QuantityOutsideFit(quantity, (low, high), allowed))
+        (label, unit, factor, limits), (low, high) = QUANTITIES[name], conditions[name]
+        lowest, highest = fitted[name][0] / factor, fitted[name][1] * factor
+        allowed = {
+            "both": _text((lowest, highest)), "lower": f"at least {lowest:.3g}", "upper": f"at most {highest:.3g}",
+        }  # fmt: skip
+        if not ((limits == "upper" or lowest <= low) and (limits == "lower" or high <= highest)):
+            found.append(QuantityOutsideFit(f"{label} of {_text((low, high))}{unit}", allowed[limits] + unit))
     return found
 
 

@@ -200,7 +200,14 @@ class _LinkErrors(NamedTuple):
 def _fit_link_errors(
     surveys: Sequence[SurveyStatistics], match_ratios: np.ndarray, lamp_share: np.ndarray, compared: ErrorModel
 ) -> _LinkErrors:
-    """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe."""
+    """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe.
+
+    Errors due to relief grow with unevenness and with the distance between the keyframes. Match error ratio, relief
+    gain and the growth of both under lamps are therefore fitted to the mean squared errors of the thirds of each survey's
+    links, sorted by distance; a relief gain is a weak prior, for smooth floors do not determine it. The bias of a
+    keyframe, which ends one link and starts the next, makes consecutive errors cancel partly, relief makes them equal:
+    the bias fraction is fitted to the scalar products of the errors of consecutive links.
+    """
     images, by_patches, by_relief = np.array([_squared_errors_by_distance(s) for s in surveys]).transpose(2, 0, 1)
     reported, share = np.square(match_ratios)[:, None], lamp_share[:, None]
     by_relief = by_relief / (RELIEF_GAIN**2 * (1 + (compared.lamp_error_growth * share) ** 2))
@@ -246,7 +253,7 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
     At distance zero, both stereo pairs of a link contribute the same variance. The contribution of the earlier pair is
     multiplied by 1 + (growth * distance)^2, so the variance of the link is multiplied by
-    1 + (growth * distance)^2 / 2. The distance is computed by `SurrogateVision.distance_in_depths`.
+    1 + (growth * distance)^2 / 2. The distance is computed by `KeyframeTruth.distance_in_depths`.
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [
@@ -429,7 +436,15 @@ def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClas
 
 
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
-    """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells."""
+    """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
+
+    The model variance of a class is that of the map with pose errors alone, plus a term for each of depth, lateral shift
+    and walls (the variance that a unit error adds to a sampled map, times a fitted factor) and for relief, which the
+    fusion of several tracks does not reduce. The sum is not exact, because a map computes part of its variance from the
+    heights around a cell. It is therefore multiplied by the ratio of the variance in the map sampled from the compared
+    model to the model variance with the compared parameters; repeated fits, each compared with the result of the one
+    before, converge. Images without binning determine all parameters but `_MapErrors.binned`.
+    """
     is_error = quantity == "error"
     edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
     laws = (compared.depth_error, compared.depth_binned_error) if is_error else (

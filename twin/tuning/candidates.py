@@ -7,6 +7,7 @@ with new samples and seeds. The plans to be verified are then flown as rendered 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -212,11 +213,10 @@ class CandidateSurveys:
         """
         for number, values in candidates.items():
             for survey in self.surveys(number, values):
-                if isinstance(survey, Survey):
-                    if not self._is_done(survey):
-                        yield survey
-                else:
+                if not isinstance(survey, Survey):
                     self.add(survey)
+                elif not self._is_done(survey):
+                    yield survey
 
     def scores(self, number: int, values: dict[str, Any]) -> list[SurveyScore]:
         """Returns the results of a candidate's surveys that were flown or refused.
@@ -342,11 +342,9 @@ def check_bounds(study: Study, config: TuningConfig) -> None:
 def _first_valid_sample(study: Study, base: Mapping[str, Any]) -> Sample:
     """Returns the first sample whose scenario is valid with the original plan; if none is, the first sample."""
     for sample in samples(study):
-        try:
+        with suppress(ScenarioError):
             scenario_of_sample(study, base, sample)
-        except ScenarioError:
-            continue
-        return sample
+            return sample
     return next(samples(study))
 
 

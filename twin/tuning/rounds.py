@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from twin.engines.engine import Engine
 from twin.scenario.model import Scenario
-from twin.studies.flight import Row, fly
-from twin.studies.progress import StudyProgress
+from twin.studies.flight import Row
 from twin.studies.results_log import ResultsLog, write_parquet
-from twin.studies.runner import fly_surveys, open_folder
+from twin.studies.runner import Fleet, open_folder
 from twin.studies.study_file import Study, TuningConfig
-from twin.studies.surveys import Survey
 from twin.tuning.candidates import (
     Candidate,
     CandidateSurveys,
@@ -56,40 +53,7 @@ class TuningResult(NamedTuple):
         return next((v for v in self.verifications if chosen and v.surrogate.number == chosen.number), None)
 
 
-class TuningFlights(NamedTuple):
-    """Runs the surveys of a search and logs their results."""
-
-    engine: Engine  #: runs the surveys in parallel
-    progress: StudyProgress  #: display of the progress
-    function: Callable[[Survey], Row]  #: flies one survey
-    log: ResultsLog  #: log of the results
-
-    def fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
-        """Flies those surveys of the given plans that have no result yet.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
-            TwinError: the engine lost its connection.
-        """
-
-        def add_row(row: Row) -> None:
-            self.log.add(row)
-            surveys.add(row)
-
-        missing = list(surveys.missing(plans))
-        self.progress.begin(self.progress.total + len(missing))
-        if missing and not fly_surveys(surveys.study, missing, add_row, self.engine, self.progress, self.function):
-            raise KeyboardInterrupt
-
-
-def tune(
-    study: Study,
-    folder: Path,
-    resume: bool,
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row] = fly,
-) -> TuningResult:
+def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult:
     """Searches for the best plan as specified in `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
     Args:
@@ -102,11 +66,10 @@ def tune(
         ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
         OSError: the results cannot be written.
     """
-    config = tuning_config(study)
+    config, interrupted = tuning_config(study), False
     check_bounds(study, config)
     with open_folder(folder, resume, search=True) as log:
-        tuning = Tuning(study, config, folder, TuningFlights(engine, progress, function, log))
-        interrupted = False
+        tuning = Tuning(study, config, folder, fleet, log)
         try:
             tuning.run()
         except KeyboardInterrupt:
@@ -119,11 +82,11 @@ def tune(
 class Tuning:
     """State of a search: the evaluated plans, the finalists (evaluated again with new seeds), and the verifications."""
 
-    def __init__(self, study: Study, config: TuningConfig, folder: Path, flights: TuningFlights):
-        self.study, self.config, self.folder, self.flights = study, config, folder, flights
-        self.trials = CandidateSurveys(study, config, folder, flights.log.rows())
-        self.confirmation = self.trials.confirmation(flights.log.rows())
-        self.rendered = self.trials.rendered(flights.log.rows())
+    def __init__(self, study: Study, config: TuningConfig, folder: Path, fleet: Fleet, log: ResultsLog):
+        self.study, self.config, self.folder, self.fleet, self.log = study, config, folder, fleet, log
+        self.trials = CandidateSurveys(study, config, folder, log.rows())
+        self.confirmation = self.trials.confirmation(log.rows())
+        self.rendered = self.trials.rendered(log.rows())
         self.needs_rendering = self.trials.uses_surrogate
         self.plans: dict[int, dict[str, Any]] = {}
         self.finalists: dict[int, Candidate] = {}
@@ -180,20 +143,39 @@ class Tuning:
             self.trials.refusals(self.plans),
         )
 
+    def _fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
+        """Flies those surveys of the given plans that have no result yet.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
+        """
+
+        def add_row(row: Row) -> None:
+            self.log.add(row)
+            surveys.add(row)
+
+        missing, progress = list(surveys.missing(plans)), self.fleet.progress
+        progress.begin(progress.total + len(missing))
+        if missing and not self.fleet.fly(surveys.study, missing, add_row):
+            raise KeyboardInterrupt
+
     def _search(self, search_round: int) -> None:
         """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
         search = Search(self.study, self.config, self.folder, self.trials.fingerprint, search_round)
         if search_round:
             search.add_earlier_candidates((c.values, c.objectives, c.shortfall) for c in self._candidates())
         while batch := search.next_batch():
-            self.flights.fly(self.trials, {proposal.number: proposal.values for proposal in batch})
+            self._fly(self.trials, {proposal.number: proposal.values for proposal in batch})
             for proposal in batch:
                 candidate = self._evaluate(self.trials, proposal.number, proposal.values)
                 search.record(proposal, candidate.objectives, candidate.shortfall)
         self.plans |= dict(search.finished())
 
     def _verify_front(self, search_round: int) -> None:
-        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans."""
+        """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
+
+        Repeats this until that plan has passed before, none is confirmed, or `config.plans` plans were verified.
+        """
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()
             if chosen is None or not self.is_verifying or chosen.number in self.verifications:
@@ -211,7 +193,11 @@ class Tuning:
                 return
 
     def _next_cheaper(self) -> Candidate | None:
-        """Returns the next plan to verify that is cheaper than the recommended one."""
+        """Returns the next plan to verify that is cheaper than the recommended one; None if there is none.
+
+        The costs of all plans are the corrected results of the search. Of the cheaper plans that no other dominates and
+        that are not verified, it has the smallest shortfall of the pass probability and, of those, the highest cost.
+        """
         if self.recommended is None:
             return None
         sign, cost = objective_signs(self.config), cost_index(self.config)
@@ -224,20 +210,23 @@ class Tuning:
     def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
         """Flies the rendered surveys of a plan and compares them with its surrogate surveys."""
         self._announce(plan, most_plans)
-        self.flights.fly(self.rendered, {plan.number: plan.values})
+        self._fly(self.rendered, {plan.number: plan.values})
         surrogate = self.finalists[plan.number]
         verification = verification_of(self.rendered, self.confirmation, surrogate, search_round)
         self.verifications[plan.number] = verification
-        self.flights.progress.print_line(verification.notice())
+        self.fleet.progress.print_line(verification.notice())
 
     def _announce(self, plan: Candidate, most_plans: int) -> None:
         """Prints the number and the expected run time of a plan's rendered surveys that are to be flown, if any."""
         if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
-            times = expected_time(self.trials, self.rendered, plan, self.flights.log.rows())
-            self.flights.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
+            times = expected_time(self.trials, self.rendered, plan, self.log.rows())
+            self.fleet.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
 
     def _cheapest_confirmed(self) -> Candidate | None:
-        """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds."""
+        """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
+
+        Bisects the front, because a more expensive plan usually has a higher pass probability. None if none is found.
+        """
         front, found = pareto_front(self._candidates(), self.config), None
         first, end = 0, len(front)
         while first < end:
@@ -252,7 +241,7 @@ class Tuning:
     def _confirm(self, plan: Candidate) -> Candidate:
         """Flies a plan with new samples and seeds, adds it to the finalists, and returns its corrected evaluation."""
         number, values = plan.number, plan.values
-        self.flights.fly(self.confirmation, {number: values})
+        self._fly(self.confirmation, {number: values})
         self.finalists[number] = self.confirmation.evaluate(number, values)
         return self._evaluate(self.confirmation, number, values)
 
