@@ -14,7 +14,7 @@ import pytest
 
 from twin import scenes, survey
 from twin.core import geometry
-from twin.core.floor_rays import height_field
+from twin.core.floor_rays import cast_pixels, height_field
 from twin.core.records import MapGrid
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError
@@ -34,7 +34,6 @@ from twin.surrogate.error_model import (
     ScatterLaw,
     SigmaLaw,
 )
-from twin.surrogate.floor_rays import FloorRayCaster
 from twin.surrogate.map_model import (
     CellErrors,
     MapModel,
@@ -90,10 +89,14 @@ def vision(reef):
     return surrogate_vision(reef, ErrorModel(), lambda: reef.start, Stopwatch())
 
 
+def field_of(terrain):
+    return height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+
+
 def test_ray_depth_equals_the_first_crossing_of_a_fine_ray_march(reef):
-    floor, pose = FloorRayCaster(reef.terrain), tilted(0.3, -0.2, 1.5)
+    pose = tilted(0.3, -0.2, 1.5)
     pixels = np.random.default_rng(0).uniform([0, 0], [319, 239], (40, 2))
-    depth = floor.depth_at(pixels, pose, reef.rig)
+    depth = cast_pixels(field_of(reef.terrain), pose[None], reef.rig, pixels)[0]
     steps = np.arange(0.2, 4.0, 5e-4)
     rays = np.column_stack([(pixels - [reef.rig.cx_px, reef.rig.cy_px]) / reef.rig.focal_px, np.ones(40)])
     for ray, ray_depth in zip(rays, depth, strict=True):
@@ -106,7 +109,7 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
     up = geometry.pose(np.eye(3), np.array([0, 0, 2.0]))
     outside = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([50.0, 0, 2.0]))
     for pose in (up, outside):
-        assert np.isinf(FloorRayCaster(reef.terrain).depth_at(np.array([[160.0, 120.0]]), pose, reef.rig)).all()
+        assert np.isinf(cast_pixels(field_of(reef.terrain), pose[None], reef.rig, np.array([[160.0, 120.0]]))).all()
 
 
 def raster_fraction(vision):

@@ -19,8 +19,7 @@ from twin.surrogate import error_model_file
 from twin.surrogate.coverage import QUANTITIES, quantities_outside_fit
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.matchability import FloorImages, floor_albedos, precision
-from twin.surrogate.measured_rows import MeasuredRows
-from twin.surrogate.measured_view import IDEAL_VIEW, measured_view
+from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, measured_view
 from twin.surrogate.snow_noise import snow_effect
 from twin.surrogate.surrogate_world import SurrogateWorld
 from twin.world.mission import prepare

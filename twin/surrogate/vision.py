@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.braking import braking_factor
+from twin.core.floor_rays import HeightField, cast_pixels
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
@@ -34,7 +35,6 @@ from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
-from twin.surrogate.floor_rays import FloorRayCaster
 from twin.surrogate.map_model import (
     CellErrors,
     MapModel,
@@ -44,8 +44,7 @@ from twin.surrogate.map_model import (
     window_noise,
 )
 from twin.surrogate.matchability import Matchability
-from twin.surrogate.measured_rows import MeasuredRows
-from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
+from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0])  # tabulated distances, in widths of `border_error`
@@ -107,7 +106,7 @@ class TrueScene(NamedTuple):
     """True scene from which measurements are sampled."""
 
     left_camera: Callable[[], Array]  #: function that returns the current true pose (4, 4) of the left camera
-    floor: FloorRayCaster  #: ray caster against the true floor
+    floor: HeightField  #: the true floor
     matchability: Matchability  #: Cramér-Rao bound and unevenness of the floor
     map_model: MapModel  #: model of the elevation map, with the true heights on its grid
     view: MeasuredView = IDEAL_VIEW  #: positions at which the estimators measure true points
@@ -220,7 +219,7 @@ class SurrogateVision:
         with self.stopwatch("stereo"):
             pose, model, scene = self.scene.left_camera(), self.model, self.scene
             scene.map_model.mark_seen(pose)
-            depth_m = scene.floor.depth_at(self._true_pixels, pose, self.rig)
+            depth_m = cast_pixels(scene.floor, pose[None], self.rig, self._true_pixels)[0]
             hits = np.flatnonzero((depth_m > 0) & (depth_m < np.inf))  # 0: the camera is below the floor
             if len(hits) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, 0, None))

@@ -105,7 +105,7 @@ class ComparisonVision:
             self.statistics["point_fraction"].append(len(points.xyz) / self.surrogate.n_corners)
             latest = self.surrogate.latest
             traces = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, sampled)]
-            sigma_ratio = np.sqrt(traces[0] / traces[1] * len(latest.points) / latest.n_points)
+            sigma_ratio = np.sqrt(traces[0] / traces[1] * (len(latest.points) / latest.n_points))
             self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
             self.statistics["bound_px"].append(latest.bound_px)
             self.statistics["stereo_parallax_px"].append(latest.stereo_parallax_px)
@@ -176,7 +176,6 @@ class ComparisonVision:
         if measured is None or sampled is None:
             return
         self.statistics["link_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
-        self.statistics["link_point_ratio"].append(measured.n_points / sampled.n_points)
         self.statistics["link_distance"].append(self.surrogate.latest.distance_in_depths(true))
         errors = {name: geometry.log(geometry.inverse(true) @ m.a_from_b) for name, m in links.items() if m is not None}
         for name, error in errors.items():

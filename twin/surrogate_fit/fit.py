@@ -203,7 +203,7 @@ def _fit_link_errors(
     """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe.
 
     Errors due to relief grow with unevenness and with the distance between the keyframes. Match error ratio, relief
-    gain and the growth of both under lamps are therefore fitted to the mean squared errors of the thirds of each survey's
+    gain and their growth under lamps are therefore fitted to the mean squared errors of the thirds of each survey's
     links, sorted by distance; a relief gain is a weak prior, for smooth floors do not determine it. The bias of a
     keyframe, which ends one link and starts the next, makes consecutive errors cancel partly, relief makes them equal:
     the bias fraction is fitted to the scalar products of the errors of consecutive links.
@@ -438,8 +438,8 @@ def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClas
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
     """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
 
-    The model variance of a class is that of the map with pose errors alone, plus a term for each of depth, lateral shift
-    and walls (the variance that a unit error adds to a sampled map, times a fitted factor) and for relief, which the
+    The model variance of a class is that of the map with pose errors alone, plus terms for depth, lateral shift and
+    walls (the variance that a unit error adds to a sampled map, times a fitted factor) and for relief, which the
     fusion of several tracks does not reduce. The sum is not exact, because a map computes part of its variance from the
     heights around a cell. It is therefore multiplied by the ratio of the variance in the map sampled from the compared
     model to the model variance with the compared parameters; repeated fits, each compared with the result of the one
