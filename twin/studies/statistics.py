@@ -229,7 +229,7 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
 
     Args:
         values: (n (n_axes + 2),) metric at the n design points of each block A, B, AB_1, AB_2, ..., where AB_k is A
-            with column k of B (`design.design_points`).
+            with column k of B (`surveys.design_points`).
     """
     blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, 1, -1)
     given: Any = {"f_A": blocks[0], "f_B": blocks[1], "f_AB": blocks[2:]}

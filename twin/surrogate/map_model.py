@@ -64,10 +64,13 @@ class DepthErrors(NamedTuple):
 
 def depth_errors(model: ErrorModel, matchability: Matchability) -> DepthErrors:
     """Returns the expected errors of the filtered depth."""
-    laws, bounds_px = model.depth_laws(matchability.binning), matchability.bounds_px
+    (error, sigma), bounds_px = model.depth_laws(matchability.binning), matchability.bounds_px
+    window_px, lamp_share = matchability.window_bounds_px, matchability.lamp_share
     return DepthErrors(
-        *laws,
-        *(law.sigma_px(matchability.window_bounds_px, matchability.lamp_share) for law in laws),
+        error,
+        sigma,
+        error.sigma_px(window_px, lamp_share),
+        sigma.sigma_px(window_px, lamp_share),
         model.depth_texture_scatter(bounds_px, matchability.texture.scatter),
         np.array([model.map_completeness(b) for b in bounds_px]),
         np.array([model.edge_error(b) for b in bounds_px]),

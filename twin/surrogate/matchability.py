@@ -278,8 +278,8 @@ def _in_snow(images: FloorImages, albedo: Image, depth_m: float, binning: int) -
     setting = sensor.meter(snowy[0])
     difference = _noise_difference(sensor, clean[0], setting, binning, np.random.default_rng(0))
     noise = float(difference.std()) / np.sqrt(2)
-    signals = ([_grey(light, setting.gain, binning) for light in lights] for lights in (clean, snowy))
-    effect = snow_effect(*signals, noise, images.scenario.estimate.patch_px)
+    signals = [[_grey(light, setting.gain, binning) for light in lights] for lights in (clean, snowy)]
+    effect = snow_effect(signals[0], signals[1], noise, images.scenario.estimate.patch_px)
     return float(np.sqrt(effect.variance_px2)), effect.matched_share
 
 

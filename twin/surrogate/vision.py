@@ -74,7 +74,7 @@ class KeyframeTruth(NamedTuple):
     unit_root: Array  #: (6, 6) lower Cholesky factor of `unit_cov`
     cells: Cells  #: (n,) floor cells of the points
     clear_share: float  #: fraction of the matches that remain in the presence of marine snow
-    noise_ratio: float  #: ratio of the scatter of the row differences to that expected from noise (`measured_rows`)
+    noise_ratio: float  #: ratio of the scatter of the row differences to that expected from noise (`MeasuredRows`)
 
     @property
     def stereo_parallax_px(self) -> float:
