@@ -131,7 +131,7 @@ def test_an_interrupted_check_is_marked_as_incomplete_with_the_exit_status_of_ct
     study, analysis = analysed(tmp_path)
     engine = Interrupted(lambda survey: row_with(survey, 0.0199))
     checked = check(study, analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
-    assert len(checked.rows) == 2 and checked.exit_status == 130
+    assert len(checked.rendered) == 2 and checked.exit_status == 130
     assert summary(checked)["interrupted"] and "interrupted and is incomplete" in checked.sentence()
     again = Calls(lambda survey: row_with(survey, 0.0199))
     finished = check(study, analysis, 6, tmp_path, Fleet(again, StudyProgress()))
@@ -151,11 +151,11 @@ def test_a_study_without_limits_has_nothing_to_check_and_does_not_fail(tmp_path)
 )
 def test_the_surrogate_agrees_if_its_pass_rate_lies_in_the_interval_of_the_rendered_one(rendered, surrogate, agrees):
     """Wilson intervals of 6 and of 1 of 12: 25 to 75 % and 1 to 35 %."""
-    checked = RenderedCheck(np.arange(12) < rendered, np.arange(12) < surrogate, [])
+    checked = RenderedCheck(np.arange(12) < rendered, np.arange(12) < surrogate)
     assert checked.agrees is agrees
     assert ("does not agree" in checked.sentence()) is not agrees
 
 
 def test_without_surveys_near_the_limits_nothing_agrees():
-    checked = RenderedCheck(np.zeros(0, bool), np.zeros(0, bool), [])
+    checked = RenderedCheck(np.zeros(0, bool), np.zeros(0, bool))
     assert not checked.agrees and checked.exit_status == 1 and "No survey" in checked.sentence()

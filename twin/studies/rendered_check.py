@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from twin.judge.require import more_is_better
 from twin.studies import wording
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.flight import Row, has_passed
+from twin.studies.flight import has_passed
 from twin.studies.runner import Fleet, check_results, open_folder
 from twin.studies.statistics import Array, Interval, wilson_interval
 from twin.studies.study_file import Study
@@ -28,7 +28,6 @@ class RenderedCheck(NamedTuple):
 
     rendered: NDArray[np.bool_]  #: (n,) whether each rendered survey was completed and met every requirement
     surrogate: NDArray[np.bool_]  #: (n,) whether each of the surrogate surveys was completed and met every requirement
-    rows: list[Row]  #: result of each rendered survey
     interrupted: bool = False  #: whether Ctrl-C ended the check, so that some of the rendered surveys are missing
     has_limits: bool = True  #: whether the study has a limit, so that there are verdicts to check
     n_lost: int = 0  #: number of rendered surveys that were refused or failed, and therefore have no verdict
@@ -102,10 +101,10 @@ def check(study: Study, analysis: StudyAnalysis, n: int, folder: Path, fleet: Fl
         log.flush()
     rows = {(row["sample"], row["seed"]): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
-    results, n_lost = [rows[keys[k]] for k in flown], sum(key in rows for key in keys) - len(flown)
-    passed = np.array([has_passed(row) for row in results], bool)
+    passed = np.array([has_passed(rows[keys[k]]) for k in flown], bool)
+    n_lost = sum(key in rows for key in keys) - len(flown)
     surrogate = analysis.passed[nearest[np.array(flown, np.int64)]]
-    return RenderedCheck(passed, surrogate, results, not completed, bool(analysis.limits), n_lost)
+    return RenderedCheck(passed, surrogate, not completed, bool(analysis.limits), n_lost)
 
 
 def summary(checked: RenderedCheck) -> dict[str, Any]:
