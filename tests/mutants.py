@@ -130,9 +130,9 @@ MUTANTS = [
         ("twin/recordings/aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),
         ("twin/datasets/readings.py", "times_s, values = table.values[:, 0] * 1e-9,", "times_s, values = table.values[:, 0] * 1e-6,", "datasets_readings"),
         ("twin/studies/statistics.py", "centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)", "centre = (p + z**2 / n) / (1 + z**2 / n)", "study_statistics"),
-        ("twin/studies/design.py", "0 if plan.paired else sample.point * plan.seeds", "sample.point * plan.seeds if plan.paired else 0", "study_sampling study_runner"),
+        ("twin/studies/surveys.py", "0 if plan.paired else sample.point * plan.seeds", "sample.point * plan.seeds if plan.paired else 0", "study_sampling study_runner"),
         ("twin/studies/agreement.py", "within = 1 / (1 + MEDIAN_LIMIT) <= self.ratio.value", "within = 1 - MEDIAN_LIMIT <= self.ratio.value", "study_agreement"),
-        ("twin/studies/correction.py", "math.exp(-0.5 * (plan_distance", "math.exp(0.5 * (plan_distance", "study_rendered_check study_tuning study_verification"),
+        ("twin/tuning/correction.py", "math.exp(-0.5 * (plan_distance", "math.exp(0.5 * (plan_distance", "study_rendered_check study_tuning study_verification"),
         ("twin/planning/cost.py", "n_frames * frame + n_keyframes *", "n_frames * frame - n_keyframes *", "app_plan"),
         ("twin/planning/expected_error.py", "float(np.mean(2 * ndtr(x / sigma) - 1)) - share", "float(np.mean(ndtr(x / sigma))) - share", "app_plan"),
         ("twin/reproduce/tank_sizes.py", "share = np.sqrt(3) / 2 if item.shape == \"dome\"", "share = 0.5 if item.shape == \"dome\"", "reproduce_tank"),
@@ -156,7 +156,8 @@ def chosen(words):
 
 
 def is_current(mutant):
-    return (ROOT / mutant.file).read_text(encoding="utf-8").count(mutant.old) == 1
+    file = ROOT / mutant.file
+    return file.is_file() and file.read_text(encoding="utf-8").count(mutant.old) == 1
 
 
 def verdict_on(mutant):

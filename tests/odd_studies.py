@@ -90,7 +90,7 @@ def run(name, folder):
     odd = ODD_STUDIES[name]
     study = study_of(folder, STUDY, *odd.changes)
     engine = SerialEngine(odd.stop_before)
-    return runner.run_study(study, folder / "out", False, engine, StudyProgress(), fly(odd.passes))
+    return runner.run_study(study, folder / "out", False, runner.Fleet(engine, StudyProgress(), fly(odd.passes)))
 
 
 def answer_of(name, folder):

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from twin.studies.engine import Outcome
+from twin.engines.engine import Outcome
+from twin.engines.worker import describe_exception
 from twin.studies.flight import row_of
 from twin.studies.study_file import load_study
-from twin.studies.worker import describe_exception
 
 STUDY = """
 scenario = "reef"

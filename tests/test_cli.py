@@ -124,7 +124,6 @@ def test_options_reach_the_survey(twin_command):
         (["run", "quickstart", "--seed", "-1"], "Invalid value for '--seed'"),
         (["run"], "Missing argument 'SCENE'"),
         (["fly"], "No such command 'fly'"),
-        (["calibrate", "fit_reef", "--out", "x.toml"], "calibrate: renamed to fit-surrogate"),
         (
             ["plan", "reef", "--set", "imaging.calibration=x"],
             "imaging.calibration: renamed to imaging.error_model",

@@ -141,7 +141,7 @@ def test_every_import_is_in_the_table(path):
         ("twin.imaging.light.optics", "from twin.simulate import mujoco_vehicle"),
         ("twin.surrogate.vision", "from twin.studies import search"),
         ("twin.surrogate.vision", "from twin.surrogate_fit import fit"),
-        ("twin.studies.search", "from twin.app import console"),
+        ("twin.tuning.search", "from twin.app import console"),
         ("twin.scenario.file", "from twin import survey"),
     ],
 )

@@ -5,12 +5,11 @@ import pytest
 from study_surveys import study_of
 
 from twin.errors import ScenarioError
-from twin.studies.agreement import agreement, values_of_pairs
-from twin.studies.agreement_report import HEADER, table, write_document
+from twin.studies.agreement import HEADER, agreement, table, values_of_pairs, write_document
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import row_of
+from twin.studies.report import summary
 from twin.studies.results_log import ResultsLog
-from twin.studies.summary import summary
 from twin.studies.surveys import surveys
 
 GATE = """

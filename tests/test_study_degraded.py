@@ -9,13 +9,13 @@ from test_study_report import analyse
 from test_study_tuning import TUNING
 
 from twin.judge.map_error import with_completeness
-from twin.studies import flight, tuning_report, wording
-from twin.studies.candidates import CandidateSurveys, tuning_config
+from twin.studies import flight, wording
 from twin.studies.progress import survey_line
-from twin.studies.report import write_report
-from twin.studies.summary import summary
+from twin.studies.report import summary, write_report
 from twin.studies.surveys import surveys
-from twin.studies.tuning import TuningResult
+from twin.tuning import tuning_report
+from twin.tuning.candidates import CandidateSurveys, tuning_config
+from twin.tuning.rounds import TuningResult
 
 REASON = "the stereo residuals are 3.1 px"
 
@@ -43,7 +43,7 @@ def test_a_degraded_survey_counts_and_does_not_pass(study, tmp_path):
 def test_the_report_of_a_study_names_the_reason_of_degraded_surveys(study, tmp_path, monkeypatch):
     analysis = analyse(study, tmp_path, half_degraded)
     assert {r.reason for r in analysis.failure_reasons if r.status == "degraded"} == {"the stereo residuals are … px"}
-    monkeypatch.setattr("twin.studies.report.draw_all", lambda *_: {}, raising=False)
+    monkeypatch.setattr("twin.studies.figures.draw_all", lambda *_: {}, raising=False)
     write_report(study, analysis, tmp_path / "study.html")
     assert re.search(r">degraded</td><td[^>]*>6</td>", (tmp_path / "study.html").read_text())
 

@@ -12,9 +12,9 @@ import pytest
 import study_tasks
 
 from twin.app.study_command import open_engine
+from twin.engines.engine import LocalEngine
+from twin.engines.worker import TaskLimits, WorkerPool
 from twin.errors import TwinError
-from twin.studies.local_engine import LocalEngine
-from twin.studies.worker import TaskLimits, WorkerPool
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_a_pipe_is_closed_only_once_when_the_pool_is_closed_during_a_task():
 
 
 def test_an_unreachable_scheduler_is_reported(monkeypatch):
-    monkeypatch.setattr("twin.studies.dask_engine._CONNECT_TIMEOUT_S", 0.5)
+    monkeypatch.setattr("twin.engines.dask_engine._CONNECT_TIMEOUT_S", 0.5)
     with pytest.raises(TwinError, match=r"--scheduler: nowhere:1 does not respond: .*e\.g\. tcp://host:8786\)"):
         with open_engine(scheduler="nowhere:1"):
             pass
@@ -142,7 +142,7 @@ def test_a_dask_cluster_gives_the_outcomes_of_a_local_engine_even_if_it_loses_a_
 def test_workers_end_when_their_parent_process_is_killed():
     script = (
         "import os, signal, study_tasks\n"
-        "from twin.studies.local_engine import LocalEngine, TaskLimits\n"
+        "from twin.engines.engine import LocalEngine, TaskLimits\n"
         "engine = LocalEngine(1)\n"
         "for outcome in engine.run_many(study_tasks.process_and_cores, [0], TaskLimits()):\n"
         "    print(outcome.result[0], flush=True)\n"
@@ -150,7 +150,10 @@ def test_workers_end_when_their_parent_process_is_killed():
     )
     folder = os.path.dirname(study_tasks.__file__)
     parent = subprocess.run(
-        [sys.executable, "-c", script], env=os.environ | {"PYTHONPATH": folder}, capture_output=True, text=True
+        [sys.executable, "-c", script],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([folder, *sys.path])},
+        capture_output=True,
+        text=True,
     )
     worker = int(parent.stdout)
     deadline = time.monotonic() + 10

@@ -4,7 +4,7 @@ import odd_studies
 import pytest
 
 from twin.studies import runner
-from twin.studies.summary import summary
+from twin.studies.report import summary
 
 
 @pytest.fixture(autouse=True)

@@ -13,10 +13,10 @@ from twin.errors import ScenarioError, UnmodelledError
 from twin.studies import flight, wording
 from twin.studies.analysis import StudyAnalysis, mask_numbers
 from twin.studies.flight import row_of
+from twin.studies.report import summary as summary_of
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
 from twin.studies.statistics import wilson_interval
-from twin.studies.summary import summary as summary_of
 from twin.studies.surveys import survey_keys, surveys
 
 
@@ -172,9 +172,7 @@ def test_the_strongest_sensitivity_comes_first(analysis):
     assert np.isnan(by_key["water.jerlov"].correlation.value)  # text has no rank
 
 
-def test_failure_reasons_and_key_comparisons_describe_the_surveys_that_did_not_pass(analysis):
-    assert analysis.key_comparisons[0].key == "water.turbidity"
-    assert analysis.key_comparisons[0].superiority > 0.95
+def test_failure_reasons_describe_the_surveys_that_did_not_pass(analysis):
     reasons = {reason.reason: reason.surveys for reason in analysis.failure_reasons}
     assert reasons[mask_numbers(LOST)] == (analysis.status == "aborted").sum()
     assert reasons["requirement not met: map.le90_m"] == (analysis.complete & ~analysis.passed).sum()

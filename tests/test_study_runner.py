@@ -9,9 +9,9 @@ from study_surveys import STUDY, SerialEngine, study_of
 
 from twin.app import study_command
 from twin.app.study_command import open_engine
+from twin.engines.engine import Outcome
 from twin.errors import ScenarioError, TwinError
 from twin.studies import runner, wording
-from twin.studies.engine import Outcome
 from twin.studies.flight import flatten, has_passed
 from twin.studies.progress import StudyProgress
 from twin.studies.results_log import ResultsLog
@@ -29,7 +29,7 @@ def study(tmp_path):
 
 
 def run_study(study, folder, engine=None, resume=False, function=study_surveys.fly):
-    return runner.run_study(study, folder, resume, engine or SerialEngine(), StudyProgress(), function)
+    return runner.run_study(study, folder, resume, runner.Fleet(engine or SerialEngine(), StudyProgress(), function))
 
 
 def rows(folder):

@@ -6,10 +6,10 @@ from scipy import stats
 from scipy.stats import qmc
 from study_surveys import STUDY, study_of
 
-from twin.studies.design import design_points, samples, seeds_of_sample
 from twin.studies.distribution import Distribution
 from twin.studies.runner import refusal_notice
 from twin.studies.study_file import n_planned_surveys
+from twin.studies.surveys import design_points, samples, seeds_of_sample
 
 PROBABILITIES = (np.arange(2000) + 0.5) / 2000
 

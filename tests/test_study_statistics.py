@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from twin.studies import statistics
-from twin.studies.design import design_points
+from twin.studies.surveys import design_points
 
 
 @pytest.mark.parametrize(("passed", "count"), [(0, 10), (3, 10), (10, 10), (86, 100), (1, 1)])
@@ -125,7 +125,3 @@ def test_no_number_of_surveys_decides_at_the_required_fraction_or_for_certainty(
 def test_the_interval_of_a_proportion_never_has_zero_width(passed, clusters):
     interval = statistics.clustered_proportion(passed, list(clusters))
     assert interval.high - interval.low > 0.1
-
-
-def test_probability_of_superiority_is_the_fraction_of_pairs():
-    assert statistics.probability_of_superiority([2, 3], [1, 2]) == (0.5 + 1 + 1 + 1) / 4

@@ -7,13 +7,14 @@ from study_surveys import SerialEngine, study_of
 
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import find_scene, load_scenario
-from twin.studies import tuning_report
-from twin.studies.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
+from twin.studies.runner import Fleet
 from twin.studies.statistics import wilson_interval
 from twin.studies.surveys import refusals
-from twin.studies.tuning import tune
+from twin.tuning import tuning_report
+from twin.tuning.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
+from twin.tuning.rounds import tune
 
 TUNING = """
 scenario = "reef"
@@ -57,7 +58,7 @@ def abort(survey):
 
 
 def search(study, folder, engine=None, resume=False, function=fly):
-    return tune(study, folder, resume, engine or SerialEngine(), StudyProgress(), function)
+    return tune(study, folder, resume, Fleet(engine or SerialEngine(), StudyProgress(), function))
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,14 @@ from study_surveys import SerialEngine, study_of
 
 from twin.app import study_command
 from twin.errors import ScenarioError
-from twin.studies import candidates, tuning_report
-from twin.studies.candidates import cost_index, tuning_config
-from twin.studies.correction import NO_CORRECTION, PlanRatio, correction_at, metric_ratio
 from twin.studies.distribution import Distribution
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
-from twin.studies.tuning import tune
+from twin.studies.runner import Fleet
+from twin.tuning import candidates, tuning_report
+from twin.tuning.candidates import cost_index, tuning_config
+from twin.tuning.correction import NO_CORRECTION, PlanRatio, correction_at, metric_ratio
+from twin.tuning.rounds import tune
 
 TUNING = """
 scenario = "reef"
@@ -107,7 +108,7 @@ def degraded(survey):
 
 
 def search(study, folder, function=optimistic, engine=None, resume=False):
-    return tune(study, folder, resume, engine or SerialEngine(), StudyProgress(), function)
+    return tune(study, folder, resume, Fleet(engine or SerialEngine(), StudyProgress(), function))
 
 
 @pytest.fixture(scope="module")
@@ -300,7 +301,7 @@ def test_the_command_line_overrides_the_number_of_rendered_surveys(tmp_path, mon
         used.append(study.tune.verify)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(study_command.tuning, "tune", fake)
+    monkeypatch.setattr(study_command.rounds, "tune", fake)
     with pytest.raises(KeyboardInterrupt):
         study_command.tune(str(tmp_path / "study.toml"), study_command.StudyOptions(tmp_path / "out", 1, verify=0))
     assert used == [0]

@@ -14,7 +14,7 @@ import pytest
 
 from twin import scenes, survey
 from twin.core import geometry
-from twin.core.floor_rays import height_field
+from twin.core.floor_rays import cast_pixels, height_field
 from twin.core.records import MapGrid
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError
@@ -34,7 +34,6 @@ from twin.surrogate.error_model import (
     ScatterLaw,
     SigmaLaw,
 )
-from twin.surrogate.floor_rays import FloorRayCaster
 from twin.surrogate.map_model import (
     CellErrors,
     MapModel,
@@ -48,7 +47,9 @@ from twin.surrogate.map_model import (
 )
 from twin.surrogate.matchability import (
     NO_DEPENDENCE,
+    FloorImages,
     Matchability,
+    floor_albedos,
     lamp_share,
     position_dependence,
     precision,
@@ -88,10 +89,14 @@ def vision(reef):
     return surrogate_vision(reef, ErrorModel(), lambda: reef.start, Stopwatch())
 
 
+def field_of(terrain):
+    return height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+
+
 def test_ray_depth_equals_the_first_crossing_of_a_fine_ray_march(reef):
-    floor, pose = FloorRayCaster(reef.terrain), tilted(0.3, -0.2, 1.5)
+    pose = tilted(0.3, -0.2, 1.5)
     pixels = np.random.default_rng(0).uniform([0, 0], [319, 239], (40, 2))
-    depth = floor.depth_at(pixels, pose, reef.rig)
+    depth = cast_pixels(field_of(reef.terrain), pose[None], reef.rig, pixels)[0]
     steps = np.arange(0.2, 4.0, 5e-4)
     rays = np.column_stack([(pixels - [reef.rig.cx_px, reef.rig.cy_px]) / reef.rig.focal_px, np.ones(40)])
     for ray, ray_depth in zip(rays, depth, strict=True):
@@ -104,13 +109,23 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
     up = geometry.pose(np.eye(3), np.array([0, 0, 2.0]))
     outside = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([50.0, 0, 2.0]))
     for pose in (up, outside):
-        assert np.isinf(FloorRayCaster(reef.terrain).depth_at(np.array([[160.0, 120.0]]), pose, reef.rig)).all()
+        assert np.isinf(cast_pixels(field_of(reef.terrain), pose[None], reef.rig, np.array([[160.0, 120.0]]))).all()
+
+
+def raster_fraction(vision):
+    """Returns the number of raster points of the last keyframe per matched point."""
+    return len(vision.latest.points) / vision.latest.n_points
+
+
+def bounds_px(m, depths_m):
+    images = FloorImages(m.scenario, m.illumination)
+    return precision(images, floor_albedos(images, m.terrain, depths_m), depths_m).bounds_px
 
 
 def test_the_matching_bound_grows_with_turbidity_depth_and_noise():
     def bound(depth_m, *sets):
         m = mission(*sets)
-        return precision(m.scenario, m.illumination, m.terrain, np.array([depth_m]))[0][0]
+        return bounds_px(m, np.array([depth_m]))[0]
 
     base = bound(2.0)
     assert bound(2.0, 'water.jerlov="3C"') > 2 * base
@@ -124,7 +139,7 @@ def test_the_matching_bound_grows_without_limit_as_the_floor_disappears():
 
     def bound(turbidity):
         m = mission('water.jerlov="III"', f"water.turbidity={turbidity}")
-        return precision(m.scenario, m.illumination, m.terrain, np.array([2.0]))[0][0]
+        return bounds_px(m, np.array([2.0]))[0]
 
     assert bound(15.0) > 100 > 1 > bound(2.0) > 2 * bound(1.2)
 
@@ -138,11 +153,7 @@ def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels
         matchability = Matchability(m.scenario, m.illumination, m.terrain)
         found.append((matchability.binning, matchability.medium_bound_px))
         depths = matchability.depths_m
-        unbinned.append(
-            np.interp(
-                np.sqrt(depths[0] * depths[-1]), depths, precision(m.scenario, m.illumination, m.terrain, depths)[0]
-            )
-        )
+        unbinned.append(np.interp(np.sqrt(depths[0] * depths[-1]), depths, bounds_px(m, depths)))
     assert [binning for binning, _ in found] == [1, 2, 4]
     assert found[0][1] == pytest.approx(unbinned[0])
     assert all(px * binning < 0.9 * full for (binning, px), full in zip(found[1:], unbinned[1:], strict=True))
@@ -181,13 +192,13 @@ def test_tracking_is_lost_where_too_few_points_would_be_matched_between_frames(r
         observe_keyframes(vision, [reef.start], [reef.start])
         vision.restart_tracking()
         assert (vision.frame_errors is not None) == tracked
-        assert vision.bound_px == pytest.approx(0.01, rel=0.3)
+        assert vision.latest.bound_px == pytest.approx(0.01, rel=0.3)
 
 
 def test_the_lamp_share_decreases_with_sunlight():
     def share(lux, *sets):
         m = mission(f"sun.illuminance_lx={lux}", *sets)
-        return lamp_share(m.scenario, m.illumination)
+        return lamp_share(FloorImages(m.scenario, m.illumination))
 
     lamps = "lamps=[{position_m=[0.3, 0.3, 0.0], intensity_cd=500.0}]"
     shares = [share(lux, lamps) for lux in (0, 100, 1000, 10_000)]
@@ -199,7 +210,7 @@ def test_the_lamp_share_decreases_with_sunlight():
     dark = mission("sun.illuminance_lx=1000", lamps, "water.turbidity=100")
     plan = dark.scenario.plan.model_copy(update={"altitude_m": 1000.0})
     high = dark.scenario.model_copy(update={"plan": plan})
-    assert lamp_share(high, dark.illumination) == 1  # no light returns
+    assert lamp_share(FloorImages(high, dark.illumination)) == 1  # no light returns
 
 
 def test_unevenness_equals_the_deviation_of_a_curved_floor_from_its_plane():
@@ -285,9 +296,9 @@ def test_relief_makes_the_matches_of_a_stereo_pair_less_precise():
         model = ErrorModel(match_sigma_px=SigmaLaw(0.02, 0.0), stereo_relief_gain=gain)
         vision = surrogate_vision(rough, model, lambda: at, Stopwatch())
         cov = vision.observe_stereo(None, 0).cov
-        sigmas.append(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) * vision.raster_fraction))
-    baseline_in_depths = np.mean(vision._latest.points[:, 2])
-    parallax_px = vision._latest.unevenness_px * baseline_in_depths
+        sigmas.append(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) * raster_fraction(vision)))
+    baseline_in_depths = np.mean(vision.latest.points[:, 2])
+    parallax_px = vision.latest.unevenness_px * baseline_in_depths
     assert parallax_px > 0.01
     assert sigmas[1] / sigmas[0] == pytest.approx(np.hypot(0.02, 3.0 * parallax_px) / 0.02, rel=1e-6)
 
@@ -365,9 +376,9 @@ def test_stereo_points_lie_in_both_images(reef):
     pose = tilted(0, 0, 2.0)
     vision = surrogate_vision(reef, ErrorModel(), lambda: pose, Stopwatch())
     points = vision.observe_stereo(None, 0)
-    right_px = points.pixels[:, 0] - reef.rig.focal_px * vision._latest.points[:, 2]
+    right_px = points.pixels[:, 0] - reef.rig.focal_px * vision.latest.points[:, 2]
     assert right_px.min() >= reef.scenario.estimate.patch_px // 2
-    excluded = vision._pixels[~np.isin(np.arange(len(vision._pixels)), vision._latest.raster_indices)]
+    excluded = vision._pixels[~np.isin(np.arange(len(vision._pixels)), vision.latest.raster_indices)]
     assert len(excluded) and excluded[:, 0].max() < points.pixels[:, 0].max() / 2  # at the left border
 
 
@@ -717,7 +728,7 @@ LAMPS = "lamps=[{position_m=[0.25, 0.35, -0.05], pan_deg=-8.0}, {position_m=[0.2
 
 def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_daylight_does_not():
     lit, sunlit = (
-        position_dependence(m.scenario, m.illumination, 2.0).bounds
+        position_dependence(FloorImages(m.scenario, m.illumination), 2.0).bounds
         for m in (mission(LAMPS, "sun.illuminance_lx=0"), mission("lamps=[]", "sun.illuminance_lx=1000"))
     )
     assert lit[:, [0, -1]].min() > 1.1 > 0.9 > lit[2:4, 3:5].max()
@@ -727,7 +738,7 @@ def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_dayl
 def test_the_relative_bound_is_that_of_random_textures_in_crops_of_the_image():
     """Oracle: bounds from gradients and noise of other textures (white noise) in each quarter of the image."""
     m = mission(LAMPS, "sun.illuminance_lx=0", "water.jerlov=III")
-    table = position_dependence(m.scenario, m.illumination, 2.0).bounds
+    table = position_dependence(FloorImages(m.scenario, m.illumination), 2.0).bounds
     rng, rig = np.random.default_rng(7), m.scenario.believed_rig()
     formation = ImageFormation(m.scenario, m.illumination, None, rng)
     shape = rig.height_px, rig.width_px
@@ -752,7 +763,7 @@ def block_means(values, rows, cols):
 
 def test_no_light_from_the_floor_gives_equal_bounds_over_the_image():
     m = mission("water.turbidity=100", "lamps=[]", "sun.illuminance_lx=1000")
-    assert position_dependence(m.scenario, m.illumination, 1000.0) is NO_DEPENDENCE
+    assert position_dependence(FloorImages(m.scenario, m.illumination), 1000.0) is NO_DEPENDENCE
 
 
 def test_rough_cells_have_more_holes(vision, no_errors):
@@ -1148,24 +1159,12 @@ def test_every_point_is_matched_in_the_model_with_which_images_are_compared():
     ("content", "message"),
     [
         ("n_surveys = 3\n", "imaging.error_model.*twin fit-surrogate"),
-        ("surveys = 3\n", "surveys was renamed to n_surveys"),
-        ("[model]\nsteady = 0.5\n", "steady was renamed to match_bias_fraction"),
-        ("[model]\nf2f_sigma_px = { floor = 0.1, rise = 1 }\n", "floor was renamed to floor_px, rise was renamed"),
-        ("[misfit]\nplace_px = 0.1\n", "place_px was renamed to match_sigma_px"),
-        ("[model]\ndepth_cell_scatter = 1\n", "depth_cell_scatter was renamed to depth_texture_scatter"),
     ],
 )
 def test_a_file_that_is_not_an_error_model_is_rejected(content, message, tmp_path):
     (tmp_path / "other.toml").write_text(content)
     with pytest.raises(TwinError, match=message):
         error_model_file.load(tmp_path / "other.toml")
-
-
-def test_former_names_of_the_error_model_lead_to_present_ones():
-    laws = [law for law in ErrorModel._field_defaults.values() if hasattr(law, "_fields")]
-    present = {"n_surveys", *ErrorModel._fields, *(name for law in laws for name in law._fields)}
-    assert set(error_model_file._RENAMED.values()) <= present
-    assert not set(error_model_file._RENAMED) & present
 
 
 @pytest.mark.long
@@ -1216,7 +1215,7 @@ class SimulatedImages:
 
     def observe_stereo(self, frame, row):
         points = self._vision.observe_stereo(frame, row)
-        return points._replace(cov=points.cov / self._vision.raster_fraction)
+        return points._replace(cov=points.cov / raster_fraction(self._vision))
 
 
 def compare_survey(flown, true, seed):

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from twin.report.run_result import RunResult
     from twin.scenario.model import Scenario
     from twin.studies.runner import StudyResult
-    from twin.studies.tuning import TuningResult
+    from twin.tuning.rounds import TuningResult
 
 Overrides = Sequence[str] | Mapping[str, Any]
 
@@ -181,22 +181,23 @@ def study(file: str | Path, out: str | Path, jobs: int | None = None, resume: bo
     """
     from twin.app.study_command import open_engine
     from twin.studies.progress import study_progress
-    from twin.studies.runner import run_study
+    from twin.studies.runner import Fleet, run_study
     from twin.studies.study_file import load_study
 
     with open_engine(jobs) as engine, study_progress(False) as progress:
-        return run_study(load_study(str(file)), Path(out).absolute(), resume, engine, progress)
+        return run_study(load_study(str(file)), Path(out).absolute(), resume, Fleet(engine, progress))
 
 
 def tune(file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False) -> TuningResult:
     """Searches the plan that a study file asks for; the arguments and errors are those of `study`."""
     from twin.app.study_command import open_engine
-    from twin.studies import tuning
     from twin.studies.progress import study_progress
+    from twin.studies.runner import Fleet
     from twin.studies.study_file import load_study
+    from twin.tuning import rounds
 
     with open_engine(jobs) as engine, study_progress(False) as progress:
-        return tuning.tune(load_study(str(file)), Path(out).absolute(), resume, engine, progress)
+        return rounds.tune(load_study(str(file)), Path(out).absolute(), resume, Fleet(engine, progress))
 
 
 def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None = None) -> ReplayResult:

@@ -452,12 +452,6 @@ def fit_surrogate(
     raise typer.Exit(fit_command.run(files or [], out, runs, jobs))
 
 
-@app.command("calibrate", hidden=True, context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
-def calibrate() -> None:
-    """Old name of the command fit-surrogate; ends with an error that states the new name."""
-    raise TwinError("calibrate", "renamed to fit-surrogate")
-
-
 @app.command()
 def study(
     file: StudyArgument,

@@ -10,10 +10,10 @@ from rich.progress import track
 
 from twin.app import console
 from twin.core.output_folder import sole_writer
-from twin.studies.local_engine import default_jobs
+from twin.engines.engine import default_jobs
+from twin.engines.worker import SINGLE_THREADED
 from twin.studies.study_file import load_study
 from twin.studies.surveys import surveys
-from twin.studies.worker import SINGLE_THREADED
 from twin.surrogate import error_model_file
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
 

@@ -12,14 +12,14 @@ from typing import NamedTuple
 from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.core.output_folder import sole_writer
+from twin.engines.engine import Engine, LocalEngine, default_jobs
 from twin.errors import TwinError
-from twin.studies import agreement, agreement_report, rendered_check, summary, tuning, tuning_report, wording
-from twin.studies.candidates import tuning_config
-from twin.studies.engine import Engine
-from twin.studies.local_engine import LocalEngine, default_jobs
+from twin.studies import agreement, rendered_check, report, wording
 from twin.studies.progress import study_progress
-from twin.studies.runner import StudyResult, run_study
+from twin.studies.runner import Fleet, StudyResult, run_study
 from twin.studies.study_file import Study, load_study
+from twin.tuning import rounds, tuning_report
+from twin.tuning.candidates import tuning_config
 
 SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
@@ -71,7 +71,7 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
     if scheduler:
         if find_spec("distributed") is None:
             raise TwinError("--scheduler", "Dask is not installed", "pip install 'seabed-twin[cluster]'")
-        from twin.studies import dask_engine
+        from twin.engines import dask_engine
 
         is_slurm = scheduler == SLURM
         with dask_engine.start_slurm_jobs(jobs) if is_slurm else dask_engine.connect_scheduler(scheduler) as engine:
@@ -93,16 +93,16 @@ def run(file: str, options: StudyOptions) -> int:
     study = load(file, options)
     folder = _folder(options, "study", study)  # workers run in other folders
     with options.engine() as engine, study_progress(options.live) as progress:
-        result = run_study(study, folder, options.resume, engine, progress)
+        result = run_study(study, folder, options.resume, Fleet(engine, progress))
         checked = None
         if options.verify and not result.interrupted:
-            checked = rendered_check.check(study, result.analysis, options.verify, folder, engine, progress)
+            checked = rendered_check.check(study, result.analysis, options.verify, folder, Fleet(engine, progress))
     for error in result.write_errors:
         console.print_error(f"{folder}: {error}; free some disk space and continue with --resume")
     if options.as_json:
         identity = {"name": study.name, "out": str(folder), "throughput": result.throughput._asdict()}
         identity |= {} if checked is None else {"rendered_check": rendered_check.summary(checked)}
-        print(json.dumps(summary.summary(result.analysis, identity), indent=1))
+        print(json.dumps(report.summary(result.analysis, identity), indent=1))
     else:
         _print_result(study, result)
         if checked is not None:
@@ -128,7 +128,7 @@ def tune(file: str, options: StudyOptions) -> int:
         study = study.model_copy(update={"tune": config})
     folder = _folder(options, "tune", study)
     with options.engine() as engine, study_progress(options.live) as progress:
-        result = tuning.tune(study, folder, options.resume, engine, progress)
+        result = rounds.tune(study, folder, options.resume, Fleet(engine, progress))
     with sole_writer(folder, used=True):
         tuning_report.write_tuning_report(study, config, result, folder)
     if options.as_json:
@@ -181,7 +181,7 @@ def _print_result(study: Study, result: StudyResult) -> None:
     ]
     console.print_table(f"{study.name}: median and 95 % bound of the surveys", rows)
     if (compared := agreement.agreement(analysis)) is not None:
-        console.print_table(agreement_report.verdict_line(compared), agreement_report.table(compared))
+        console.print_table(agreement.verdict_line(compared), agreement.table(compared))
     if analysis.refusal_reasons:
         reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
         samples = wording.sample_count(len(analysis.refused_samples))

@@ -16,6 +16,7 @@ from twin.surrogate import error_model_file
 from twin.surrogate.map_model import (
     EDGE_VIEWS_EXPONENT,
     WINDOW_PX,
+    depth_errors,
     edge_strength,
     relief_error_px,
     roughness,
@@ -90,24 +91,26 @@ def expected_error(mission: Mission, forecast: FloorForecast) -> ExpectedError:
     model, matching = fitted.model, Matchability(scenario, mission.illumination, mission.terrain)
     rig = rig.binned(matching.binning)
     depth, slope, rough_m, edge_m = _floor_points(mission, forecast, rig)
-    bound = np.interp(depth, matching.depths_m, matching.bounds_px)
-    table = matching.bounds_px
-    law, _ = model.depth_laws(matching.binning)
-    sigma_px = np.interp(depth, matching.depths_m, law.sigma_px(matching.window_bounds_px, matching.lamp_share))
-    in_view = np.interp(depth, matching.depths_m, [model.map_completeness(b) for b in table])
+    errors = depth_errors(model, matching)
+
+    def at_depth(table: Array) -> Array:
+        return np.interp(depth, matching.depths_m, table)
+
+    bound, sigma_px = at_depth(matching.bounds_px), at_depth(errors.error_px)
+    in_view = at_depth(errors.completeness)
     poses, overlap = forecast.keyframes.world_from_camera, scenario.plan.overlap_along
     step = float(np.median(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1))) if len(poses) > 1 else 0.0
-    window = np.interp(depth, matching.depths_m, matching.window_bounds_px)
-    share = law.relative_variance(1 / (1 - overlap), step / rig.baseline_m, window)
-    scatters = model.error_scatter_share * model.depth_texture_scatter(table, matching.texture.scatter)
-    scatter = np.interp(depth, matching.depths_m, scatters)
+    share = errors.error_law.relative_variance(
+        1 / (1 - overlap), step / rig.baseline_m, at_depth(matching.window_bounds_px)
+    )
+    scatter = at_depth(model.error_scatter_share * errors.cell_scatter)
     evenly = (0.5 + np.arange(len(depth)) * _GOLDEN_RATIO) % 1
     sigma_px *= np.exp(scatter * ndtri(np.clip(evenly, 1e-6, 1 - 1e-6)))
     vertical = depth**2 / (rig.focal_px * rig.baseline_m) * sigma_px * np.sqrt(share)
     lateral = slope * model.lateral_sigma_px * depth / rig.focal_px
     per_px = depth**2 / (rig.focal_px * rig.baseline_m)
     relief = per_px * relief_error_px(rough_m / per_px, model.relief_error_gain, model.relief_error_limit_px)
-    walls = np.interp(depth, matching.depths_m, [model.edge_error(b) for b in table]) * edge_m
+    walls = at_depth(errors.edge_error) * edge_m
     walls *= (1 - overlap) ** EDGE_VIEWS_EXPONENT
     sigma_m = np.sqrt(vertical**2 + lateral**2 + relief**2 + walls**2)
     return ExpectedError(

@@ -1027,17 +1027,8 @@ class Scenario(Section):
         return EstimatorSettings(**settings, noisy_images=self.sensor is not None or max(noise) >= _VISIBLE_NOISE)
 
     def fingerprint(self) -> str:
-        """Returns a hash of all values, 16 hexadecimal digits; of files, only the paths are hashed.
-
-        `record` is left out, and so are `imu` if there is none and `terrain.wall_texture` where it is draped or has no
-        effect, so that results from before these keys were introduced keep their hash.
-        """
-        left_out: dict[str, bool | set[str]] = {"record": True}
-        if not self.imu:
-            left_out["imu"] = True
-        if not self.has_walls:
-            left_out["terrain"] = {"wall_texture"}
-        return hashlib.sha256(self.model_dump_json(exclude=left_out).encode()).hexdigest()[:16]
+        """Returns a hash of all values but `record`, 16 hexadecimal digits; of files, only the paths are hashed."""
+        return hashlib.sha256(self.model_dump_json(exclude={"record"}).encode()).hexdigest()[:16]
 
     @property
     def has_walls(self) -> bool:

@@ -15,9 +15,9 @@ from twin.judge.map_error import with_completeness
 from twin.judge.require import more_is_better
 from twin.studies import statistics
 from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values, rounded
-from twin.studies.design import axis_names
 from twin.studies.statistics import Array, Interval, SobolIndex
 from twin.studies.study_file import Study
+from twin.studies.surveys import axis_names
 
 _MAX_REASONS = 12
 _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
@@ -48,19 +48,6 @@ class Sensitivity(NamedTuple):
     metric: str
     correlation: Interval
     explained: float
-
-
-class KeyComparison(NamedTuple):
-    """Medians of a key over the surveys that passed and over the surveys that did not pass.
-
-    `superiority` is the probability that the key has a greater value in a survey that did not pass than in one that
-    passed; ties count half.
-    """
-
-    key: str
-    passed: float
-    not_passed: float
-    superiority: float
 
 
 class FailureReason(NamedTuple):
@@ -133,10 +120,7 @@ class StudyAnalysis:
         return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
 
     def _has_values(self, metric: str) -> bool:
-        """Returns whether the metric is in the table, and is required or has a finite value in some survey.
-
-        Surveys by the surrogate, for example, have no contrast.
-        """
+        """Returns whether the metric is in the table, and is required or has a finite value in some survey."""
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
@@ -211,7 +195,6 @@ class StudyAnalysis:
         """Groups surveys by the value of a key; see `statistics.group_indices` for numbers.
 
         Args:
-            key: the varied key.
             chosen: (n,) mask of the surveys to group.
 
         Returns:
@@ -274,10 +257,7 @@ class StudyAnalysis:
         }
 
     def _mean_of_samples(self, metric: str) -> Array:
-        """Returns the mean of a metric over the surveys of each sample, by sample number.
-
-        It is NaN unless all surveys of the sample are complete and have a value.
-        """
+        """Returns the mean of a metric over the surveys of each sample, by sample number."""
         values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)
@@ -326,22 +306,6 @@ class StudyAnalysis:
         """
         counts = count_similar(self.reason[self.refused])
         return [FailureReason("refused", reason, count) for reason, count in counts.items()][:_MAX_REASONS]
-
-    @cached_property
-    def key_comparisons(self) -> list[KeyComparison]:
-        """Returns, for each numeric key, a comparison of the evaluated surveys that passed with those that did not.
-
-        The greatest difference comes first. Empty if all of these surveys passed or none did.
-        """
-        comparisons = []
-        for key in self.keys:
-            x = self.key_numbers(key)
-            if x is not None:
-                good, bad = x[self.evaluated & self.passed], x[self.evaluated & ~self.passed]
-                if len(good) and len(bad):
-                    superiority = statistics.probability_of_superiority(bad, good)
-                    comparisons.append(KeyComparison(key, float(np.median(good)), float(np.median(bad)), superiority))
-        return sorted(comparisons, key=lambda c: -abs(c.superiority - 0.5))
 
     @cached_property
     def failure_reasons(self) -> list[FailureReason]:

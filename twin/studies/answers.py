@@ -19,50 +19,33 @@ _DIVIDING_DEVIANCE = 15.0  # exceeded in less than 1 % of samples with one pass 
 
 
 class Answer(NamedTuple):
-    """Verdict on the pass probability for one range of values of a scenario key, or for one of its listed values.
+    """Verdict on the pass probability for one range of values of a scenario key, or for one of its listed values."""
 
-    Args:
-        verdict: "passes" if the lower confidence bound of the pass probability reaches the required value, "fails" if
-            the upper bound is below it, else "undecided". The bounds of ranges are corrected for multiple comparisons.
-        label: the range or the value as text, e.g. "1.6 to 1.9".
-        low: smallest value in the range; NaN for text.
-        high: largest value in the range; NaN for text.
-        surveys: number of surveys in the range.
-        probability: pass probability in the range, with its 95 % confidence interval.
-        more_surveys: number of further surveys that would decide the verdict if the observed fractions stay the same; 0
-            if it is decided, infinite if the observed fraction equals the required one or the required one is 1, or if
-            the verdict depends on the unknown results.
-        unknown: number of these surveys whose result is unknown; see `PassRecord`.
-    """
-
+    #: "passes" if the lower confidence bound of the pass probability reaches the required value, "fails" if the upper
+    #: bound is below it, else "undecided". The bounds of ranges are corrected for multiple comparisons.
     verdict: Verdict
-    label: str
-    low: float
-    high: float
-    surveys: int
-    probability: Interval
+    label: str  #: the range or the value as text, e.g. "1.6 to 1.9".
+    low: float  #: smallest value in the range; NaN for text
+    high: float  #: largest value in the range; NaN for text
+    surveys: int  #: number of surveys in the range
+    probability: Interval  #: pass probability in the range, with its 95 % confidence interval
+    #: number of further surveys that would decide the verdict if the observed fractions stay the same; 0 if it is
+    #: decided, infinite if the observed fraction equals the required one or the required one is 1, or if the verdict
+    #: depends on the unknown results
     more_surveys: float
-    unknown: int = 0
+    unknown: int = 0  #: number of these surveys whose result is unknown; see `PassRecord`
 
 
 class PassRecord(NamedTuple):
-    """Pass or fail of n surveys with their cluster labels, and the required pass probability.
+    """Pass or fail of n surveys with their cluster labels, and the required pass probability."""
 
-    Args:
-        passed: (n,) whether each survey passed.
-        clusters: (n,) cluster label of each survey.
-        required: required pass probability.
-        pass_level: confidence level of the lower bound for the verdict "passes".
-        fail_level: confidence level of the upper bound for the verdict "fails".
-        unknown: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at
-            the lower bound of the pass probability, and as one that passed at the upper bound. None: all are known.
-    """
-
-    passed: NDArray[np.bool_]
-    clusters: Array
-    required: float
-    pass_level: float = LEVEL
-    fail_level: float = LEVEL
+    passed: NDArray[np.bool_]  #: (n,) whether each survey passed
+    clusters: Array  #: (n,) cluster label of each survey
+    required: float  #: required pass probability
+    pass_level: float = LEVEL  #: confidence level of the lower bound for the verdict "passes"
+    fail_level: float = LEVEL  #: confidence level of the upper bound for the verdict "fails"
+    #: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at the lower
+    #: bound of the pass probability, and as one that passed at the upper bound. None: all are known.
     unknown: NDArray[np.bool_] | None = None
 
     @property
@@ -116,7 +99,6 @@ def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
 
     Args:
         names: (n,) value of the key in each survey, numbers or text.
-        record: results of the surveys.
     """
     values = np.asarray(names)
     numeric = np.issubdtype(values.dtype, np.number)
@@ -139,7 +121,6 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
 
     Args:
         x: (n,) value of the key in each survey.
-        record: results of the surveys.
     """
     if len(x) == 0:
         return []
@@ -225,11 +206,7 @@ def _decided_runs(
 
 
 def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], required: float) -> bool:
-    """Returns whether the verdict on a range of consecutive bins (first, last) is supported by these bins.
-
-    The verdict must be decided, the observed fractions of the first and the last bin must agree with it, and no range
-    of bins within this one may have the opposite verdict.
-    """
+    """Returns whether the verdict on a range of consecutive bins (first, last) is supported by these bins."""
     verdict = runs[run].verdict
     if verdict == "undecided":
         return False

@@ -73,10 +73,7 @@ _RULES = {
     "uniform": ("low < high", lambda low, high: low < high),
     "log_uniform": ("0 < low < high", lambda low, high: 0 < low < high),
     "normal": ("standard deviation > 0", lambda _, sigma: sigma > 0),
-    "truncated_normal": (
-        "standard deviation > 0, low < high",
-        lambda _, sigma, low, high: sigma > 0 and low < high,
-    ),
+    "truncated_normal": ("standard deviation > 0, low < high", lambda _, sigma, low, high: sigma > 0 and low < high),
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib
@@ -25,14 +25,15 @@ PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["l
 _MAX_POINTS = 3000
 
 
-def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
-    """Returns the figures for which the study has data, as a dictionary from figure name to data URI."""
+def draw_all(analysis: StudyAnalysis, further: Mapping[str, Callable[[StudyAnalysis], Figure]]) -> dict[str, str]:
+    """Returns the figures for which the study has data, and `further` ones, as {figure name: data URI}."""
     drawings: dict[str, Callable[[], Figure | None]] = {
         "pass_probability": lambda: pass_probability(analysis),
         "histograms": lambda: metric_histograms(analysis, analysis.metric_summaries),
         "sensitivity": lambda: sensitivity(analysis.sensitivities),
         "key_histograms": lambda: key_histograms(analysis),
     } | {f"metric.{metric}": lambda metric=metric: metric_by_key(analysis, metric) for metric in analysis.metrics}
+    drawings |= {name: lambda draw=draw: draw(analysis) for name, draw in further.items()}
     with matplotlib.rc_context(FIGURE_STYLE):
         figures = {name: draw() for name, draw in drawings.items()}
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
@@ -69,10 +70,7 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
 
 
 def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
-    """Shades the ranges of a key that reach the required pass probability (green) or miss it (orange).
-
-    The required pass probability is drawn as a horizontal line.
-    """
+    """Shades the ranges of a key that reach the required pass probability (green) or miss it (orange)."""
     answers = analysis.answers.get(key, [])
     if answers:
         axes.axhline(analysis.required_probability or 0.0, color=LIMIT, linestyle=":", linewidth=1)
@@ -84,17 +82,7 @@ def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
 
 
 def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]) -> Array:
-    """Formats the x axis for a key and returns the x position of each group of surveys.
-
-    The position is the median of the key within the group, or the index of the group if the key is text.
-
-    Args:
-        axes: axes to format.
-        values: values of the key; None if it is text.
-        chosen: (n,) mask of the surveys shown.
-        groups: group index of each chosen survey.
-        names: names of the groups.
-    """
+    """Formats the x axis for a key and returns the x position of each group of surveys."""
     if values is None:
         rotation = 25 if max(len(name) for name in names) > 8 else 0
         axes.set_xticks(range(len(names)), names, rotation=rotation)

@@ -11,8 +11,7 @@ from typing import Any
 from uuid import uuid4
 
 from twin.errors import ScenarioError, TwinError, UnmodelledError
-from twin.studies.design import Sample
-from twin.studies.surveys import Survey
+from twin.studies.surveys import Sample, Survey
 
 Row = dict[str, Any]
 #: Files of a run folder that are kept, by the value of the study's `keep`; "all" keeps every file, "none" no file.
@@ -52,10 +51,7 @@ def fly(survey: Survey) -> Row:
 
 
 def _move_kept_files(scratch: Path, survey: Survey) -> None:
-    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name.
-
-    A folder that already has this name is deleted first. If no file is kept, `scratch` stays; the caller deletes it.
-    """
+    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name."""
     shutil.rmtree(survey.folder, ignore_errors=True)
     if survey.keep == "none":
         return
@@ -77,11 +73,9 @@ def row_of(survey: Survey, status: str, reason: str) -> Row:
     """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason, values of the varied keys.
 
     Args:
-        survey: the survey.
         status: "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
             "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
             computer failed.
-        reason: why the status is not "complete"; else "".
     """
     identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}
     identity["fidelity"] = survey.scenario.imaging.fidelity

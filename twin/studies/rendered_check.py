@@ -14,36 +14,23 @@ from numpy.typing import NDArray
 from twin.judge.require import more_is_better
 from twin.studies import wording
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.design import samples
-from twin.studies.engine import Engine
-from twin.studies.flight import Row, has_passed
-from twin.studies.progress import StudyProgress
-from twin.studies.runner import check_results, fly_surveys, open_folder
+from twin.studies.flight import has_passed
+from twin.studies.runner import Fleet, check_results, open_folder
 from twin.studies.statistics import Array, Interval, wilson_interval
 from twin.studies.study_file import Study
-from twin.studies.surveys import Survey, surveys
+from twin.studies.surveys import Survey, samples, surveys
 
 FOLDER = "rendered"  #: subfolder of the results folder
 
 
 class RenderedCheck(NamedTuple):
-    """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds.
+    """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds."""
 
-    Args:
-        rendered: (n,) whether each rendered survey was completed and met every requirement.
-        surrogate: (n,) whether each of the surrogate surveys was completed and met every requirement.
-        rows: result of each rendered survey.
-        interrupted: whether Ctrl-C ended the check, so that some of the rendered surveys are missing.
-        has_limits: whether the study has a limit, so that there are verdicts to check.
-        n_lost: number of rendered surveys that were refused or failed, and therefore have no verdict.
-    """
-
-    rendered: NDArray[np.bool_]
-    surrogate: NDArray[np.bool_]
-    rows: list[Row]
-    interrupted: bool = False
-    has_limits: bool = True
-    n_lost: int = 0
+    rendered: NDArray[np.bool_]  #: (n,) whether each rendered survey was completed and met every requirement
+    surrogate: NDArray[np.bool_]  #: (n,) whether each of the surrogate surveys was completed and met every requirement
+    interrupted: bool = False  #: whether Ctrl-C ended the check, so that some of the rendered surveys are missing
+    has_limits: bool = True  #: whether the study has a limit, so that there are verdicts to check
+    n_lost: int = 0  #: number of rendered surveys that were refused or failed, and therefore have no verdict
 
     @property
     def exit_status(self) -> int:
@@ -88,20 +75,13 @@ class RenderedCheck(NamedTuple):
         )
 
 
-def check(
-    study: Study, analysis: StudyAnalysis, n: int, folder: Path, engine: Engine, progress: StudyProgress
-) -> RenderedCheck:
+def check(study: Study, analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> RenderedCheck:
     """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
 
     Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
 
     Args:
-        study: the study.
-        analysis: results of the study.
-        n: largest number of surveys to compare.
         folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
 
     Raises:
         TwinError: the subfolder cannot be written, or contains the results of another study; or the engine lost its
@@ -116,15 +96,15 @@ def check(
     with open_folder(folder / FOLDER, True) as log:
         check_results(log, ((key, survey.scenario_hash) for key, survey in chosen.items()))
         done = log.done()
-        progress.begin(progress.done + len(set(keys) - done))
-        completed = fly_surveys(study, (chosen[key] for key in keys if key not in done), log.add, engine, progress)
+        fleet.progress.begin(fleet.progress.done + len(set(keys) - done))
+        completed = fleet.fly(study, (chosen[key] for key in keys if key not in done), log.add)
         log.flush()
     rows = {(row["sample"], row["seed"]): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
-    results, n_lost = [rows[keys[k]] for k in flown], sum(key in rows for key in keys) - len(flown)
-    passed = np.array([has_passed(row) for row in results], bool)
+    passed = np.array([has_passed(rows[keys[k]]) for k in flown], bool)
+    n_lost = sum(key in rows for key in keys) - len(flown)
     surrogate = analysis.passed[nearest[np.array(flown, np.int64)]]
-    return RenderedCheck(passed, surrogate, results, not completed, bool(analysis.limits), n_lost)
+    return RenderedCheck(passed, surrogate, not completed, bool(analysis.limits), n_lost)
 
 
 def summary(checked: RenderedCheck) -> dict[str, Any]:
@@ -145,10 +125,6 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     The distance of a metric from its limit is the number of surveys whose value lies between the two, so that metrics
     of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
     or else closest to it. Surveys without a finite value of every required metric are left out.
-
-    Args:
-        analysis: results of the study.
-        n: largest number of surveys.
     """
     is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
     chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
@@ -162,10 +138,7 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
 
 
 def _excess(values: Array, limit: float) -> Array:
-    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit.
-
-    Of the values that are equal to the value itself, half are counted.
-    """
+    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit."""
     ascending = np.sort(values)
     rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
     return rank - np.searchsorted(ascending, limit, "right")

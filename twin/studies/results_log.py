@@ -117,10 +117,7 @@ def write_parquet(rows: pa.Table, file: Path) -> None:
 
 
 def _sorted_columns(names: Iterable[str]) -> list[str]:
-    """Returns the names of the columns in four sections: identity, varied keys, metrics, timing.
-
-    The identity has a fixed order; the names of each other section are sorted alphabetically.
-    """
+    """Returns the names of the columns in four sections: identity, varied keys, metrics, timing."""
     identity = ("sample", "seed", "status", "reason", "unmodelled", "warning", "fidelity", "scenario_hash")
     sections = {"vary": 1, "timing": 3}
 

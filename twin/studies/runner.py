@@ -10,18 +10,17 @@ from pathlib import Path
 from typing import NamedTuple
 
 from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
+from twin.engines.engine import Engine, Outcome
+from twin.engines.worker import TaskLimits
 from twin.errors import TwinError
-from twin.studies.agreement_report import write_document
+from twin.studies.agreement import write_document
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.design import samples, seeds_of_sample
-from twin.studies.engine import Engine, Outcome
 from twin.studies.flight import Row, fly, refused_row, row_of
 from twin.studies.progress import StudyProgress
 from twin.studies.report import write_report
 from twin.studies.results_log import JOURNAL_FILE, ResultsLog, write_parquet
 from twin.studies.study_file import Study
-from twin.studies.surveys import Survey, refusals, survey_keys, surveys
-from twin.studies.worker import TaskLimits
+from twin.studies.surveys import Survey, refusals, samples, seeds_of_sample, survey_keys, surveys
 
 
 class Throughput(NamedTuple):
@@ -33,95 +32,87 @@ class Throughput(NamedTuple):
 
 
 class StudyResult(NamedTuple):
-    """Outcome of `run_study`.
+    """Outcome of `run_study`."""
 
-    Args:
-        analysis: statistics of the surveys.
-        page: file of the report.
-        write_errors: messages of the errors that occurred while the results were written.
-        interrupted: whether Ctrl-C ended the study.
-        throughput: number of surveys flown by this call, and their run times.
-    """
-
-    analysis: StudyAnalysis
-    page: Path
-    write_errors: list[str]
-    interrupted: bool
-    throughput: Throughput
+    analysis: StudyAnalysis  #: statistics of the surveys
+    page: Path  #: file of the report
+    write_errors: list[str]  #: messages of the errors that occurred while the results were written
+    interrupted: bool  #: whether Ctrl-C ended the study
+    throughput: Throughput  #: number of surveys flown by this call, and their run times
 
 
-def run_study(
-    study: Study,
-    folder: Path,
-    resume: bool,
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row] = fly,
-) -> StudyResult:
+class Fleet(NamedTuple):
+    """Workers that fly surveys in parallel."""
+
+    engine: Engine  #: runs the surveys
+    progress: StudyProgress  #: display of the progress
+    function: Callable[[Survey], Row] = fly  #: flies one survey; must be importable by name on the workers
+
+    def fly(self, study: Study, missing: Iterable[Survey], add_row: Callable[[Row], None]) -> bool:
+        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C.
+
+        Raises:
+            TwinError: the engine lost its connection.
+        """
+        try:
+            for outcome in self.engine.run_many(self.function, missing, TaskLimits(study.timeout_s, study.retries)):
+                row = row_of_outcome(outcome)
+                add_row(row)
+                self.progress.add(row)
+        except KeyboardInterrupt:
+            return False
+        return True
+
+
+def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyResult:
     """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
 
     For a study that compares rendered and surrogate surveys, agreement.md and its figure are written too. Ctrl-C ends
     the study early; the results obtained until then are written.
-
-    Args:
-        study: the study.
-        folder: results folder, new or empty unless `resume` is set.
-        resume: continue the study whose results are in the folder.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey; must be importable by name on the workers.
 
     Raises:
         TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written,
             or belongs to another study; or the engine lost its connection.
         ScenarioError: no sample has a valid scenario; nothing was flown.
     """
-    refused = refusals(study)
+    refused, planned, run_times_s = refusals(study), set(survey_keys(study)), []
     with open_folder(folder, resume) as log:
-        return _run_study(study, folder, refused, log, engine, progress, function)
+        missing = _missing(study, folder, refused, log)
+        if refused:
+            fleet.progress.print_line(refusal_notice(refused))
+        fleet.progress.begin(len(planned - log.done()))
+
+        def add_row(row: Row) -> None:
+            run_times_s.append(row.get("timing.survey_s") or 0.0)
+            log.add(row)
+
+        start = time.perf_counter()
+        interrupted = not fleet.fly(study, missing, add_row)
+        throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
+        analysis, page = StudyAnalysis(log.table(planned), study, len(planned)), folder / "study.html"
+        write_errors = _write_errors(
+            log.flush,
+            lambda: write_parquet(analysis.rows, folder / "results.parquet"),
+            lambda: write_report(study, analysis, page),
+            lambda: write_document(analysis, folder),
+        )
+        return StudyResult(analysis, page, write_errors, interrupted, throughput)
 
 
-def _run_study(
-    study: Study,
-    folder: Path,
-    refused: dict[int, str],
-    log: ResultsLog,
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row],
-) -> StudyResult:
-    """Runs a study as `run_study` does, with the log of its folder and the errors of its invalid samples."""
+def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLog) -> Iterator[Survey]:
+    """Logs the refused surveys and returns the others that have no result.
+
+    Raises:
+        TwinError: the log has the results of another study.
+    """
     check_results(log, _identities(study, folder, refused))
-    done, planned = log.done(), set(survey_keys(study))
-    if done and done.isdisjoint(planned):
+    done = log.done()
+    if done and done.isdisjoint(survey_keys(study)):
         raise _another_study(log)
     for row in _refused_rows(study, refused):
         if (row["sample"], row["seed"]) not in done:
             log.add(row)
-    done = log.done() if refused else done
-    if refused:
-        progress.print_line(refusal_notice(refused))
-    progress.begin(len(planned - done))
-    missing = (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
-    run_times_s: list[float] = []
-
-    def add_row(row: Row) -> None:
-        run_times_s.append(row.get("timing.survey_s") or 0.0)
-        log.add(row)
-
-    start = time.perf_counter()
-    interrupted = not fly_surveys(study, missing, add_row, engine, progress, function)
-    throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
-
-    analysis = StudyAnalysis(log.table(planned), study, len(planned))
-    page = folder / "study.html"
-    write_errors = _write_errors(
-        log.flush,
-        lambda: write_parquet(analysis.rows, folder / "results.parquet"),
-        lambda: write_report(study, analysis, page),
-        lambda: write_document(analysis, folder),
-    )
-    return StudyResult(analysis, page, write_errors, interrupted, throughput)
+    return (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
 
 
 def _identities(study: Study, folder: Path, refused: dict[int, str]) -> Iterator[tuple[tuple[int, int], str]]:
@@ -137,11 +128,7 @@ def _refused_rows(study: Study, refused: dict[int, str]) -> Iterator[Row]:
 
 
 def refusal_notice(refused: dict[int, str]) -> str:
-    """Returns a line with the number of refused samples, and the number and reason of the first one.
-
-    Args:
-        refused: reason of each refused sample, by sample number.
-    """
+    """Returns a line with the number of refused samples, and the number and reason of the first one."""
     number, reason = min(refused.items())
     if len(refused) == 1:
         return f"1 sample cannot be flown and is left out: sample {number}: {reason}"
@@ -153,11 +140,6 @@ def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[Re
     """Locks a new folder or, with `resume`, that of an earlier run, and yields its results log.
 
     Creates the folder if it does not exist, and deletes unfinished run folders.
-
-    Args:
-        folder: results folder.
-        resume: whether the folder may contain results.
-        search: whether the results are those of a search, not of a study.
 
     Raises:
         TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written, or
@@ -189,7 +171,6 @@ def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]
     """Raises TwinError if the log has a row of another scenario.
 
     Args:
-        log: results log.
         planned: ((sample, seed), scenario hash) of each survey of the study.
     """
     hashes = {(row["sample"], row["seed"]): row["scenario_hash"] for row in log.rows()}
@@ -201,37 +182,6 @@ def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]
 def _another_study(log: ResultsLog) -> TwinError:
     problem = f"{log.file.parent} contains the results of another study"
     return TwinError("--resume", problem, "the folder of this study")
-
-
-def fly_surveys(
-    study: Study,
-    missing: Iterable[Survey],
-    add_row: Callable[[Row], None],
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row] = fly,
-) -> bool:
-    """Flies surveys and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C, else True.
-
-    Args:
-        study: study with the timeout and the number of retries.
-        missing: surveys to fly.
-        add_row: called with the row of each survey that has ended.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey; must be importable by name on the workers.
-
-    Raises:
-        TwinError: the engine lost its connection.
-    """
-    try:
-        for outcome in engine.run_many(function, missing, TaskLimits(study.timeout_s, study.retries)):
-            row = row_of_outcome(outcome)
-            add_row(row)
-            progress.add(row)
-    except KeyboardInterrupt:
-        return False
-    return True
 
 
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:

@@ -33,8 +33,6 @@ def wilson_interval(successes: float, n: float, level: float = LEVEL, unknown: i
     and the normal quantile z of (1 + level) / 2. Without trials, the proportion is NaN and the interval is 0 to 1.
 
     Args:
-        successes: number of successes.
-        n: number of trials, or effective number of trials.
         level: confidence level, 0 to 1.
         unknown: number of further trials whose outcome is unknown: they count as failures at the lower bound and as
             successes at the upper bound.
@@ -107,7 +105,6 @@ def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, l
         passed: (n,) whether each survey passed.
         clusters: (n,) cluster label of each survey.
         required: required proportion r, 0 to 1.
-        level: confidence level of the interval.
 
     Returns:
         The number of surveys, at least 1; infinite if p equals r, if r is 1, or if no survey is given.
@@ -129,7 +126,6 @@ def bootstrap_interval(
 
     Args:
         values: (n,) data.
-        statistic: maps an array to its statistic along the last axis, ignoring NaN.
         clusters: (n,) label of the cluster of each value; None if the values are independent.
 
     Returns:
@@ -233,8 +229,7 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
 
     Args:
         values: (n (n_axes + 2),) metric at the n design points of each block A, B, AB_1, AB_2, ..., where AB_k is A
-            with column k of B (`design.design_points`).
-        n_axes: number of sampled axes.
+            with column k of B (`surveys.design_points`).
     """
     blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, 1, -1)
     given: Any = {"f_A": blocks[0], "f_B": blocks[1], "f_AB": blocks[2:]}
@@ -265,14 +260,3 @@ def group_indices(x: ArrayLike) -> NDArray[np.int64]:
         return index.astype(np.int64)
     bins = int(np.clip(len(values) // 6, 2, 10))
     return (stats.rankdata(values, method="ordinal") - 1).astype(np.int64) * bins // max(len(values), 1)
-
-
-def probability_of_superiority(x: ArrayLike, y: ArrayLike) -> float:
-    """Returns the probability that a value of x exceeds a value of y, with ties counting half; NaN if x or y is empty.
-
-    It is U / (n_x n_y) for n_x and n_y values, with the statistic U of Mann & Whitney (1947, Ann. Math. Stat. 18, 50).
-    """
-    a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if len(a) == 0 or len(b) == 0:
-        return float("nan")
-    return float(stats.mannwhitneyu(a, b).statistic) / (len(a) * len(b))

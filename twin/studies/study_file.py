@@ -21,6 +21,7 @@ SamplingMethod = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KeepLevel = Literal["all", "report", "metrics", "none"]
 #: Largest number of surveys of a study; limited because all scenarios are validated before the first survey is flown.
 MAX_SURVEYS = 100_000
+_OBJECTIVES = "tune.objectives"
 FIDELITIES = {"rendered", "surrogate"}  #: values of imaging.fidelity in a study with `compare`
 DEFAULT_METRICS = (
     "trajectory.final.ate_rmse_m", "map.le90_area_m", "map.completeness_area", "map.le90_m", "map.completeness",
@@ -88,10 +89,7 @@ class TuningConfig(Section):
         "recommended, if the search uses the surrogate; 0: the recommended plan is not verified",
     )
     plans: int = Field(
-        default=3,
-        ge=1,
-        le=100,
-        description="largest number of plans verified in a round, and of cheaper plans at the end",
+        default=3, ge=1, le=100, description="most plans verified in a round, and cheaper plans at the end"
     )
     rounds: int = Field(
         default=2,
@@ -115,9 +113,7 @@ class Study(Section):
     scenario: str = Field(description="the scenario to vary: a path relative to this file, or a name in scenes/")
     question: str = Field(default="", max_length=200, description="question to answer; a heading of the report")
     seek: str | None = Field(
-        default=None,
-        description="a varied numeric key: report first at which of its values the pass probability reaches "
-        "require.probability",
+        default=None, description="a varied numeric key: report first where it reaches require.probability"
     )
     keep: KeepLevel = Field(default="metrics", description="files to keep of each run")
     timeout_s: float = Field(
@@ -177,10 +173,6 @@ class Study(Section):
 def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     """Reads and validates a study file and the scenario file that it names.
 
-    Args:
-        path: a file, or a name in scenes/studies/.
-        allow_plugins: whether study and scenario may name a plug-in as module:Class.
-
     Raises:
         ScenarioError: a file does not exist or is not valid; lists the errors of the study file or, if it has none,
             those of the scenario file, each as `FILE:LINE: key: problem (allowed: ...)`.
@@ -198,17 +190,13 @@ def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     errors = [source.describe(error) for error in _errors(study)]
     if errors:
         raise ScenarioError(errors)
-    load_scenario(
-        study.scenario_file, allow_plugins=allow_plugins
-    )  # reports the errors of the scenario itself with its own line numbers
+    # reports the errors of the scenario itself with its own line numbers
+    load_scenario(study.scenario_file, allow_plugins=allow_plugins)
     return study
 
 
 def find_study(path: str | Path) -> Path:
     """Returns the path of a study file.
-
-    Args:
-        path: a file, or a name in scenes/studies/.
 
     Raises:
         ScenarioError: there is neither such a file nor such a name.
@@ -224,12 +212,7 @@ def find_study(path: str | Path) -> Path:
 
 
 def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value.
-
-    Args:
-        tree: nested tables.
-        prefix: text before every key.
-    """
+    """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
             yield from flatten_keys(value, f"{prefix}{key}.")
@@ -239,10 +222,8 @@ def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 def _errors(study: Study) -> Iterable[TwinError]:
     """Yields the errors that pydantic's validation of single fields does not find."""
-    yield from _key_errors(study)
-    yield from _table_errors(study)
-    yield from _sampling_errors(study)
-    yield from _metric_errors(study)
+    for errors in (_key_errors, _table_errors, _sampling_errors, _metric_errors):
+        yield from errors(study)
     try:
         _ = study.scenario_file
     except ScenarioError as error:
@@ -315,29 +296,23 @@ def n_planned_surveys(study: Study) -> int:
 
 
 def _metric_errors(study: Study) -> Iterable[TwinError]:
+    tune, fidelity = study.tune, study.vary.get("imaging.fidelity")
+    objectives = [name for name in tune.objectives if name != "risk"] if tune else []
     known = empty_metrics()
-    for name in study.limits:
-        try:
-            check_metric_names([name], known)
-        except TwinError as error:
-            yield error
-    named = [*(("show", name) for name in study.show), *(("compare", name) for name in study.compare)]
-    if study.tune is not None:
-        named += [("tune.objectives", name) for name in study.tune.objectives if name != "risk"]
-        for key, distribution in study.tune.search.items():
-            if distribution.kind not in ("uniform", "log_uniform", "choice"):
-                allowed = "uniform, log_uniform or choice"
-                yield TwinError(f"tune.search.{key}", f"{distribution.kind} cannot be searched", allowed)
-    for study_key, name in named:
-        try:
-            check_metric_names([name], known)
-        except TwinError as error:
-            yield TwinError(study_key, f"{name}: {error.problem}", error.allowed)
+    for key, names in (("", study.limits), ("show", study.show), ("compare", study.compare), (_OBJECTIVES, objectives)):
+        for name in names:
+            try:
+                check_metric_names([name], known)
+            except TwinError as error:
+                yield TwinError(key, f"{name}: {error.problem}", error.allowed) if key else error
+    for key, distribution in tune.search.items() if tune else ():
+        if distribution.kind not in ("uniform", "log_uniform", "choice"):
+            allowed = "uniform, log_uniform or choice"
+            yield TwinError(f"tune.search.{key}", f"{distribution.kind} cannot be searched", allowed)
     for name in study.compare:
         if name in SIGNED:
             problem = f"{name} can be negative, but the ratio of its medians is compared"
             yield TwinError("compare", problem, "metrics that are never negative, such as map.rmse_m")
-    fidelity = study.vary.get("imaging.fidelity")
     if study.compare and (fidelity is None or fidelity.grid is None or set(fidelity.grid) != FIDELITIES):
         yield TwinError("compare", "needs surveys of both fidelities", "vary.imaging.fidelity with a grid of both")
     if study.seek is not None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from twin.judge.require import more_is_better
 from twin.report.wording import DASH, length, percent, with_unit
-from twin.studies.analysis import KeyComparison, StudyAnalysis, count_similar
+from twin.studies.analysis import StudyAnalysis, count_similar
 from twin.studies.answers import Answer
 from twin.studies.statistics import LEVEL, Interval
 from twin.studies.study_file import Study
@@ -110,11 +110,6 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     """Returns a sentence on the values of a key at which enough surveys pass, too few pass, or more must be flown.
 
     It names only values that were flown.
-
-    Args:
-        key: the varied key.
-        answers: verdict for each range or value of the key.
-        required: required pass probability.
     """
     if not answers:
         return f"{key}: no survey could be evaluated."
@@ -150,10 +145,7 @@ def _count(surveys: int) -> str:
 
 
 def _more(undecided: list[Answer]) -> str:
-    """Returns a phrase with the number of further surveys that would decide all undecided answers.
-
-    The number is rounded up to two significant digits. If it is infinite, the phrase gives the reason instead.
-    """
+    """Returns a phrase with the number of further surveys that would decide all undecided answers."""
     total = sum(answer.more_surveys for answer in undecided)
     if np.isinf(total):
         if any(answer.unknown for answer in undecided):
@@ -167,7 +159,6 @@ def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
     """Returns a phrase with the number of surveys flown, their rate, and their mean run time.
 
     Args:
-        surveys: number of surveys flown.
         wall_s: wall time [s].
         worker_s: sum of the surveys' run times on the workers [s].
     """
@@ -182,10 +173,7 @@ def _labelled(low: str, high: str) -> str:
 
 
 def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence, after a space, on the surveys that have a warning; "" if none has.
-
-    It has their number, without surveys that repeat others, and the text of the most frequent warning.
-    """
+    """Returns a sentence, after a space, on the surveys that have a warning; "" if none has."""
     different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)
     warned = int((different != "").sum())
     return f" Warning in {warned} of {len(different)} surveys: {texts[0].rstrip('.')}." if texts else ""
@@ -209,10 +197,7 @@ def limit_relation(metric: str) -> str:
 
 
 def _requirement(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on whether the pass probability reaches the required one, and whether more surveys are needed.
-
-    Returns "" if the study requires no pass probability.
-    """
+    """Returns a sentence on whether the required pass probability is reached, and whether more surveys are needed."""
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None:
         return ""
@@ -288,15 +273,6 @@ def _failed(analysis: StudyAnalysis) -> str:
         f" {subject} failed because of the computer or the program and {'is' if n == 1 else 'are'} not counted; if "
         f"{none} passed, the pass probability would be {lowest}. Use --resume to fly {again} again."
     )
-
-
-def superiority(comparison: KeyComparison) -> str:
-    """Returns a phrase on whether a key has higher or lower values in surveys that did not pass than in the others."""
-    higher = comparison.superiority >= 0.5
-    probability = comparison.superiority if higher else 1 - comparison.superiority
-    if probability < 0.6:
-        return "no clear difference"
-    return f"{'higher' if higher else 'lower'} in surveys that did not pass, in {percent(probability)} of pairs"
 
 
 def independence_note(analysis: StudyAnalysis) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Literal, NamedTuple
 
@@ -15,20 +14,14 @@ _OVERLAP_PAIRS = 40  # largest number of pairs of images whose overlap is comput
 
 
 class Quantity(NamedTuple):
-    """Condition of a survey on which the error model depends.
+    """Condition of a survey on which the error model depends."""
 
-    Args:
-        label: name in messages.
-        unit: unit in messages, with a leading space; "" for a ratio.
-        factor: largest allowed ratio of a value to the upper end of the fitted range, and of the lower end to a value.
-        limits: ends of the fitted range that restrict the use of the error model. Beyond an end that is not named, the
-            functions of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free
-            images.
-    """
-
-    label: str
-    unit: str
+    label: str  #: name in messages
+    unit: str  #: unit in messages, with a leading space; "" for a ratio
+    #: largest allowed ratio of a value to the upper end of the fitted range, and of the lower end to a value
     factor: float = 1.0
+    #: ends of the fitted range that restrict the use of the error model. Beyond an end that is not named, the functions
+    #: of the error model approach a value that the surveys of the fit determine, e.g. that of noise-free images.
     limits: Literal["both", "lower", "upper"] = "both"
 
 
@@ -49,10 +42,6 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
     """Returns the smallest and the largest value of each quantity in a survey, by name.
 
     An overlap is left out if no pair of planned images has one.
-
-    Args:
-        mission: the survey.
-        matchability: matchability of its floor.
     """
     overlap = planned_overlap(mission, _OVERLAP_PAIRS)._asdict()
     overlaps = {f"overlap_{name}": (value, value) for name, value in overlap.items() if value is not None}
@@ -66,30 +55,10 @@ def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str,
 
 
 class QuantityOutsideFit(NamedTuple):
-    """Quantity whose values in a survey lie outside the range in which the error model may be used.
+    """Quantity whose values in a survey lie outside the range in which the error model may be used, as texts."""
 
-    Args:
-        quantity: the quantity.
-        values: smallest and largest value in the survey.
-        allowed: smallest and largest allowed value; infinite on a side without limit.
-    """
-
-    quantity: Quantity
-    values: Range
-    allowed: Range
-
-    @property
-    def value_text(self) -> str:
-        """Returns the quantity and its range of values in the survey as text."""
-        return f"{self.quantity.label} of {_text(self.values)}{self.quantity.unit}"
-
-    @property
-    def allowed_text(self) -> str:
-        """Returns the allowed range of the quantity as text."""
-        if self.quantity.limits == "both":
-            return f"{_text(self.allowed)}{self.quantity.unit}"
-        side = "at most" if self.quantity.limits == "upper" else "at least"
-        return f"{side} {self.allowed[self.quantity.limits == 'upper']:.3g}{self.quantity.unit}"
+    value_text: str  #: the quantity and its range of values in the survey
+    allowed_text: str  #: the allowed range
 
 
 def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[QuantityOutsideFit]:
@@ -97,19 +66,16 @@ def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str,
 
     The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; an end
     that is not named is unlimited. Quantities without a fitted range are not checked.
-
-    Args:
-        conditions: smallest and largest value of each quantity in the survey, by name.
-        fitted: smallest and largest value of each quantity in the surveys of the fit, by name.
     """
     found = []
     for name in [name for name in fitted if name in conditions]:
-        quantity, (low, high), (smallest, largest) = QUANTITIES[name], conditions[name], fitted[name]
-        lowest = -math.inf if quantity.limits == "upper" else smallest / quantity.factor
-        highest = math.inf if quantity.limits == "lower" else largest * quantity.factor
-        allowed = lowest, highest
-        if not allowed[0] <= low <= high <= allowed[1]:
-            found.append(QuantityOutsideFit(quantity, (low, high), allowed))
+        (label, unit, factor, limits), (low, high) = QUANTITIES[name], conditions[name]
+        lowest, highest = fitted[name][0] / factor, fitted[name][1] * factor
+        allowed = {
+            "both": _text((lowest, highest)), "lower": f"at least {lowest:.3g}", "upper": f"at most {highest:.3g}",
+        }  # fmt: skip
+        if not ((limits == "upper" or lowest <= low) and (limits == "lower" or high <= highest)):
+            found.append(QuantityOutsideFit(f"{label} of {_text((low, high))}{unit}", allowed[limits] + unit))
     return found
 
 

@@ -24,7 +24,8 @@ from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
 from twin.kernels import kernel
-from twin.surrogate.error_model import DepthLaw
+from twin.surrogate.error_model import DepthLaw, ErrorModel
+from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import IDEAL_TABLE, ViewTable, measure_point
 from twin.world.coverage import DEPTH_TOLERANCE
 
@@ -49,101 +50,98 @@ _EVEN = np.ones((1, 1))  # relative bounds of an evenly lit image
 _HIDING_SLOPE = 1.0
 
 
+class DepthErrors(NamedTuple):
+    """Errors of the filtered depth that an error model expects at the depths of a `Matchability`."""
+
+    error_law: DepthLaw  #: decrease of the true and of the reported variance with the number of keyframes
+    sigma_law: DepthLaw  #: decrease of the true and of the reported variance with the number of keyframes
+    error_px: Array  #: (m,) true and reported standard deviation from one keyframe [px of disparity]
+    sigma_px: Array  #: (m,) true and reported standard deviation from one keyframe [px of disparity]
+    cell_scatter: Array  #: (m,) standard deviation over cells of the logarithm of the reported standard deviation
+    completeness: Array  #: (m,) fraction of the smooth cells away from the image border with a depth
+    edge_error: Array  #: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)]
+
+
+def depth_errors(model: ErrorModel, matchability: Matchability) -> DepthErrors:
+    """Returns the expected errors of the filtered depth."""
+    (error, sigma), bounds_px = model.depth_laws(matchability.binning), matchability.bounds_px
+    window_px, lamp_share = matchability.window_bounds_px, matchability.lamp_share
+    return DepthErrors(
+        error,
+        sigma,
+        error.sigma_px(window_px, lamp_share),
+        sigma.sigma_px(window_px, lamp_share),
+        model.depth_texture_scatter(bounds_px, matchability.texture.scatter),
+        np.array([model.map_completeness(b) for b in bounds_px]),
+        np.array([model.edge_error(b) for b in bounds_px]),
+    )
+
+
 class CellErrors(NamedTuple):
-    """Errors of the filtered depth: random numbers and standard deviations.
+    """Errors of the filtered depth: random numbers and standard deviations."""
 
-    Args:
-        lateral_noise: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell.
-        relief_noise: (rows, cols) standard normal samples of the error due to relief within the matching window, shared
-            by all views of a cell; see `window_noise`.
-        edge_noise: (rows, cols) samples of the error near walls, of zero mean and unit variance, shared by all views of
-            a cell; see `heavy_tailed`.
-        cell_noise: (rows, cols) standard normal samples of the logarithm of the standard deviation of depth, shared by
-            all views of a cell and correlated over a window; see `cell_scatter`.
-        dropout: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which
-            is multiplied by factors for the roughness and for the image border.
-        lateral_sigma_px: standard deviation of the lateral error [px].
-        depths_m: (m,) ascending depths at which the next four fields are tabulated, and also `edge_error`,
-            `border_width_px`, `error_noise_share` and `sigma_noise_share` [m].
-        depth_error_px: (m,) true standard deviation of the depth from one keyframe [px of disparity].
-        depth_sigma_px: (m,) reported standard deviation of the depth from one keyframe [px of disparity].
-        cell_scatter: (m,) standard deviation over cells of the logarithm of the reported standard deviation.
-        completeness: (m,) fraction of the smooth cells away from the image border for which the filter provides a
-            depth.
-        error_law: decrease of the true variance with the number of keyframes.
-        sigma_law: decrease of the reported variance with the number of keyframes.
-        relief_error_gain: `ErrorModel.relief_error_gain`.
-        relief_error_limit_px: `ErrorModel.relief_error_limit_px`.
-        edge_error: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)].
-        edge_sigma_gain: `ErrorModel.edge_sigma_gain`.
-        edge_half_px: `ErrorModel.edge_half_px`.
-        border_share: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`.
-        border_width_px: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px].
-        error_scatter_share: `ErrorModel.error_scatter_share`.
-        border_distances_px: (r,) ascending distances from the image border at which the next two fields are
-            tabulated.
-        border_depth: (r,) factor on the true and on the reported standard deviation of depth.
-        border_edge: (r,) factor on the error near walls; see `edge_border_factor`.
-        bound_ratios: (q,) ascending ratios of the Cramér-Rao bound of a cell to that of the whole image, at which the
-            next two fields are tabulated; see `MapModel.bound_ratio`.
-        bound_error: (q,) factor on the true standard deviation of depth.
-        bound_sigma: (q,) factor on the reported standard deviation of depth.
-        error_noise_share: (m,) fraction of the true variance of depth that image noise causes
-            (`DepthLaw.noise_share`).
-        sigma_noise_share: (m,) fraction of the reported variance of depth that image noise causes.
-    """
-
-    lateral_noise: Map
+    lateral_noise: Map  #: (rows, cols) standard normal samples of the lateral error, shared by all views of a cell
+    #: (rows, cols) standard normal samples of the error due to relief within the matching window, shared by all views
+    #: of a cell; see `window_noise`
     relief_noise: Map
+    #: (rows, cols) samples of the error near walls, of zero mean and unit variance, shared by all views of a cell; see
+    #: `heavy_tailed`
     edge_noise: Map
+    #: (rows, cols) standard normal samples of the logarithm of the standard deviation of depth, shared by all views of
+    #: a cell and correlated over a window; see `cell_scatter`
     cell_noise: Map
+    #: (rows, cols) uniform numbers in [0, 1); a cell has no depth if its number exceeds `completeness`, which is
+    #: multiplied by factors for the roughness and for the image border
     dropout: Map
-    lateral_sigma_px: float
+    lateral_sigma_px: float  #: standard deviation of the lateral error [px]
+    #: (m,) ascending depths at which the next four fields are tabulated, and also `edge_error`, `border_width_px`,
+    #: `error_noise_share` and `sigma_noise_share` [m]
     depths_m: Array
-    depth_error_px: Array
-    depth_sigma_px: Array
-    cell_scatter: Array
+    depth_error_px: Array  #: (m,) true standard deviation of the depth from one keyframe [px of disparity]
+    depth_sigma_px: Array  #: (m,) reported standard deviation of the depth from one keyframe [px of disparity]
+    cell_scatter: Array  #: (m,) standard deviation over cells of the logarithm of the reported standard deviation
+    #: (m,) fraction of the smooth cells away from the image border for which the filter provides a depth
     completeness: Array
-    error_law: DepthLaw = ONE_KEYFRAME
-    sigma_law: DepthLaw = ONE_KEYFRAME
-    relief_error_gain: float = 0.0
-    relief_error_limit_px: float = 1.0
+    error_law: DepthLaw = ONE_KEYFRAME  #: decrease of the true variance with the number of keyframes
+    sigma_law: DepthLaw = ONE_KEYFRAME  #: decrease of the reported variance with the number of keyframes
+    relief_error_gain: float = 0.0  #: `ErrorModel.relief_error_gain`
+    relief_error_limit_px: float = 1.0  #: `ErrorModel.relief_error_limit_px`
+    #: (m,) true standard deviation of the height error near walls, per `edge_strength` [px^(1/2)]
     edge_error: Array = np.zeros(2)
-    edge_sigma_gain: float = 0.0
-    edge_half_px: float = np.inf
+    edge_sigma_gain: float = 0.0  #: `ErrorModel.edge_sigma_gain`
+    edge_half_px: float = np.inf  #: `ErrorModel.edge_half_px`
+    #: fraction of cells without a depth at the border of the images; see `error_model.BorderLaw`
     border_share: float = 0.0
+    #: (m,) distance from the border over which this fraction decreases by the factor 1 / e [px]
     border_width_px: Array = np.ones(2)
-    error_scatter_share: float = 1.0
+    error_scatter_share: float = 1.0  #: `ErrorModel.error_scatter_share`
+    #: (r,) ascending distances from the image border at which the next two fields are tabulated
     border_distances_px: Array = np.array([0.0, 1.0])
-    border_depth: Array = np.ones(2)
-    border_edge: Array = np.ones(2)
+    border_depth: Array = np.ones(2)  #: (r,) factor on the true and on the reported standard deviation of depth
+    border_edge: Array = np.ones(2)  #: (r,) factor on the error near walls; see `edge_border_factor`
+    #: (q,) ascending ratios of the Cramér-Rao bound of a cell to that of the whole image, at which the next two fields
+    #: are tabulated; see `MapModel.bound_ratio`
     bound_ratios: Array = np.array([0.0, 1.0])
-    bound_error: Array = np.ones(2)
-    bound_sigma: Array = np.ones(2)
+    bound_error: Array = np.ones(2)  #: (q,) factor on the true standard deviation of depth
+    bound_sigma: Array = np.ones(2)  #: (q,) factor on the reported standard deviation of depth
+    #: (m,) fraction of the true variance of depth that image noise causes (`DepthLaw.noise_share`)
     error_noise_share: Array = np.zeros(2)
-    sigma_noise_share: Array = np.zeros(2)
+    sigma_noise_share: Array = np.zeros(2)  #: (m,) fraction of the reported variance of depth that image noise causes
 
 
 class ObservedCells(NamedTuple):
-    """Cells that both cameras of a keyframe see, in a rectangular window of the grid.
+    """Cells that both cameras of a keyframe see, in a rectangular window of the grid."""
 
-    Args:
-        row, col: grid position of the first (north-west) cell of the window.
-        depth_m: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen.
-        border_px: (rows, cols) distance of this point from the nearest border of the two images [px]; 0 if it is not
-            seen.
-        information: (rows, cols) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left
-            image to that of the whole image; 0 if it is not seen.
-        true, estimated: (4, 4) poses of the keyframe.
-    """
-
-    row: int
-    col: int
-    depth_m: Map
+    row: int  #: grid position of the first (north-west) cell of the window
+    col: int  #: grid position of the first (north-west) cell of the window
+    depth_m: Map  #: (rows, cols) depth of the floor point that is mapped to each cell [m]; -1 if it is not seen
+    #: (rows, cols) distance of this point from the nearest border of the two images [px]; 0 if it is not seen
     border_px: Map
+    #: (rows, cols) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left image to that of
+    #: the whole image; 0 if it is not seen
     information: Map
-    true: Array
-    estimated: Array
+    true: Array  #: (4, 4) poses of the keyframe
+    estimated: Array  #: (4, 4) poses of the keyframe
 
 
 class MapModel:
@@ -254,11 +252,8 @@ class MapModel:
         that observed a cell determine the standard deviation of its height and whether it has one.
 
         Args:
-            observed: cells that the keyframe observes.
             following: cells that the next keyframe observes; None for the last one.
             cov: (6, 6) covariance of the estimated pose, in camera axes.
-            errors: distribution of the depth errors, and their part that is common to all keyframes.
-            rng: random generator of the depth errors that are independent between keyframes.
 
         Returns:
             The patch, or None if the field of view does not overlap the grid.
@@ -286,19 +281,12 @@ class MapModel:
         )
 
     def _poses_of(self, true: Array) -> Array:
-        """Returns three matrices (3, 4, 4) for a pose (4, 4) of the left camera.
-
-        They are camera_from_world and world_from_camera of the left camera, and world_from_camera of the right camera.
-        """
+        """Returns three matrices (3, 4, 4) for a pose (4, 4) of the left camera."""
         right_from_left = geometry.pose(np.eye(3), np.array([self._rig.baseline_m, 0.0, 0.0]))
         return np.stack([geometry.inverse(true), true, true @ right_from_left])
 
     def _window(self, world_from_camera: Array) -> tuple[int, int, int, int]:
-        """Returns (first row, end row, first column, end column) of the cells that may be in view; ends are exclusive.
-
-        They cover the footprint of the image on a plane at the lowest height of the floor, or the whole grid if the
-        image (nearly) shows the horizon.
-        """
+        """Returns (first row, end row, first column, end column) of the cells that may be in view, without the ends."""
         size = (self.grid.rows, self.grid.cols)
         return _window(world_from_camera, self._camera, self._geotransform, self._lowest_m, size)
 
@@ -332,9 +320,7 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
     Their standard deviation exceeds 1 if the array has fewer rows or columns than the window.
 
     Args:
-        shape: number of rows and columns.
         window_cells: side of the window [cells].
-        rng: random generator.
     """
     noise = rng.standard_normal(shape, np.float32)
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
@@ -358,10 +344,7 @@ def _border_of(camera, x, y, disparity):
 
 @kernel
 def _source(camera_from_world, camera, view, estimated_from_true, point, slope):
-    """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error.
-
-    Used only with calibration errors or an approximated port: pose errors alone are much smaller than a cell.
-    """
+    """Returns the true floor point (x, y, z) that is mapped to a cell: the cell's centre minus the mapping error."""
     x, y, z = point
     px, py, _ = _estimated_position(camera_from_world, camera, view, estimated_from_true, x, y, z)
     return 2 * x - px, 2 * y - py, z + slope[0] * (x - px) + slope[1] * (y - py)
@@ -394,13 +377,7 @@ def _estimated_position(camera_from_world, camera, view, estimated_from_true, x,
 
 
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:
-    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; for the others, no rays are cast.
-
-    A cell may be hidden if part of the floor rises above a line that starts at the cell with slope `_HIDING_SLOPE`.
-    Lower floor can hide it only from rays more than 45 deg from the vertical; this is neglected. The floor is
-    searched in square windows whose size doubles, up to the distance at which the range of the heights is too small to
-    reach the line.
-    """
+    """Returns the mask (rows, cols) of the cells that relief may hide from a camera; no rays are cast for others."""
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m))
     hidden, radius, relief_m = np.zeros(height.shape, np.bool_), 1, float(np.ptp(height))
     while radius * cell_m * _HIDING_SLOPE < relief_m:
@@ -416,7 +393,6 @@ def roughness(height_m: Map, window_cells: float) -> Map:
 
     Args:
         height_m: (rows, cols) heights; NaN is replaced by the lowest height.
-        window_cells: side of the window in cells; rounded to an odd number, at least 3.
     """
     side = _odd(window_cells)
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
@@ -441,7 +417,6 @@ def step_slope(height_m: Map, cell_m: float) -> Map:
 
     Args:
         height_m: (rows, cols) heights; NaN is replaced by the lowest height.
-        cell_m: side of a cell.
     """
     height = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
     steps = []
@@ -465,7 +440,6 @@ def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     Args:
         roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
         slope: (rows, cols) slope of the cells [m/m]; see `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
-        window_cells: side of the matching window in cells; rounded to an odd number, at least 3.
     """
     side = _odd(window_cells)
     near_wall = maximum_filter(slope, side) > WALL_SLOPE
@@ -480,7 +454,6 @@ def edge_border_factor(border_px: Array, height_px: int) -> Array:
 
     Args:
         border_px: (n,) distances.
-        height_px: height of the images.
     """
     return 1 + EDGE_BORDER_SHARE * np.exp(-EDGE_BORDER_DECAY * border_px / height_px)
 
@@ -551,10 +524,7 @@ def _observe(out, row, col, cells, camera, view, image_information, poses, estim
 
 @kernel(inline="always")
 def _information_at(table, camera, x, y):
-    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), by interpolation.
-
-    The values hold at the centres of the blocks; beyond the centres of the outermost blocks they are constant.
-    """
+    """Returns the value of a table (rows, cols) over the blocks of the image at a normalised (x, y), interpolated."""
     focal, cx, cy, right, bottom, _ = camera
     rows, cols = table.shape
     row = min(max((focal * y + cy + 0.5) / (bottom + 1) * rows - 0.5, 0.0), rows - 1.0)
@@ -567,20 +537,13 @@ def _information_at(table, camera, x, y):
 
 
 class _Runs(NamedTuple):
-    """Consecutive keyframes that observe each cell, up to the current one.
+    """Consecutive keyframes that observe each cell, up to the current one."""
 
-    Args:
-        views: (rows, cols) number of these keyframes.
-        squared_steps: (rows, cols) sum of the squared distances between neighbours in this series, in squared stereo
-            baselines.
-        border_px: (rows, cols) largest distance from the image border over these keyframes [px].
-        information: (rows, cols) sum of `ObservedCells.information` over these keyframes.
-    """
-
-    views: NDArray[np.int16]
+    views: NDArray[np.int16]  #: (rows, cols) number of these keyframes
+    #: (rows, cols) sum of the squared distances between neighbours in this series, in squared stereo baselines
     squared_steps: Map
-    border_px: Map
-    information: Map
+    border_px: Map  #: (rows, cols) largest distance from the image border over these keyframes [px]
+    information: Map  #: (rows, cols) sum of `ObservedCells.information` over these keyframes
 
 
 @kernel
@@ -588,12 +551,7 @@ def _sample_patch(
     out, variance, systematic, floor, runs, fused, observed, following, step, camera, view,
     camera_from_world, estimated_from_true, position, cov, depth_noise, errors,
 ):  # fmt: skip
-    """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m].
-
-    Writes the heights to `out`, their variances due to depth errors to `variance`, and their variances due to the pose,
-    the lateral error and walls to `systematic`. Updates the arrays of `runs` and `fused`. The mean depth is over the
-    cells that have a height; 0 without any. A height that is not finite raises a FloatingPointError: it is no hole.
-    """
+    """Compiled kernel of `MapModel.sample_patch`; returns the mean depth [m]."""
     (height, slope, roughness, edge, (west, north, cell)), (row, col, depth_m, border_px, information) = floor, observed
     next_row, next_col, next_depth_m = following
     views, step_baselines, best_border_px, border_distance_px, bound_ratio = fused
@@ -678,7 +636,6 @@ def relief_error_px(rough_px, gain, limit_px):
 
     Args:
         rough_px: roughness of the cell [px of disparity].
-        gain, limit_px: `ErrorModel.relief_error_gain` and `ErrorModel.relief_error_limit_px`.
     """
     share = (gain * rough_px / max(limit_px, 1e-9)) ** 2
     return limit_px * share / np.sqrt(1 + share**2)
@@ -695,10 +652,7 @@ def _relative_variance(law, n_views, step_baselines, noise_share):
 
 @kernel(inline="always")
 def _interval(ascending, value):
-    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it.
-
-    A value outside the table is replaced by the nearest end of the table.
-    """
+    """Returns the index of the interval that contains a value, and the value's relative position (0 to 1) in it."""
     k = 0
     while k < len(ascending) - 2 and value > ascending[k + 1]:
         k += 1

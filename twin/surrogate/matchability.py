@@ -4,24 +4,17 @@ The bound is computed from images of a level floor, simulated with the scenario'
 the gradient along a row of the part of the grey image that the texture causes, and s the standard deviation of the
 image noise. The standard deviation of the measured shift between two patches of p x p pixels is at least
 c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound). Veil and unevenness of the light do not move with the floor, so
-their gradients do not count: the image of a floor with the same mean albedo, but without texture, is subtracted.
-
-Lamps light the centre of the images more than their border, so the bound depends on the position in the image. Its
-ratio to the bound of the whole image is computed in blocks of the image, from the gradients of a random texture.
+the image of a floor with the same mean albedo, but without texture, is subtracted.
 
 In turbid water most corners of the full image are noise. The estimators then bin the images (`image_scale`), and the
 bound is that of the binned images, in their pixels.
-
-Matching models the floor under a patch as a plane. Relief above or below that plane causes parallax and thus a matching
-error. The unevenness is the RMS of this parallax over the patches, in pixels per unit of baseline / depth. Patches
-with an edge have a far larger parallax, but they are not matched or have little weight, so their contribution is
-limited.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import cached_property
 from typing import NamedTuple
 
 import cv2
@@ -33,7 +26,8 @@ from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
 from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.image_scale import BINNINGS
-from twin.imaging.camera.photo_sensor import sensor_of
+from twin.imaging.camera.photo_sensor import Sensor, sensor_of
+from twin.imaging.camera.sensor import ExposureSetting
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Radiance
@@ -51,28 +45,97 @@ _CORNERS_BOUND_PX = 0.11
 _DEPTHS = 6  # number of tabulated depths
 _LARGEST_UNEVENNESS = 2.0  # largest unevenness with which a patch is counted, relative to the median of the patches
 _BLOCKS = (6, 8)  # rows and columns of blocks of the image in `PositionDependence`
-_GRAY, _CONTRAST = (
-    90,
-    12,
-)  # mean and standard deviation per octave of the random texture of `position_dependence`, 0 to 255
-_OCTAVES = 5  # number of octaves of this texture
-_PATCHES = 300  # number of patches sampled to estimate the unevenness
-_SAMPLES = 9  # number of height samples along each side of a patch (9 x 9 in total)
+_GRAY, _CONTRAST, _OCTAVES = 90, 12, 5  # random texture: mean, standard deviation per octave (0 to 255), octaves
+_PATCHES, _SAMPLES = 300, 9  # patches sampled for the unevenness; height samples along each side of a patch
 
 
 class PositionDependence(NamedTuple):
-    """Dependence of matching on the position in the image, in blocks that divide the image evenly.
+    """Dependence of matching on the position in the image, in blocks (rows, cols) that divide the image evenly."""
 
-    Args:
-        bounds: (rows, cols) Cramér-Rao bound in a block, divided by that of the whole image.
-        gradients: (rows, cols) RMS gradient of an even texture in a block, divided by that of the whole image.
-    """
-
-    bounds: Array
-    gradients: Array
+    bounds: Array  #: Cramér-Rao bound in a block, divided by that of the whole image
+    gradients: Array  #: RMS gradient of an even texture in a block, divided by that of the whole image
 
 
 NO_DEPENDENCE = PositionDependence(np.ones((1, 1)), np.ones((1, 1)))
+
+
+class Precision(NamedTuple):
+    """Cramér-Rao bound (m,) [px of the binned images] and fraction (m,) of matches that remain in snow, at m depths."""
+
+    bounds_px: Array
+    clear_share: Array
+
+
+class FloorImages:
+    """Simulated images of a level floor under the vehicle, without shadows, which the surrogate does not model.
+
+    Tone curve and white balance scale texture and noise of a pixel alike, so that images are linear, in white light.
+    The tables of the light are computed once, here.
+
+    Args:
+        scenario: description of the survey.
+        illumination: optical properties of the water, and daylight in the water.
+    """
+
+    def __init__(self, scenario: Scenario, illumination: Illumination):
+        imaging = scenario.imaging.model_copy(update={"shadows": False})
+        linear = {"tone_curve": "linear", "white_balance": "white_light"}
+        sensor = scenario.sensor and scenario.sensor.model_copy(update=linear)
+        self._with_snow = scenario.model_copy(update={"imaging": imaging, "sensor": sensor})
+        no_snow = scenario.snow.model_copy(update={"density_per_m3": 0.0})
+        self.scenario = self._with_snow.model_copy(update={"snow": no_snow})
+        self.rig, self.illumination = scenario.believed_rig(), illumination
+        self._formation = self._formation_of(self.scenario)
+
+    @property
+    def snowy(self) -> bool:
+        """Returns whether there is marine snow in the scenario."""
+        return self._with_snow.snow.density_per_m3 > 0
+
+    def pair(self, albedo: Image, depth_m: float) -> tuple[Radiance, Radiance]:
+        """Returns the radiances (H, W, 3) of a floor at a depth: with an albedo image, and with its mean colour."""
+        mean = albedo.mean(axis=(0, 1)).round().astype(np.uint8)
+        return self._radiance(albedo, depth_m), self._radiance(np.broadcast_to(mean, albedo.shape).copy(), depth_m)
+
+    def sensor(self) -> Sensor:
+        """Returns the sensor in its initial state: the first frame that it meters has its own exposure."""
+        return sensor_of(self.scenario, self.rig)
+
+    def snow_views(self, albedo: Image, depth_m: float) -> tuple[list[Radiance], list[Radiance]]:
+        """Returns views (H, W, 3) of a floor without snow, and the same with different particles of marine snow."""
+        formations = self._formation, self._snow_formation
+        depth, camera_pose = self._level_floor(depth_m)
+        clean, snowy = ([one.radiance(albedo, depth, 0, p) for p in snow_poses(camera_pose)] for one in formations)
+        return clean, snowy
+
+    @cached_property
+    def _snow_formation(self) -> ImageFormation:
+        return self._formation_of(self._with_snow)
+
+    def reflected(self, lamps: bool) -> float:
+        """Returns the radiance that a white floor at the planned altitude reflects, with or without lamps [cd/m2].
+
+        It is the mean difference between the images of a white and a black floor, which removes the veil.
+        """
+        unlit = self.scenario.model_copy(update={"lamps": ()})
+        formation = self._formation if lamps else self._formation_of(unlit)
+        depth, camera_pose = self._level_floor(self.scenario.plan.altitude_m)
+        albedos = (np.full((*depth.shape, 3), level, np.uint8) for level in (255, 0))
+        white, black = (formation.radiance(albedo, depth, 0, camera_pose) for albedo in albedos)
+        return float(np.mean(white - black))
+
+    def _formation_of(self, scenario: Scenario) -> ImageFormation:
+        return ImageFormation(scenario, self.illumination, None, np.random.default_rng(0))
+
+    def _radiance(self, albedo: Image, depth_m: float) -> Radiance:
+        depth, camera_pose = self._level_floor(depth_m)
+        return self._formation.radiance(albedo, depth, 0, camera_pose)
+
+    def _level_floor(self, depth_m: float) -> tuple[Depth, StampedPose]:
+        """Returns the depth image of a level floor seen from above, and the camera's pose at the planned altitude."""
+        world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))
+        depth = np.full((self.rig.height_px, self.rig.width_px), depth_m, np.float32)
+        return depth, StampedPose(world_from_left, 0.0)
 
 
 class Matchability:
@@ -110,12 +173,12 @@ class Matchability:
         if scenario.plan.height == "floor":
             highest_m += terrain.highest_m
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
-        self._set_image_scale(scenario, illumination, terrain)
-        self.dependence = position_dependence(scenario, illumination, self.medium_depth_m, self.binning)
-        signal = texture_signal(scenario, illumination, terrain, self.medium_depth_m, self.binning)
-        self.texture = window_texture(signal, self.dependence.gradients)
+        images = FloorImages(scenario, illumination)
+        self._set_image_scale(images, floor_albedos(images, terrain, self.depths_m))
+        self.dependence = position_dependence(images, self.medium_depth_m, self.binning)
+        self.texture = window_texture(self._texture_signal(images, terrain), self.dependence.gradients)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
-        self.lamp_share = lamp_share(scenario, illumination)
+        self.lamp_share = lamp_share(images)
 
     @property
     def medium_bound_px(self) -> float:
@@ -132,24 +195,25 @@ class Matchability:
         """Returns the geometric mean of the smallest and the largest of `depths_m` [m]."""
         return float(np.sqrt(self.depths_m[0] * self.depths_m[-1]))
 
-    def _set_image_scale(self, scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain) -> None:
-        """Sets `binning`, `bounds_px` and `clear_share`.
-
-        As in `image_scale.choose_binning`, the binning is the smallest one at which enough corners are matched, i.e.
-        whose bound at the medium depth is below `_CORNERS_BOUND_PX`, or else the one with the smallest such bound; 1 if
-        these bounds are infinite.
-        """
-        rig, best_px = scenario.believed_rig(), np.inf
+    def _set_image_scale(self, images: FloorImages, albedos: list[Image]) -> None:
+        """Sets `binning`, `bounds_px` and `clear_share`."""
+        best_px = np.inf
         for binning in BINNINGS:
-            if rig.width_px % binning or rig.height_px % binning:
+            if images.rig.width_px % binning or images.rig.height_px % binning:
                 break
-            bounds_px, clear_share = precision(scenario, illumination, terrain, self.depths_m, binning)
-            medium_px = float(np.interp(self.medium_depth_m, self.depths_m, bounds_px))
+            found = precision(images, albedos, self.depths_m, binning)
+            medium_px = float(np.interp(self.medium_depth_m, self.depths_m, found.bounds_px))
             if binning == BINNINGS[0] or medium_px < best_px:
-                best_px = medium_px
-                self.binning, self.bounds_px, self.clear_share = binning, bounds_px, clear_share
+                best_px, self.binning, (self.bounds_px, self.clear_share) = medium_px, binning, found
             if medium_px < _CORNERS_BOUND_PX:
                 break
+
+    def _texture_signal(self, images: FloorImages, terrain: terrains.Terrain) -> NDArray[np.floating]:
+        """Returns the part (rows, cols) of the grey image at the medium depth that the texture causes [grey levels]."""
+        (albedo,) = floor_albedos(images, terrain, np.array([self.medium_depth_m]))
+        radiance, untextured = images.pair(albedo, self.medium_depth_m)
+        gain = images.sensor().meter(radiance).gain
+        return _grey(radiance, gain, self.binning) - _grey(untextured, gain, self.binning)
 
     def bound_at(self, depth_m: float) -> float:
         """Returns the Cramér-Rao bound of a patch's position [px of the binned images] at a depth [m]."""
@@ -164,112 +228,89 @@ class Matchability:
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
-def precision(
-    scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depths_m: Array, binning: int = 1
-) -> tuple[Array, Array]:
-    """Returns the Cramér-Rao bound (n,) [px] and the fraction (n,) of matches that remain in snow, at depths (n,).
+def precision(images: FloorImages, albedos: list[Image], depths_m: Array, binning: int = 1) -> Precision:
+    """Returns the precision of matching a floor with an albedo image for each of its depths (m,).
 
-    Args:
-        scenario: description of the survey.
-        illumination: optical properties of the water, and daylight in the water.
-        terrain: true floor.
-        depths_m: (n,) depths of the floor along the optical axis [m].
-        binning: side of the squares of pixels that are averaged to one pixel [px]; the bound is in binned pixels.
+    `binning` is the side of the squares of pixels that are averaged to one pixel [px].
     """
-    scenario = _with_linear_images(scenario)
-    clear = _without_unmodelled_effects(scenario)
-    rig, rng = scenario.believed_rig(), np.random.default_rng(0)
-    formation = ImageFormation(clear, illumination, None, rng)
-    texture, texel_m = _texture(scenario, terrain, float(max(depths_m)) * rig.width_px / rig.focal_px)
-    albedos = [_albedo(texture, texel_m, rig, z) for z in depths_m]
-    if not scenario.snow.density_per_m3:
-        bounds = [
-            _bound_px(clear, rig, formation, albedo, z, rng, binning)
-            for albedo, z in zip(albedos, depths_m, strict=True)
-        ]
-        return np.array(bounds), np.ones(len(depths_m))
-    with_snow = scenario.model_copy(update={"imaging": clear.imaging})
-    formations = formation, ImageFormation(with_snow, illumination, None, rng)
-    both = [
-        _in_snow(scenario, rig, formations, albedo, z, binning) for albedo, z in zip(albedos, depths_m, strict=True)
-    ]
-    return np.array([bound for bound, _ in both]), np.array([share for _, share in both])
+    rng = np.random.default_rng(0)
+    if images.snowy:
+        found = [_in_snow(images, albedo, z, binning) for albedo, z in zip(albedos, depths_m, strict=True)]
+        return Precision(*np.array(found).T)
+    bounds = [_bound_px(images, albedo, z, rng, binning) for albedo, z in zip(albedos, depths_m, strict=True)]
+    return Precision(np.array(bounds), np.ones(len(depths_m)))
 
 
-def _in_snow(
-    scenario: Scenario,
-    rig: StereoRig,
-    formations: tuple[ImageFormation, ImageFormation],
-    albedo: Image,
-    depth_m: float,
-    binning: int,
-) -> tuple[float, float]:
-    """Returns the Cramér-Rao bound [px] and the fraction of matches that remain in marine snow, at one depth.
+class _MatchedImages(NamedTuple):
+    """Binned grey images (rows, cols) [grey levels]: the part that texture causes; difference of two with noise."""
 
-    Args:
-        scenario: description of the survey.
-        rig: believed calibration.
-        formations: image formation without and with snow.
-        albedo: albedo image of the floor.
-        depth_m: depth of the floor.
-        binning: see `precision`.
-    """
-    depth, camera_pose = _level_floor(scenario, depth_m)
-    clean, snowy = (
-        [formation.radiance(albedo, depth, 0, pose) for pose in snow_poses(camera_pose)] for formation in formations
-    )
-    sensor, rng = sensor_of(scenario, rig), np.random.default_rng(0)
+    signal: NDArray[np.floating]
+    difference: NDArray[np.floating]
+
+
+def _matched_images(
+    sensor: Sensor, textured: Radiance, untextured: Radiance, binning: int, rng: np.random.Generator
+) -> _MatchedImages:
+    setting = sensor.meter(textured)
+    signal = _grey(textured, setting.gain, binning) - _grey(untextured, setting.gain, binning)
+    return _MatchedImages(signal, _noise_difference(sensor, textured, setting, binning, rng))
+
+
+def _noise_difference(
+    sensor: Sensor, light: Radiance, setting: ExposureSetting, binning: int, rng: np.random.Generator
+) -> NDArray[np.floating]:
+    first, second = (matching.gray(sensor.image(light, setting, rng).astype(np.float32), binning) for _ in range(2))
+    return first - second
+
+
+def _bound_px(images: FloorImages, albedo: Image, depth_m: float, rng: np.random.Generator, binning: int) -> float:
+    """Returns the Cramér-Rao bound [px of the binned images] for a level floor at a depth, with an albedo image."""
+    matched = _matched_images(images.sensor(), *images.pair(albedo, depth_m), binning, rng)
+    noise = float(matched.difference.std()) / np.sqrt(2)
+    gradient = float(np.sqrt(np.mean(np.diff(matched.signal, axis=1) ** 2)))
+    return np.sqrt(2) * noise / (images.scenario.estimate.patch_px * max(gradient, 1e-6))
+
+
+def _in_snow(images: FloorImages, albedo: Image, depth_m: float, binning: int) -> tuple[float, float]:
+    """Returns the bound [px of the binned images] and the fraction of matches that remain in snow, at one depth."""
+    clean, snowy = images.snow_views(albedo, depth_m)
+    sensor = images.sensor()
     setting = sensor.meter(snowy[0])
-    first, second = (matching.gray(sensor.image(clean[0], setting, rng).astype(np.float32), binning) for _ in range(2))
-    clean_signals, snowy_signals = (
-        [matching.gray(np.minimum(255 * setting.gain * light, 255).astype(np.float32), binning) for light in lights]
-        for lights in (clean, snowy)
-    )
-    noise = float((first - second).std()) / np.sqrt(2)
-    effect = snow_effect(clean_signals, snowy_signals, noise, scenario.estimate.patch_px)
+    difference = _noise_difference(sensor, clean[0], setting, binning, np.random.default_rng(0))
+    noise = float(difference.std()) / np.sqrt(2)
+    signals = [[_grey(light, setting.gain, binning) for light in lights] for lights in (clean, snowy)]
+    effect = snow_effect(signals[0], signals[1], noise, images.scenario.estimate.patch_px)
     return float(np.sqrt(effect.variance_px2)), effect.matched_share
 
 
-def lamp_share(scenario: Scenario, illumination: Illumination) -> float:
+def _grey(light: Radiance, gain: float, binning: int) -> NDArray[np.floating]:
+    """Returns the binned grey image (rows, cols) of a radiance (H, W, 3) without noise [grey levels]."""
+    return matching.gray(np.minimum(255 * gain * light, 255).astype(np.float32), binning)
+
+
+def lamp_share(images: FloorImages) -> float:
     """Returns the fraction of the light reflected by a level floor at the planned altitude that is due to the lamps."""
+    scenario = images.scenario
     if not scenario.lamps or scenario.sun.illuminance_lx == 0:
         return float(bool(scenario.lamps))
-    without_lamps = scenario.model_copy(update={"lamps": ()})
-    sunlit, both = (_reflected_radiance(s, illumination) for s in (without_lamps, scenario))
-    return 1 - sunlit / max(both, np.finfo(float).tiny)
+    return 1 - images.reflected(lamps=False) / max(images.reflected(lamps=True), np.finfo(float).tiny)
 
 
-def position_dependence(
-    scenario: Scenario, illumination: Illumination, depth_m: float, binning: int = 1
-) -> PositionDependence:
-    """Returns the dependence of matching on the position in the image, for a level floor.
+def position_dependence(images: FloorImages, depth_m: float, binning: int = 1) -> PositionDependence:
+    """Returns the dependence of matching on the position in the image, for a level floor at a depth [m].
 
     Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The floor has a
-    random texture whose statistics are the same everywhere, so the details of the true floor do not count. The squares
-    of gradients and noise are averaged over each block, and their logarithms are smoothed by a polynomial in the
-    position, because a block of binned images has few pixels. The result is `NO_DEPENDENCE` if a block shows no texture
-    or no noise.
-
-    Args:
-        scenario: description of the survey.
-        illumination: optical properties of the water, and daylight in the water.
-        depth_m: depth of the floor along the optical axis.
-        binning: see `precision`.
+    random texture whose statistics are the same everywhere. The squares of gradients and noise are averaged over each
+    block, and their logarithms are smoothed by a polynomial in the position, because a block of binned images has few
+    pixels. The result is `NO_DEPENDENCE` if a block shows no texture or no noise.
     """
-    scenario = _without_unmodelled_effects(_with_linear_images(scenario))
-    rig, rng = scenario.believed_rig(), np.random.default_rng(0)
-    formation, sensor = ImageFormation(scenario, illumination, None, rng), sensor_of(scenario, rig)
+    rng, sensor, shape = np.random.default_rng(0), images.sensor(), (images.rig.height_px, images.rig.width_px)
     gradients, noise = np.zeros(_BLOCKS), np.zeros(_BLOCKS)
     for _ in range(binning):
-        albedo = _random_albedo((rig.height_px, rig.width_px), binning, rng)
-        radiance, untextured = _radiance_of_texture(scenario, formation, albedo, depth_m)
-        setting = sensor.meter(radiance)
-        signal = _texture_signal(radiance, untextured, setting.gain, binning)
-        first, second = (
-            matching.gray(sensor.image(radiance, setting, rng).astype(np.float32), binning) for _ in range(2)
-        )
-        gradients += _block_means(np.diff(signal, axis=1) ** 2)
-        noise += _block_means((first - second) ** 2)
+        lights = images.pair(_random_albedo(shape, binning, rng), depth_m)
+        matched = _matched_images(sensor, *lights, binning, rng)
+        gradients += _block_means(np.diff(matched.signal, axis=1) ** 2)
+        noise += _block_means(matched.difference**2)
     if not gradients.min() > 1e-12 * binning or not noise.min() > 0:
         return NO_DEPENDENCE
     noise, gradients = (_smooth(values) / values.mean() for values in (noise, gradients))
@@ -277,13 +318,7 @@ def position_dependence(
 
 
 def _random_albedo(shape: tuple[int, int], binning: int, rng: np.random.Generator) -> Image:
-    """Returns an albedo image (height_px, width_px, 3) of a grey random texture with equal variance in each octave.
-
-    Args:
-        shape: height and width [px].
-        binning: side of the smallest structures [px].
-        rng: random generator.
-    """
+    """Returns an albedo image (H, W, 3) of a grey random texture: equal variance in octaves from `binning` px up."""
     albedo = np.full(shape, _GRAY, np.float32)
     for octave in range(_OCTAVES):
         side_px = binning * 2**octave
@@ -305,72 +340,6 @@ def _smooth(values: Array) -> Array:
     return np.exp(fitted).reshape(values.shape)
 
 
-def texture_signal(
-    scenario: Scenario, illumination: Illumination, terrain: terrains.Terrain, depth_m: float, binning: int = 1
-) -> NDArray[np.floating]:
-    """Returns the part (rows, cols) of the grey image of a level floor that its texture causes [grey levels].
-
-    Noise, shadows and marine snow are absent.
-
-    Args:
-        scenario: description of the survey.
-        illumination: optical properties of the water, and daylight in the water.
-        terrain: true floor.
-        depth_m: depth of the floor along the optical axis.
-        binning: see `precision`.
-    """
-    clear = _without_unmodelled_effects(_with_linear_images(scenario))
-    rig = clear.believed_rig()
-    formation = ImageFormation(clear, illumination, None, np.random.default_rng(0))
-    texture, texel_m = _texture(clear, terrain, depth_m * rig.width_px / rig.focal_px)
-    albedo = _albedo(texture, texel_m, rig, depth_m)
-    radiance, untextured = _radiance_of_texture(clear, formation, albedo, depth_m)
-    gain = sensor_of(clear, rig).meter(radiance).gain
-    return _texture_signal(radiance, untextured, gain, binning)
-
-
-def _reflected_radiance(scenario: Scenario, illumination: Illumination) -> float:
-    """Returns the radiance due to light reflected by a white floor at the planned altitude [cd/m2].
-
-    It is the difference between the images of a white and a black floor, which removes the veil, averaged over pixels
-    and colour channels.
-    """
-    scenario = _without_unmodelled_effects(scenario)
-    formation = ImageFormation(scenario, illumination, None, np.random.default_rng(0))
-    depth, camera_pose = _level_floor(scenario, scenario.plan.altitude_m)
-    albedos = (np.full((*depth.shape, 3), level, np.uint8) for level in (255, 0))
-    white, black = (formation.radiance(albedo, depth, 0, camera_pose) for albedo in albedos)
-    return float(np.mean(white - black))
-
-
-def _level_floor(scenario: Scenario, depth_m: float) -> tuple[Depth, StampedPose]:
-    """Returns a depth image (height_px, width_px) of constant depth [m], and a camera pose at the planned altitude.
-
-    The depth image is that of a level floor seen vertically from above.
-    """
-    rig, altitude_m = scenario.believed_rig(), scenario.plan.altitude_m
-    world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, altitude_m]))
-    return np.full((rig.height_px, rig.width_px), depth_m, np.float32), StampedPose(world_from_left, 0.0)
-
-
-def _with_linear_images(scenario: Scenario) -> Scenario:
-    """Returns the scenario with a linear tone curve and the white balance of white light.
-
-    Tone curve and white balance scale texture and noise of a pixel alike, so they do not change the bound.
-    """
-    if scenario.sensor is None:
-        return scenario
-    linear = {"tone_curve": "linear", "white_balance": "white_light"}
-    return scenario.model_copy(update={"sensor": scenario.sensor.model_copy(update=linear)})
-
-
-def _without_unmodelled_effects(scenario: Scenario) -> Scenario:
-    """Returns the scenario without shadows, which the surrogate does not model, and without marine snow."""
-    imaging = scenario.imaging.model_copy(update={"shadows": False})
-    snow = scenario.snow.model_copy(update={"density_per_m3": 0.0})
-    return scenario.model_copy(update={"imaging": imaging, "snow": snow})
-
-
 def unevenness_px(
     scenario: Scenario,
     terrain: terrains.Terrain,
@@ -386,8 +355,6 @@ def unevenness_px(
     limit the influence of matches with large residuals.
 
     Args:
-        scenario: description of the survey.
-        terrain: true floor.
         depths_m: (n,) depths of the floor along the optical axis [m].
         locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
             centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
@@ -411,64 +378,15 @@ def unevenness_px(
     return np.array(unevenness)
 
 
-def _bound_px(
-    scenario: Scenario,
-    rig: StereoRig,
-    formation: ImageFormation,
-    albedo: Image,
-    depth_m: float,
-    rng: np.random.Generator,
-    binning: int,
-) -> float:
-    """Returns the Cramér-Rao bound [px of the binned images] for a level floor at a depth, with an albedo image."""
-    radiance, untextured = _radiance_of_texture(scenario, formation, albedo, depth_m)
-    sensor = sensor_of(scenario, rig)
-    setting = sensor.meter(radiance)
-    signal = _texture_signal(radiance, untextured, setting.gain, binning)
-    first, second = (matching.gray(sensor.image(radiance, setting, rng).astype(np.float32), binning) for _ in range(2))
-    noise = float((first - second).std()) / np.sqrt(2)
-    gradient = float(np.sqrt(np.mean(np.diff(signal, axis=1) ** 2)))
-    return np.sqrt(2) * noise / (scenario.estimate.patch_px * max(gradient, 1e-6))
-
-
-def _radiance_of_texture(
-    scenario: Scenario, formation: ImageFormation, albedo: Image, depth_m: float
-) -> tuple[Radiance, Radiance]:
-    """Returns the radiances (H, W, 3) of a level floor at a depth: with an albedo image, and with its mean colour."""
-    depth, camera_pose = _level_floor(scenario, depth_m)
-    textured, untextured = (formation.radiance(image, depth, 0, camera_pose) for image in (albedo, _untextured(albedo)))
-    return textured, untextured
-
-
-def _texture_signal(textured: Radiance, untextured: Radiance, gain: float, binning: int) -> NDArray[np.floating]:
-    """Returns the difference (rows, cols) that the texture makes in the binned grey image [grey levels].
-
-    Args:
-        textured: radiance (H, W, 3) of the floor.
-        untextured: radiance (H, W, 3) of a floor of its mean colour.
-        gain: pixel value per unit of radiance; a saturated pixel has the value 1.
-        binning: see `precision`.
-    """
-    lit, smooth = (
-        matching.gray(np.minimum(255 * gain * light, 255).astype(np.float32), binning)
-        for light in (textured, untextured)
-    )
-    return lit - smooth
-
-
-def _untextured(albedo: Image) -> Image:
-    """Returns an albedo image of constant colour, the mean of the given image (height_px, width_px, 3)."""
-    return np.broadcast_to(albedo.mean(axis=(0, 1)).round().astype(np.uint8), albedo.shape).copy()
+def floor_albedos(images: FloorImages, terrain: terrains.Terrain, depths_m: Array) -> list[Image]:
+    """Returns the albedo image (H, W, 3) of the texture of a true floor for each of its depths (m,) [m]."""
+    rig = images.rig
+    texture, texel_m = _texture(images.scenario, terrain, float(max(depths_m)) * rig.width_px / rig.focal_px)
+    return [_albedo(texture, texel_m, rig, z) for z in depths_m]
 
 
 def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns the texture of the floor's photos or mesh, or else a generated one, and its texel size [m].
-
-    Args:
-        scenario: description of the survey.
-        terrain: true floor.
-        extent_m: side length of the generated texture, limited by the size of the terrain.
-    """
+    """Returns the texture of the floor's photos or mesh, or else a generated one, and its texel size [m]."""
     t = scenario.terrain
     if t.texture_file is not None or t.orthophoto_file is not None or t.kind == "mesh":
         return terrain.texture, terrain.texture_px_m
@@ -481,10 +399,7 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
 
 
 def _painted_centre(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
-    """Returns the generated texture of the central part of a floor from a file, and its texel size [m].
-
-    The part has at least 5 x 5 nodes, where the floor has as many.
-    """
+    """Returns the generated texture of the central part of a floor from a file, and its texel size [m]."""
     n_cells = max(4, math.ceil(extent_m / terrain.spacing_m))
     first = [max(0, (n - 1 - n_cells) // 2) for n in terrain.height_m.shape]
     height_m = terrain.height_m[first[0] :, first[1] :][: n_cells + 1, : n_cells + 1]

@@ -3,8 +3,9 @@
 A true point is imaged by the true cameras (lens, port, calibration errors) and the image is rectified with the believed
 calibration (`imaging.true_cameras`). The estimators then remove the pitch, the roll and the row offset of the right
 image that they estimate from row differences (`estimate.vision.epipolar_calibration`). The result is a deterministic
-map from the true (x, y, disparity) of a point to the measured one. It is tabulated once per survey, on a regular grid
-over the image and disparity, and interpolated linearly.
+map from the true (x, y, disparity) of a point to the measured one, tabulated once per survey on a regular grid over the
+image and disparity. The row differences that remain increase the scatter of the measured ones beyond that of the noise,
+and the estimators increase their covariances accordingly (`stereo.row_noise_ratio`).
 
 All positions are normalised: (x, y) = (X, Y) / Z, and disparity = believed baseline / Z for a true point (X, Y, Z).
 """
@@ -14,11 +15,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import StereoRig
-from twin.estimate.vision.epipolar_calibration import CORRECTED, NOTICEABLE_PX, row_jacobian
+from twin.core.quality import EpipolarError
+from twin.core.records import StereoObservation, StereoRig
+from twin.estimate.vision import stereo
+from twin.estimate.vision.epipolar_calibration import CORRECTED, NOTICEABLE_PX, EpipolarCalibration, row_jacobian
+from twin.estimate.vision.stereo import StereoPoints
 from twin.imaging.camera.true_cameras import TrueCameras
 from twin.kernels import kernel
 
@@ -30,37 +35,26 @@ _INVERSE_ITERATIONS = 8
 
 
 class ViewTable(NamedTuple):
-    """Measured (x, y, disparity) on a regular grid of true (disparity, y, x).
+    """Measured (x, y, disparity) on a regular grid of true (disparity, y, x)."""
 
-    Args:
-        values: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are
-            measured at their true positions.
-        first: (3,) true disparity, y and x of the first grid point.
-        step: (3,) spacing of the grid.
-    """
-
+    #: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are measured
+    #: at their true positions.
     values: Array
-    first: Array
-    step: Array
+    first: Array  #: (3,) true disparity, y and x of the first grid point
+    step: Array  #: (3,) spacing of the grid
 
 
 IDEAL_TABLE = ViewTable(np.zeros((0, 0, 0, 3)), np.zeros(3), np.ones(3))
 
 
 class MeasuredView(NamedTuple):
-    """Measured positions and row differences of true points after the estimators have removed rectification errors.
+    """Measured positions and row differences of true points after the estimators have removed rectification errors."""
 
-    Args:
-        table: measured positions on a grid of true positions; without values if all points are measured at their true
-            positions.
-        row_table: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of
-            `table`.
-        removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove.
-    """
-
+    #: measured positions on a grid of true positions; without values if all points are measured at their true positions
     table: ViewTable
+    #: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of `table`
     row_table: Array
-    removed: Array
+    removed: Array  #: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove
 
     @property
     def is_ideal(self) -> bool:
@@ -115,8 +109,6 @@ def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> Meas
     """Returns the measured view of a stereo rig.
 
     Args:
-        cameras: geometry of the true cameras.
-        rig: believed calibration.
         depths_m: (m,) ascending depths of the floor [m].
     """
     if cameras.sampling is None and cameras.rendered_rig.baseline_m == rig.baseline_m:
@@ -155,11 +147,7 @@ def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, A
 
 
 def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
-    """Returns the rectification errors (4,) that the estimators remove from the right image: `MeasuredView.removed`.
-
-    They are fitted to the row differences of the points at the middle disparity that lie inside both images. They are
-    zero if there are too few points, or if they change no row by more than `NOTICEABLE_PX`.
-    """
+    """Returns the rectification errors (4,) that the estimators remove from the right image: `MeasuredView.removed`."""
     middle = _SHAPE[0] // 2
     left, right = left[middle].reshape(-1, 2), right[middle].reshape(-1, 2)
     half = np.array([rig.width_px, rig.height_px]) / 2 / rig.focal_px
@@ -231,10 +219,7 @@ def measure_point(table, x, y, disparity):
 
 @kernel(inline="always")
 def _interval(position, n):
-    """Returns the index of the grid interval that contains a position, and the relative position in it.
-
-    The grid has n points. The relative position is 0 to 1 inside the grid, and below 0 or above 1 outside.
-    """
+    """Returns the index of the grid interval that contains a position, and the relative position in it."""
     k = min(max(int(np.floor(position)), 0), n - 2)
     return k, position - k
 
@@ -246,3 +231,79 @@ def measure_all(table, points):
     for k in range(len(points)):
         measured[k, 0], measured[k, 1], measured[k, 2] = measure_point(table, points[k, 0], points[k, 1], points[k, 2])
     return measured
+
+
+_MAD_TO_SIGMA = 1.4826
+_SIGNIFICANT = 2 * 1.17  # two standard errors of the noise ratio, times the root of the number of points
+
+
+class MeasuredRows:
+    """Row differences measured so far.
+
+    Args:
+        view: positions at which true points are measured.
+        rig: believed calibration.
+        patch_px: side of the matched patches.
+        rng: random generator of the noise of row differences.
+    """
+
+    def __init__(self, view: MeasuredView, rig: StereoRig, patch_px: int, rng: np.random.Generator):
+        self._view, self._rig, self._patch_px, self._rng = view, rig, patch_px, rng
+        self._calibration = EpipolarCalibration()
+        self._calibration.removed = view.removed
+
+    def are_matched(self, points: Array) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the true points whose measured positions satisfy the epipolar constraint.
+
+        Args:
+            points: (n, 3) true normalised (x, y, disparity).
+        """
+        left, right = self._positions_px(points)
+        return stereo.satisfies_epipolar(left, right)
+
+    def observe(
+        self, observation: StereoObservation, points: Array, sigma_px: float
+    ) -> tuple[StereoObservation, float]:
+        """Adds the row differences of a stereo pair.
+
+        Args:
+            points: (n, 3) true normalised (x, y, disparity) of points that are matched; they represent
+                `observation.n_points` points.
+            sigma_px: standard deviation of a match in one image [px].
+
+        Returns:
+            The observation with the statistics of the row differences, and their noise ratio. The noise ratio is
+            defined as in `stereo.row_noise_ratio`, but for any number of points.
+        """
+        rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
+        of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)
+        self._add(points, rows_px + of_raster * self._rng.standard_normal(len(points)), of_raster)
+        scatter_px = _MAD_TO_SIGMA * np.median(np.abs(rows_px - np.median(rows_px)))
+        spread_px = float(np.hypot(row_sigma_px, scatter_px))
+        ratio = spread_px / row_sigma_px
+        described = observation._replace(
+            row_offset_px=float(np.median(rows_px)), row_spread_px=spread_px, row_sigma_px=float(row_sigma_px)
+        )
+        return described, ratio if ratio > 1 + _SIGNIFICANT / np.sqrt(observation.n_points) else 1.0
+
+    def report(self) -> EpipolarError:
+        """Returns the errors of the rectification, estimated from all row differences so far."""
+        return self._calibration.report()
+
+    def _add(self, points: Array, rows_px: Array, sigma_px: float) -> None:
+        """Updates the estimate of the rectification errors with the row differences (n,) [px] of true points (n, 3)."""
+        n, (left, _) = len(points), self._positions_px(points)
+        cov = np.tile(np.eye(3) * (sigma_px / 2 / self._rig.focal_px) ** 2, (n, 1, 1))
+        measured, zeros = self._view.measure(points), np.zeros((n, 2))
+        pair = StereoPoints(
+            left.astype(np.float32), zeros, zeros[:, 0], measured, cov, np.zeros((n, 3)), rows_px
+        )  # fmt: skip
+        self._calibration.add(pair, self._rig, self._patch_px)
+
+    def _positions_px(self, points: Array) -> tuple[Array, Array]:
+        """Returns the measured positions (n, 2) of points in the left and the right image [px]."""
+        measured, rows = self._view.measure(points), self._view.row_difference(points)
+        centre = [self._rig.cx_px, self._rig.cy_px]
+        left = np.column_stack([measured[:, 0], measured[:, 1] - rows / 2])
+        right = np.column_stack([measured[:, 0] - measured[:, 2], measured[:, 1] + rows / 2])
+        return left * self._rig.focal_px + centre, right * self._rig.focal_px + centre

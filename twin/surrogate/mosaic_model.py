@@ -37,19 +37,12 @@ def floor_cells(pose, points, baseline):
 
 
 class MosaicView(NamedTuple):
-    """Keyframes that make up the part of the mosaic in a camera's field of view.
+    """Keyframes that make up the part of the mosaic in a camera's field of view."""
 
-    Args:
-        numbers: (n,) numbers of the keyframes, ascending.
-        estimated: (n, 4, 4) estimated poses at which the keyframes were added to the mosaic.
-        fractions: (n,) fraction of the mosaic in view that comes from each keyframe; sums to 1.
-        coverage: fraction of the field of view that the mosaic covers.
-    """
-
-    numbers: list[int]
-    estimated: Array
-    fractions: Array
-    coverage: float
+    numbers: list[int]  #: (n,) numbers of the keyframes, ascending
+    estimated: Array  #: (n, 4, 4) estimated poses at which the keyframes were added to the mosaic
+    fractions: Array  #: (n,) fraction of the mosaic in view that comes from each keyframe; sums to 1
+    coverage: float  #: fraction of the field of view that the mosaic covers
 
 
 class MosaicModel:

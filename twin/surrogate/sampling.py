@@ -20,8 +20,6 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
     """Samples the frame-to-frame motion previous_from_current (4, 4) between two true poses (4, 4).
 
     Args:
-        errors: distribution of the errors, a `vision.FrameErrors`.
-        previous_pose, pose: true poses of the left camera at the two frames.
         normals, previous_normals: (6,) standard normal random numbers for this motion and for the motion before it.
     """
     error = np.zeros(6)
@@ -56,12 +54,7 @@ def sample_link(
             [m]; table of the measured positions of true points (`measured_view.ViewTable`).
         cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
         error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
-        bias_fraction: `match_bias_fraction` of the `ErrorModel`.
-        relief_sigma: standard deviation of the error due to relief, per unit of distance / depth.
-        common_bias: true standard deviation of the common bias.
         distance_growth: growth of the true and of the reported variance in the earlier pair with distance / depth.
-        common_sigma: reported standard deviation of the common bias.
-        inflation: factor on the part of the reported covariance that is due to the points.
         noise_share: number of points divided by the number of matches that they represent: the variance of the mean of
             independent matches that a point represents, divided by that of a single match.
 
@@ -151,7 +144,6 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
     Args:
         points: (n, 3) normalised (x, y, disparity).
         baseline: stereo baseline [m].
-        n_effective: number of flow vectors.
     """
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])

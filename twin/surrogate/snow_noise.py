@@ -27,15 +27,10 @@ _VIEWS = 3  # number of views with different particles
 
 
 class SnowEffect(NamedTuple):
-    """Effect of marine snow on the matching of patches between two images.
+    """Effect of marine snow on the matching of patches between two images."""
 
-    Args:
-        variance_px2: variance of the weighted mean of n matches, times n [px^2]; includes the image noise.
-        matched_share: fraction of the patches that are matched in spite of the snow.
-    """
-
-    variance_px2: float
-    matched_share: float
+    variance_px2: float  #: variance of the weighted mean of n matches, times n [px^2]; includes the image noise
+    matched_share: float  #: fraction of the patches that are matched in spite of the snow
 
 
 def snow_poses(pose: StampedPose) -> list[StampedPose]:
@@ -55,9 +50,7 @@ def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patc
 
     Args:
         clean: noise-free images of the same floor without snow, one for each view [grey levels].
-        snowy: the same images with snow.
         noise: standard deviation of the image noise [grey levels].
-        patch_px: side of the matched patches.
     """
     weights, errors, n_patches = [], [], 0
     for k in range(len(clean)):
@@ -81,12 +74,6 @@ def _patches(
     """Returns how patches at every second pixel are matched.
 
     Three arrays (n,): variance of the matched position [px^2], its error due to snow [px], whether it is matched.
-
-    Args:
-        clean: noise-free image without snow.
-        snow: change of the grey levels by snow in each of the two images.
-        noise: standard deviation of the image noise.
-        patch_px: side of the patches.
     """
     n = patch_px**2
     gradient = np.gradient(clean, axis=1)

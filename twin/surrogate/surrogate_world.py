@@ -13,7 +13,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.floor_rays import HeightField, cast_pixels, height_field
 from twin.core.geometry import Array
+from twin.core.records import StereoRig
 from twin.core.timing import StageTimer
 from twin.errors import TwinError, UnmodelledError
 from twin.estimate.pipeline import Navigator
@@ -25,7 +27,6 @@ from twin.surrogate.compiled_loop import compiled_loop
 from twin.surrogate.coverage import QuantityOutsideFit, survey_conditions
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
-from twin.surrogate.floor_rays import FloorRayCaster
 from twin.surrogate.map_model import MapModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import measured_view
@@ -87,7 +88,9 @@ class SurrogateWorld(World):
 
     def capture(self, step: Step) -> CameraImages:
         pose, rig = self.world_from_camera, self.mission.rig
-        return CameraImages(_BLANK, _BLANK if step.keyframe else None, lambda: self.vision.scene.floor.depth(pose, rig))
+        return CameraImages(
+            _BLANK, _BLANK if step.keyframe else None, lambda: _depth_image(self.vision.scene.floor, pose, rig)
+        )
 
     def fast_forward(self, navigator: Navigator, pilot: PilotOfEstimates) -> FastForward:
         if (
@@ -102,12 +105,15 @@ class SurrogateWorld(World):
         return self.vision.scene.map_model.seen
 
 
-def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Matchability) -> tuple[str, ...]:
-    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`.
+def _depth_image(floor: HeightField, world_from_camera: Array, rig: StereoRig) -> NDArray[np.float32]:
+    """Returns the depth image (height_px, width_px) along the optical axis [m]; inf where rays miss the floor."""
+    rows, cols = np.indices((rig.height_px, rig.width_px), dtype=np.float64)
+    depth = cast_pixels(floor, world_from_camera[None], rig, np.column_stack([cols.ravel(), rows.ravel()]))
+    return depth.reshape(rows.shape).astype(np.float32)
 
-    Raises:
-        UnmodelledError: the survey lies outside this range, and `imaging.extrapolate` is not set.
-    """
+
+def _extrapolations(mission: Mission, fitted: FittedErrorModel, matchability: Matchability) -> tuple[str, ...]:
+    """Returns a warning if the survey lies outside the range of the fit; see `SurrogateWorld`."""
     found = fitted.quantities_outside_fit(survey_conditions(mission, matchability))
     if not found:
         return ()
@@ -146,10 +152,7 @@ def surrogate_vision(
     """Returns the `SurrogateVision` of a mission.
 
     Args:
-        mission: the survey to fly.
-        model: error model of the measurements.
         true_pose: function that returns the current true world_from_camera (4, 4) of the left camera.
-        stopwatch: timer of the stages.
 
     Raises:
         UnmodelledError: marine snow prevents all matches at `Matchability.medium_depth_m`.
@@ -158,10 +161,11 @@ def surrogate_vision(
     matchability = Matchability(scenario, mission.illumination, terrain, mission.plan.area.at_fractions)
     _check_matches(mission, matchability)
     view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
-    floor, heights = FloorRayCaster(terrain), true_heights(mission.grid, terrain.height_at)
+    floor = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+    heights = true_heights(mission.grid, terrain.height_at)
     depth_m = float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1]))
     rig = mission.rig.binned(matchability.binning)
-    map_model = MapModel(mission.grid, heights, rig, floor.field, depth_m, view.table, matchability.dependence.bounds)
+    map_model = MapModel(mission.grid, heights, rig, floor, depth_m, view.table, matchability.dependence.bounds)
     scene = TrueScene(true_pose, floor, matchability, map_model, view)
     rng = streams(scenario.seed)["surrogate"]
     return SurrogateVision(rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

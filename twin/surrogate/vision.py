@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.braking import braking_factor
+from twin.core.floor_rays import HeightField, cast_pixels
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
@@ -34,11 +35,16 @@ from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
-from twin.surrogate.floor_rays import FloorRayCaster
-from twin.surrogate.map_model import CellErrors, MapModel, edge_border_factor, heavy_tailed, window_noise
+from twin.surrogate.map_model import (
+    CellErrors,
+    MapModel,
+    depth_errors,
+    edge_border_factor,
+    heavy_tailed,
+    window_noise,
+)
 from twin.surrogate.matchability import Matchability
-from twin.surrogate.measured_rows import MeasuredRows
-from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
+from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
 _BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0])  # tabulated distances, in widths of `border_error`
@@ -52,75 +58,58 @@ _BLOCK = 4096  # random numbers generated at a time
 _RESIDUAL_GROWTH = 2.0
 
 
-class _KeyframeTruth(NamedTuple):
-    """True geometry and sampled noise of a keyframe.
+class KeyframeTruth(NamedTuple):
+    """True geometry and sampled noise of a keyframe."""
 
-    Args:
-        pose: (4, 4) true pose.
-        points: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images.
-        raster_indices: (n,) index of each point in the raster.
-        noise: (rows, cols, 3) standard normal samples of the stereo errors of the raster points.
-        bound_px: Cramér-Rao bound of a patch's position [px].
-        unevenness_px: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`.
-        stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
-        n_points: number of matched points that the raster points represent.
-        unit_cov: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation.
-        unit_root: (6, 6) lower Cholesky factor of `unit_cov`.
-        cells: (n,) floor cells of the points.
-        measured: (n, 3) positions at which the points are measured without noise; see `measured_view`.
-        clear_share: fraction of the matches that remain in the presence of marine snow.
-        noise_ratio: ratio of the scatter of the row differences to that expected from noise (`measured_rows`).
-    """
-
-    pose: Array
-    points: Array
-    raster_indices: NDArray[np.int64]
-    noise: Array
-    bound_px: float
-    unevenness_px: float
-    stereo_parallax_px: float
-    n_points: float
+    pose: Array  #: (4, 4) true pose
+    points: Array  #: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images
+    raster_indices: NDArray[np.int64]  #: (n,) index of each point in the raster
+    noise: Array  #: (rows, cols, 3) standard normal samples of the stereo errors of the raster points
+    bound_px: float  #: Cramér-Rao bound of a patch's position [px]
+    unevenness_px: float  #: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`
+    n_points: float  #: number of matched points that the raster points represent
+    baseline_m: float  #: stereo baseline [m]
+    #: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation
     unit_cov: Array
-    unit_root: Array
-    cells: Cells
-    measured: Array
-    clear_share: float
-    noise_ratio: float
+    unit_root: Array  #: (6, 6) lower Cholesky factor of `unit_cov`
+    cells: Cells  #: (n,) floor cells of the points
+    clear_share: float  #: fraction of the matches that remain in the presence of marine snow
+    noise_ratio: float  #: ratio of the scatter of the row differences to that expected from noise (`MeasuredRows`)
+
+    @property
+    def stereo_parallax_px(self) -> float:
+        """Returns the RMS parallax of the relief in a patch between the two cameras [px]."""
+        return self.unevenness_px * float(np.mean(self.points[:, 2]))
+
+    def parallax_px(self, earlier_pose: Array) -> float:
+        """Returns the RMS parallax of the relief in a patch between the keyframe and an earlier pose (4, 4) [px]."""
+        distance_m = float(np.linalg.norm(self.pose[:3, 3] - earlier_pose[:3, 3]))
+        return self.unevenness_px * distance_m * float(np.mean(self.points[:, 2])) / self.baseline_m
+
+    def distance_in_depths(self, a_from_b: Array) -> float:
+        """Returns the length of a motion's translation multiplied by the mean inverse depth of the points."""
+        return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self.points[:, 2]) / self.baseline_m)
 
 
 class FrameErrors(NamedTuple):
-    """Distribution of the errors of frame-to-frame motions until the next keyframe.
+    """Distribution of the errors of frame-to-frame motions until the next keyframe."""
 
-    Args:
-        root: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion.
-        cov: (6, 6) reported covariance of a motion.
-        anticorrelation: fraction of the independent error of a motion that the next motion cancels.
-        gain: (6, 6) matrix that maps the twist of the true motion to that of the measured one, to model calibration
-            errors and an approximated port; empty without these.
-    """
-
-    root: Array
-    cov: Array
-    anticorrelation: float
+    root: Array  #: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion
+    cov: Array  #: (6, 6) reported covariance of a motion
+    anticorrelation: float  #: fraction of the independent error of a motion that the next motion cancels
+    #: (6, 6) matrix that maps the twist of the true motion to that of the measured one, to model calibration errors and
+    #: an approximated port; empty without these
     gain: Array
 
 
 class TrueScene(NamedTuple):
-    """True scene from which measurements are sampled.
+    """True scene from which measurements are sampled."""
 
-    Args:
-        left_camera: function that returns the current true pose (4, 4) of the left camera.
-        floor: ray caster against the true floor.
-        matchability: Cramér-Rao bound and unevenness of the floor.
-        map_model: model of the elevation map, with the true heights on its grid.
-        view: positions at which the estimators measure true points.
-    """
-
-    left_camera: Callable[[], Array]
-    floor: FloorRayCaster
-    matchability: Matchability
-    map_model: MapModel
-    view: MeasuredView = IDEAL_VIEW
+    left_camera: Callable[[], Array]  #: function that returns the current true pose (4, 4) of the left camera
+    floor: HeightField  #: the true floor
+    matchability: Matchability  #: Cramér-Rao bound and unevenness of the floor
+    map_model: MapModel  #: model of the elevation map, with the true heights on its grid
+    view: MeasuredView = IDEAL_VIEW  #: positions at which the estimators measure true points
 
 
 class SurrogateVision:
@@ -170,8 +159,8 @@ class SurrogateVision:
         self._tracking_cov: Array | None = None
         self._poses: dict[int, Array] = {}  # true poses of all keyframes
         self._pose_at: dict[int, Array] = {}  # the same, by the row of the frame
-        self._keyframes: dict[int, _KeyframeTruth] = {}  # keyframes that may still be linked
-        self._latest: _KeyframeTruth | None = None
+        self._keyframes: dict[int, KeyframeTruth] = {}  # keyframes that may still be linked
+        self._latest: KeyframeTruth | None = None
         self.stereo_observations: list[StereoObservation] = []
         self._f2f: FrameErrors | None = None
         self._last_motion, self._blind_s = np.eye(4), 0.0  # blind: time without points to track
@@ -187,12 +176,6 @@ class SurrogateVision:
         self._unit_root = np.linalg.cholesky(self._unit_cov)
 
     @property
-    def bounds_px(self) -> tuple[float, float]:
-        """Returns the smallest and the largest Cramér-Rao bound of matching over the range of floor depths [px]."""
-        bounds_px = self.scene.matchability.bounds_px
-        return float(bounds_px.min()), float(bounds_px.max())
-
-    @property
     def binning(self) -> int:
         """Returns the binning factor: the side [px] of the squares of pixels that are averaged into one pixel."""
         return self.scene.matchability.binning
@@ -203,39 +186,15 @@ class SurrogateVision:
         return self.scene.matchability.lamp_share
 
     @property
-    def bound_px(self) -> float:
-        """Returns the Cramér-Rao bound of a patch's position in the last keyframe [px]."""
+    def latest(self) -> KeyframeTruth:
+        """Returns the last keyframe with a stereo observation."""
         assert self._latest is not None
-        return self._latest.bound_px
+        return self._latest
 
     @property
-    def raster_fraction(self) -> float:
-        """Returns the number of raster points in view of the last keyframe, divided by its number of matched points.
-
-        The raster points sample the left image; each represents several matched points.
-        """
-        assert self._latest is not None
-        return len(self._latest.points) / self._latest.n_points
-
-    @property
-    def stereo_parallax_px(self) -> float:
-        """Returns the RMS parallax of the relief in a patch between the two cameras in the last keyframe [px]."""
-        assert self._latest is not None
-        return self._latest.stereo_parallax_px
-
-    def parallax_px(self, earlier_pose: Array) -> float:
-        """Returns the parallax of the relief in a patch between the last keyframe and an earlier pose (4, 4) [px]."""
-        assert self._latest is not None
-        return _parallax_px(self._latest, earlier_pose, self.rig.baseline_m)
-
-    def distance_in_depths(self, a_from_b: Array) -> float:
-        """Returns the length of a motion's translation multiplied by the mean inverse depth of the last keyframe.
-
-        Args:
-            a_from_b: (4, 4) motion.
-        """
-        assert self._latest is not None
-        return float(np.linalg.norm(a_from_b[:3, 3]) * np.mean(self._latest.points[:, 2]) / self.rig.baseline_m)
+    def frame_errors(self) -> FrameErrors | None:
+        """Returns the error distribution of the current F2F motions; None if there are no points to track."""
+        return self._f2f
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         pose = self.scene.left_camera()
@@ -255,17 +214,12 @@ class SurrogateVision:
         self.last_normals = normals
         return Motion(self._last_motion, self._f2f.cov, F2F_POINTS, 0.0), "ok"
 
-    @property
-    def frame_errors(self) -> FrameErrors | None:
-        """Returns the error distribution of the current F2F motions; None if there are no points to track."""
-        return self._f2f
-
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         self._f2f = None  # no points to track until `restart_tracking`
         with self.stopwatch("stereo"):
             pose, model, scene = self.scene.left_camera(), self.model, self.scene
             scene.map_model.mark_seen(pose)
-            depth_m = scene.floor.depth_at(self._true_pixels, pose, self.rig)
+            depth_m = cast_pixels(scene.floor, pose[None], self.rig, self._true_pixels)[0]
             hits = np.flatnonzero((depth_m > 0) & (depth_m < np.inf))  # 0: the camera is below the floor
             if len(hits) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, 0, None))
@@ -274,8 +228,9 @@ class SurrogateVision:
             bound_px = scene.matchability.bound_at(mean_m)
             n_points = len(hits) / len(self._rays) * model.point_fraction(bound_px) * self.n_corners
             clear_share = scene.matchability.clear_share_at(mean_m)
-            n_points *= self._matchable(hits, depth_m) * clear_share
-            hits = hits[self._in_both_images(hits, depth_m)]
+            matched = self._are_matched(hits, depth_m)
+            n_points *= float(matched.mean()) * clear_share
+            hits = hits[matched & self._in_both_images(hits, depth_m)]
             if n_points < _MIN_POINTS or len(hits) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, int(n_points), None))
                 return None
@@ -283,8 +238,6 @@ class SurrogateVision:
             true_measured = scene.view.measure(points)
             n = len(points)
             unevenness_px = scene.matchability.unevenness_at(mean_m)
-            stereo_parallax_px = unevenness_px * float(np.mean(points[:, 2]))
-            sigma_px = match_sigma_px(model, bound_px, stereo_parallax_px) * np.sqrt(n / n_points)
             noise = self._rng.standard_normal((*_RASTER, 3))
             n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, self.rig, self.settings.patch_px)
             unit = sampling.unit_motion_cov(true_measured, self.rig.baseline_m, n_tracked)
@@ -294,10 +247,11 @@ class SurrogateVision:
                 observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px))
             self.stereo_observations.append(observation)
             self._pose_at[row] = pose
-            self._latest = _KeyframeTruth(
-                pose, points, hits, noise, bound_px, unevenness_px, stereo_parallax_px, n_points, *unit, cells,
-                true_measured, clear_share, noise_ratio,
+            latest = self._latest = KeyframeTruth(
+                pose, points, hits, noise, bound_px, unevenness_px, n_points, self.rig.baseline_m, *unit, cells,
+                clear_share, noise_ratio,
             )  # fmt: skip
+            sigma_px = match_sigma_px(model, bound_px, latest.stereo_parallax_px) * np.sqrt(n / n_points)
             error_root = self._unit_root.T * sigma_px * model.match_error_ratio
             measured = true_measured + noise.reshape(-1, 3)[hits] @ error_root
             sigma_px *= noise_ratio
@@ -307,85 +261,60 @@ class SurrogateVision:
             return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
     def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
-        """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image.
-
-        Args:
-            indices: (n,) indices of the points in the raster.
-            depth_m: depth of every point of the raster [m].
-        """
+        """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image."""
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
-    def _matchable(self, indices: NDArray[np.int64], depth_m: Array) -> float:
-        """Returns the fraction of the given raster points whose measured positions satisfy the epipolar constraint.
-
-        Args:
-            indices: (n,) indices of the points in the raster.
-            depth_m: depth of every point of the raster [m].
-        """
+    def _are_matched(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the points whose measured positions satisfy the epipolar constraint."""
         if self._rows is None:
-            return 1.0
-        return float(self._rows.are_matched(self._true_points(indices, depth_m)).mean())
+            return np.ones(len(indices), np.bool_)
+        return self._rows.are_matched(self._true_points(indices, depth_m))
 
     def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the points whose patches lie inside both images and satisfy the epipolar constraint.
-
-        Args:
-            indices: (n,) indices of the points in the raster.
-            depth_m: depth of every point of the raster [m].
-        """
-        points = self._true_points(indices, depth_m)
-        measured = self.scene.view.measure(points)
+        """Returns the mask (n,) of the points whose patches lie inside both images."""
+        measured = self.scene.view.measure(self._true_points(indices, depth_m))
         left_px = measured[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         right_px = left_px - np.column_stack([self.rig.focal_px * measured[:, 2], np.zeros(len(measured))])
         in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
-        matched = True if self._rows is None else self._rows.are_matched(points)
-        return in_left & in_right & matched
+        return in_left & in_right
 
     def tracking_cov(self) -> Array | None:
         return self._tracking_cov
 
     def restart_tracking(self) -> None:
-        assert self._latest is not None
         model = self.model
-        if model.match_fraction(self._latest.bound_px) * self._latest.clear_share < MIN_MATCHED:
+        if model.match_fraction(self.latest.bound_px) * self.latest.clear_share < MIN_MATCHED:
             return  # vision is lost until the next keyframe
-        root, cov = self._motion_errors(model.f2f_sigma_px(self._latest.bound_px))
+        root, cov = self._motion_errors(model.f2f_sigma_px(self.latest.bound_px))
         independent = model.f2f_error_ratio / np.sqrt(1 + model.f2f_anticorrelation**2)
-        gain = self.scene.view.motion_gain(self._latest.points, self.rig.baseline_m)
+        gain = self.scene.view.motion_gain(self.latest.points, self.rig.baseline_m)
         self._f2f = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
         self.last_normals, self._tracking_cov = np.zeros(6), cov
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
-        """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow.
-
-        Args:
-            sigma_px: standard deviation of a flow vector.
-        """
-        assert self._latest is not None
+        """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow."""
         sigma = sigma_px / self.rig.focal_px
-        return self._latest.unit_root * sigma, self._latest.unit_cov * sigma**2
+        return self.latest.unit_root * sigma, self.latest.unit_cov * sigma**2
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
-        assert self._latest is not None
-        view = self._mosaic.view(self._latest.cells)
+        view = self._mosaic.view(self.latest.cells)
         if view is None:
             return None
-        points, pose = self._latest.points, self._latest.pose
-        cov = self._unit_cov * self.model.match_sigma_px(self._latest.bound_px) ** 2
+        points, pose = self.latest.points, self.latest.pose
+        cov = self._unit_cov * self.model.match_sigma_px(self.latest.bound_px) ** 2
         measured = np.array([
             sampling.measured_motion(points, self._poses[number], pose, self._camera, cov)
             for number in view.numbers
         ])  # fmt: skip
         mean = sampling.mosaic_correction(view.estimated, measured, view.fractions, world_from_camera)
-        root, cov = self._motion_errors(self.model.mosaic_sigma_px(self._latest.bound_px) / np.sqrt(view.coverage))
+        root, cov = self._motion_errors(self.model.mosaic_sigma_px(self.latest.bound_px) / np.sqrt(view.coverage))
         error = root @ self.draw_normals(1)[0] * self.model.mosaic_error_ratio
-        correction = Motion(geometry.exp(mean + error), cov, len(self._latest.points), 1.0)
+        correction = Motion(geometry.exp(mean + error), cov, len(self.latest.points), 1.0)
         return Registration(correction, view.numbers[int(np.searchsorted(np.cumsum(view.fractions), 0.5))])
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
-        assert self._latest is not None
-        self._poses[number], self._keyframes[number] = self._latest.pose, self._latest
-        self._mosaic.add(number, world_from_camera, self._latest.cells)
+        self._poses[number], self._keyframes[number] = self.latest.pose, self.latest
+        self._mosaic.add(number, world_from_camera, self.latest.cells)
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
         self._mosaic.clear()
@@ -404,40 +333,30 @@ class SurrogateVision:
             self._keyframes.pop(number, None)
 
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
-        """Returns links as `measure_motions` does, sampled from the given error model.
-
-        Args:
-            node: the later keyframe of all links.
-            others: the earlier keyframes.
-            model: error model of the measurements.
-        """
+        """Returns links as `measure_motions` does, sampled from the given error model."""
         with self.stopwatch("network"):
-            assert self._latest is not None
-            later = self._keyframes.get(node.number, self._latest)
+            later = self._keyframes.get(node.number, self.latest)
             return [self._sample_link(later, self._keyframes[k.number], node.number, k.number, model) for k in others]
 
     def _sample_link(
-        self, later: _KeyframeTruth, earlier: _KeyframeTruth, number: int, other: int, model: ErrorModel
+        self, later: KeyframeTruth, earlier: KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes; None if the number or the fraction of matched points is too small.
+        """Samples the motion between two keyframes; None if too few points or too small a fraction are matched.
 
-        The motion is estimated from noisy points by least squares, starting at the true motion: in one iteration, or in
-        several if `TrueScene.view` is not ideal. The random numbers that belong to the link alone depend only on the
-        two keyframe numbers, not on the order in which links are measured.
-
-        Args:
-            later, earlier: the two keyframes.
-            number, other: their numbers, in the same order.
-            model: error model of the measurements.
+        It is estimated from noisy points by least squares from the true motion: in one iteration, or in several if
+        `TrueScene.view` is not ideal.
         """
+        n, parallax_px = len(later.points), later.parallax_px(earlier.pose)
         bound_px = max(later.bound_px, earlier.bound_px)
-        n = len(later.points)
-        match_fraction = self._match_fraction(later, earlier, model)
+        stereo_sigma_px = match_sigma_px(model, bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
+        clear_share = min(later.clear_share, earlier.clear_share)
+        match_fraction = (
+            clear_share * model.match_fraction(bound_px) / (1 + (parallax_px / model.match_parallax_px) ** 2)
+        )
         n_matches = later.n_points * match_fraction
         inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
         noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
-        parallax_px = max(later.stereo_parallax_px, earlier.stereo_parallax_px)
-        sigma_px = match_sigma_px(model, bound_px, parallax_px) * noise_scale
+        sigma_px = stereo_sigma_px * noise_scale
         lamp_factor = np.hypot(1, model.lamp_error_growth * self.lamp_share)
         error_ratio = model.match_error_ratio * lamp_factor
         normals = self._link_normals(number, other, n + 1)
@@ -452,27 +371,11 @@ class SurrogateVision:
         n_matched = int(in_view / n * later.n_points * match_fraction)
         if in_view < sampling.MIN_POINTS or n_matched < _MIN_POINTS or match_fraction < MIN_INLIER_SHARE:
             return None
-        growth = self._relief_growth(later, earlier, model)
+        # relief increases the variance of the difference of a match's two image positions, 2 sigma^2 without it
+        growth = 1 + (model.relief_gain * parallax_px) ** 2 / (2 * stereo_sigma_px**2)
         residual = np.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
         lamp_growth = 1 + (model.lamp_sigma_growth * self.lamp_share) ** 2
         return Motion(motion, cov * growth * lamp_growth, n_matched, float(residual))
-
-    def _relief_growth(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
-        """Returns the factor by which relief increases the residuals' variance and the reported covariance of a link.
-
-        It is the variance of the difference between the two image positions of a match, divided by this variance
-        without relief, 2 sigma^2.
-        """
-        bound_px = max(later.bound_px, earlier.bound_px)
-        stereo_px = max(later.stereo_parallax_px, earlier.stereo_parallax_px)
-        relief_px = model.relief_gain * _parallax_px(later, earlier.pose, self.rig.baseline_m)
-        return 1 + relief_px**2 / (2 * match_sigma_px(model, bound_px, stereo_px) ** 2)
-
-    def _match_fraction(self, later: _KeyframeTruth, earlier: _KeyframeTruth, model: ErrorModel) -> float:
-        """Returns the fraction of the later keyframe's points in view of the earlier one that are matched there."""
-        parallax = _parallax_px(later, earlier.pose, self.rig.baseline_m) / model.match_parallax_px
-        clear_share = min(later.clear_share, earlier.clear_share)
-        return clear_share * model.match_fraction(max(later.bound_px, earlier.bound_px)) / (1 + parallax**2)
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns standard normal numbers (n, 3) of a link; in a survey, they depend only on its keyframe numbers."""
@@ -505,42 +408,31 @@ class SurrogateVision:
 
     @np.errstate(invalid="raise")
     def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
-        """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells.
-
-        `CellErrors` holds their random numbers and standard deviations.
-        """
+        """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells."""
         lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
         cells = self.scene.map_model.correlated_cells
         relief_noise, cell_noise, wall_noise = (window_noise(shape, cells, self._rng) for _ in range(3))
         edge_noise = heavy_tailed(wall_noise)
         level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
-        error_law, sigma_law = model.depth_laws(self.binning)
-        matchability = self.scene.matchability
-        bounds_px, window_px = matchability.bounds_px, matchability.window_bounds_px
+        matchability, laws = self.scene.matchability, depth_errors(model, self.scene.matchability)
+        window_px = matchability.window_bounds_px
         border_px = model.border_error.width_px * _BORDER_STEPS
         bound_ratios, bound_factors = self._bound_factors(model)
         return CellErrors(
             lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px,
-            matchability.depths_m,
-            error_law.sigma_px(window_px, self.lamp_share) * float(np.exp(level + ratio)),
-            sigma_law.sigma_px(window_px, self.lamp_share) * float(np.exp(level)),
-            model.depth_texture_scatter(bounds_px, matchability.texture.scatter),
-            np.array([model.map_completeness(b) for b in bounds_px]),
-            error_law, sigma_law, model.relief_error_gain, model.relief_error_limit_px,
-            np.array([model.edge_error(b) for b in bounds_px]), model.edge_sigma_gain, model.edge_half_px,
-            model.border_holes.share, model.border_holes.width_px(bounds_px, self.lamp_share),
+            matchability.depths_m, laws.error_px * float(np.exp(level + ratio)), laws.sigma_px * float(np.exp(level)),
+            laws.cell_scatter, laws.completeness, laws.error_law, laws.sigma_law, model.relief_error_gain,
+            model.relief_error_limit_px, laws.edge_error, model.edge_sigma_gain, model.edge_half_px,
+            model.border_holes.share, model.border_holes.width_px(matchability.bounds_px, self.lamp_share),
             model.error_scatter_share,
             border_px, model.border_error(border_px), edge_border_factor(border_px, self.rig.height_px),
             bound_ratios, *bound_factors,
-            error_noise_share=error_law.noise_share(window_px),
-            sigma_noise_share=sigma_law.noise_share(window_px),
+            error_noise_share=laws.error_law.noise_share(window_px),
+            sigma_noise_share=laws.sigma_law.noise_share(window_px),
         )  # fmt: skip
 
     def _bound_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
-        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and two arrays of factors (q,).
-
-        The factors are those on the true and on the reported standard deviation of depth at these ratios.
-        """
+        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and two arrays of factors (q,)."""
         scene = self.scene.matchability
         medium_px = scene.medium_bound_px * scene.texture.median_ratio
         laws = model.depth_laws(self.binning)
@@ -561,7 +453,6 @@ def match_sigma_px(model: ErrorModel, bound_px: float, stereo_parallax_px: float
     """Returns the reported standard deviation of a patch's position in one image [px].
 
     Args:
-        model: error model of the measurements.
         bound_px: Cramér-Rao bound [px].
         stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
     """
@@ -582,28 +473,12 @@ def overlap_inflation(n_points: float, rig: StereoRig, patch_px: int) -> float:
 
     It is the expected value of `matching.variance_inflation` for patches spread over the image at random, which share a
     fraction patch_px^2 / (width height) of their pixels on average.
-
-    Args:
-        n_points: number of patches.
-        rig: calibration, for the image size.
-        patch_px: side of the patches.
     """
     return 1 + n_points * patch_px**2 / (rig.width_px * rig.height_px)
 
 
-def _parallax_px(keyframe: _KeyframeTruth, earlier_pose: Array, baseline_m: float) -> float:
-    """Returns the RMS parallax of the relief within a patch between a keyframe and an earlier pose (4, 4) [px]."""
-    distance_m = float(np.linalg.norm(keyframe.pose[:3, 3] - earlier_pose[:3, 3]))
-    return keyframe.unevenness_px * distance_m * float(np.mean(keyframe.points[:, 2])) / baseline_m
-
-
 def _raster(rig: StereoRig, margin_px: float) -> Array:
-    """Returns the pixels (n, 2) of the raster points, which are evenly spaced over the part of the image with matches.
-
-    Args:
-        rig: calibration, for the image size.
-        margin_px: smallest distance of the centre of a matched patch from the image border.
-    """
+    """Returns the pixels (n, 2) of the raster points, evenly spaced over the part of the image with matches."""
     sides = (rig.height_px, rig.width_px)
     rows, cols = (
         margin_px + (np.arange(n) + 0.5) / n * (side - 2 * margin_px) for n, side in zip(_RASTER, sides, strict=True)

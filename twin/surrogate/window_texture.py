@@ -23,15 +23,10 @@ _WEAKEST = 0.05  # smallest RMS gradient of a window that is counted, relative t
 
 
 class WindowTexture(NamedTuple):
-    """Distribution over windows of the Cramér-Rao bound of matching in one window.
+    """Distribution over windows of the Cramér-Rao bound of matching in one window."""
 
-    Args:
-        median_ratio: bound of the median window, divided by that of the RMS gradient of the image.
-        scatter: standard deviation over windows of the logarithm of the bound.
-    """
-
-    median_ratio: float
-    scatter: float
+    median_ratio: float  #: bound of the median window, divided by that of the RMS gradient of the image
+    scatter: float  #: standard deviation over windows of the logarithm of the bound
 
 
 _EVEN = np.ones((1, 1))  # relative gradients of an evenly lit image

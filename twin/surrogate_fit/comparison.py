@@ -103,11 +103,12 @@ class ComparisonVision:
         self._frames = []
         if points is not None and sampled is not None:
             self.statistics["point_fraction"].append(len(points.xyz) / self.surrogate.n_corners)
+            latest = self.surrogate.latest
             traces = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, sampled)]
-            sigma_ratio = np.sqrt(traces[0] / traces[1] * self.surrogate.raster_fraction)
+            sigma_ratio = np.sqrt(traces[0] / traces[1] * (len(latest.points) / latest.n_points))
             self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
-            self.statistics["bound_px"].append(self.surrogate.bound_px)
-            self.statistics["stereo_parallax_px"].append(self.surrogate.stereo_parallax_px)
+            self.statistics["bound_px"].append(latest.bound_px)
+            self.statistics["stereo_parallax_px"].append(latest.stereo_parallax_px)
         return points
 
     def tracking_cov(self) -> Array | None:
@@ -164,28 +165,18 @@ class ComparisonVision:
         return measured["images"]
 
     def _compare_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
-        """Adds the statistics of one link, measured in images and sampled from each error model.
-
-        Errors are normalised by the covariance that the surrogate reports. For two consecutive links of the chain, the
-        normalised scalar product of their errors is added too; it is negative if the second error cancels the first.
-
-        Args:
-            i, j: numbers of the earlier and the later node.
-            links: motion from i to j by source: "images", or the name of an error model.
-            true: (4, 4) true motion from i to j.
-        """
+        """Adds the statistics of one link, measured in images and sampled from each error model."""
         measured, sampled = links["images"], links["all"]
         self.statistics["link_failed_images"].append(float(measured is None))
         self.statistics["link_failed_surrogate"].append(float(sampled is None))
         if sampled is not None:
-            self.statistics["link_parallax_px"].append(self.surrogate.parallax_px(self._poses[i]))
+            self.statistics["link_parallax_px"].append(self.surrogate.latest.parallax_px(self._poses[i]))
             n_points = 0 if measured is None else measured.n_points
             self.statistics["link_matched"].append(n_points / sampled.n_points)
         if measured is None or sampled is None:
             return
         self.statistics["link_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
-        self.statistics["link_point_ratio"].append(measured.n_points / sampled.n_points)
-        self.statistics["link_distance"].append(self.surrogate.distance_in_depths(true))
+        self.statistics["link_distance"].append(self.surrogate.latest.distance_in_depths(true))
         errors = {name: geometry.log(geometry.inverse(true) @ m.a_from_b) for name, m in links.items() if m is not None}
         for name, error in errors.items():
             self.statistics[f"link_nees_{name}"].append(_chi2(error, sampled.cov) / 6)
@@ -233,30 +224,7 @@ class ComparisonVision:
         return elevation
 
     def _compare_maps(self, name: str, cells: np.ndarray, maps: dict[str, ElevationMap]) -> None:
-        """Adds four statistics of a class of cells: variance of errors, reported variance, tail ratio and scatter.
-
-        The first two have the quantities `MAP_STATISTICS`. None is added if the class has too few cells with a height
-        in all maps.
-
-        The reported standard deviation varies from cell to cell, and the errors of a cell are normal with a standard
-        deviation proportional to it (a scale mixture). Two robust numbers describe this: the median of the reported
-        variance, and the RMS of error / sigma, to which a gross error contributes at most `_GROSS`. The median error is
-        subtracted first. The variance of errors is that of a cell with the median sigma. Near walls, where gross errors
-        are modelled, it follows from the 90th percentile of the absolute errors, which a few outliers do not change.
-
-        The third statistic is the ratio of the 90th percentile of absolute errors to the median, in the map from images
-        and in the map sampled with all errors. It exceeds that of normal errors if their standard deviation varies over
-        the cells.
-
-        The fourth statistic is the scatter of ln(sigma in the map from images / sigma in the sampled map "depth"). The
-        depths of this sampled map have the same precision in all cells. The upper half of the distribution determines
-        the largest errors, so the scatter is computed from the median and the 90th percentile.
-
-        Args:
-            name: name of the class.
-            cells: (rows, cols) mask of the cells.
-            maps: map from images and sampled maps, by name.
-        """
+        """Adds four statistics of a class of cells: variance of errors, reported variance, tail ratio and scatter."""
         map_model = self.surrogate.scene.map_model
         heights = np.array([elevation.height_m for elevation in maps.values()])
         known = cells & map_model.seen & np.isfinite(heights).all(axis=0)
@@ -286,13 +254,7 @@ class ComparisonVision:
         self.statistics[f"map_tail_{name}"] = (p90 / median).tolist()
 
     def _compare_borders(self, maps: dict[str, ElevationMap]) -> None:
-        """Adds the ratios of errors and of reported standard deviations near image borders, images / sampled map.
-
-        The cells are those with a roughness below 0.08 px and no wall within a matching window, divided into classes by
-        their distance from the image border. `border_error_ratio` is the ratio of the medians of the absolute errors,
-        `border_sigma_ratio` that of the medians of the reported standard deviations, and `border_distance_px` the
-        median distance of the cells.
-        """
+        """Adds the ratios of errors and of reported standard deviations near image borders, images / sampled map."""
         map_model = self.surrogate.scene.map_model
         images, sampled = maps["images"], maps["all"]
         steepest = np.asarray(maximum_filter(map_model.steepness, 2 * map_model.window_cells + 1))
@@ -313,13 +275,7 @@ class ComparisonVision:
             self.statistics["border_distance_px"].append(float(np.median(map_model.border_distance_px[cells])))
 
     def _cell_classes(self) -> dict[str, np.ndarray]:
-        """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared, by name.
-
-        Level cells are divided into classes of roughness and of the number of consecutive keyframes that observed them,
-        cells near walls into classes of `edge_strength`. Steep smooth cells are one class. Cells near the image border
-        belong to no class, and level or steep cells belong to none if a wall or a rough cell lies within a matching
-        window of them.
-        """
+        """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared, by name."""
         map_model = self.surrogate.scene.map_model
         rough = self._in_px(map_model.roughness_m)
         steepness, views, inner = map_model.steepness, map_model.views, map_model.border_px > _BORDER_BINS_PX[-1]
@@ -340,11 +296,7 @@ class ComparisonVision:
         return height_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
 
     def _count_holes(self, elevation: ElevationMap) -> None:
-        """Adds the number of observed cells and the fraction of them with a height, by roughness and border distance.
-
-        The median roughness or distance of each bin is added too. The bins of the distance from the image border
-        (`MapModel.border_px`) contain smooth cells only; those of the roughness contain cells far from the border only.
-        """
+        """Adds the number of observed cells and their fraction with a height, by roughness and border distance."""
         map_model = self.surrogate.scene.map_model
         roughness = self._in_px(map_model.roughness_m)
         seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)

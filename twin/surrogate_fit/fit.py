@@ -10,9 +10,10 @@ measurements. Every survey has the same weight, except in the fits of `match_bia
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from twin.surrogate.error_model import (
@@ -53,10 +54,6 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
     """Returns the error model that reproduces the statistics of rendered surveys.
 
     `match_parallax_px` and `common_bias_px` are not fitted; they are those of the compared model.
-
-    Args:
-        surveys: statistics of each survey; all of them complete (`rendered_surveys.fit_to_surveys`).
-        compared: error model of the surrogate with which the surveys were compared.
     """
     bounds = np.array([np.median(s["bound_px"]) for s in surveys])
 
@@ -90,7 +87,6 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
         lamp_error_growth=links.lamp_error_growth,
         lamp_sigma_growth=lamp_sigma_growth,
         match_fraction=_fit_fraction_law(bounds, np.minimum(match_fractions, 1.0)),
-        match_parallax_px=compared.match_parallax_px,
         match_covariance_inflation=compared.match_covariance_inflation * inflation**2,
         match_bias_fraction=links.match_bias_fraction,
         distance_growth=distance_growth,
@@ -121,79 +117,63 @@ def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -
 
 
 def log_misfit(surveys: Sequence[SurveyStatistics], compared: ErrorModel, fitted: ErrorModel) -> dict[str, float]:
-    """Returns the RMS over surveys of ln(reported / fitted standard deviation), by name of the error model's field.
+    """Returns the RMS over surveys of ln(reported / fitted standard deviation), by name of the error model's field."""
 
-    Args:
-        surveys: statistics of each survey.
-        compared: error model of the surrogate with which the surveys were compared.
-        fitted: error model fitted to the surveys.
-    """
+    def sigma_px(name: str, model: ErrorModel, s: SurveyStatistics) -> float:
+        bound_px = float(np.median(s["bound_px"]))
+        if name == "match_sigma_px":
+            return match_sigma_px(model, bound_px, float(np.median(s["stereo_parallax_px"])))
+        return getattr(model, name)(bound_px)
 
-    def match_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
-        return match_sigma_px(model, float(np.median(s["bound_px"])), float(np.median(s["stereo_parallax_px"])))
-
-    def misfit(ratio: str, sigma_px: Callable[[ErrorModel, SurveyStatistics], float]) -> float:
-        logs = [np.log(np.median(s[ratio]) * sigma_px(compared, s) / sigma_px(fitted, s)) for s in surveys]
+    def misfit(name: str) -> float:
+        ratio = name.replace("_px", "_ratio")
+        logs = [np.log(np.median(s[ratio]) * sigma_px(name, compared, s) / sigma_px(name, fitted, s)) for s in surveys]
         return float(np.sqrt(np.mean(np.square(logs))))
 
-    def f2f_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
-        return model.f2f_sigma_px(float(np.median(s["bound_px"])))
+    return {name: misfit(name) for name in ("match_sigma_px", "f2f_sigma_px", "mosaic_sigma_px")}
 
-    def mosaic_sigma(model: ErrorModel, s: SurveyStatistics) -> float:
-        return model.mosaic_sigma_px(float(np.median(s["bound_px"])))
 
-    return {
-        "match_sigma_px": misfit("match_sigma_ratio", match_sigma),
-        "f2f_sigma_px": misfit("f2f_sigma_ratio", f2f_sigma),
-        "mosaic_sigma_px": misfit("mosaic_sigma_ratio", mosaic_sigma),
-    }
+def _solve(
+    residuals: Callable[[np.ndarray], np.ndarray],
+    start: ArrayLike,
+    limits: tuple[ArrayLike, ArrayLike],
+    outlier: float | None = None,
+) -> list[float]:
+    """Returns the parameters, within limits, of least squares; residuals beyond `outlier` have less weight."""
+    loss: dict[str, Any] = {} if outlier is None else {"loss": "soft_l1", "f_scale": outlier}
+    return least_squares(residuals, start, bounds=limits, **loss).x.tolist()
 
 
 def _fit_sigma_law(bounds: np.ndarray, sigmas: np.ndarray) -> SigmaLaw:
-    """Returns the `SigmaLaw` fitted to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px].
-
-    Residuals are differences of logarithms.
-    """
+    """Returns the `SigmaLaw` fitted to standard deviations (n,) [px] at Cramér-Rao bounds (n,) [px]."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.hypot(x[0], x[1] * bounds) / sigmas)
 
-    solution = least_squares(residuals, [sigmas.min() / 2, 1.0], bounds=([1e-4, 0.0], [10.0, 100.0]))
-    return SigmaLaw(float(solution.x[0]), float(solution.x[1]))
+    return SigmaLaw(*_solve(residuals, [sigmas.min() / 2, 1.0], ([1e-4, 0.0], [10.0, 100.0])))
 
 
 def _fit_match_sigma(bounds: np.ndarray, parallax: np.ndarray, sigmas: np.ndarray) -> tuple[SigmaLaw, float]:
-    """Returns `match_sigma_px` and `stereo_relief_gain` of the error model, fitted to reported standard deviations.
-
-    Residuals are differences of logarithms.
-
-    Args:
-        bounds: (n,) Cramér-Rao bounds [px].
-        parallax: (n,) RMS parallax of the relief in a patch between the two cameras [px].
-        sigmas: (n,) reported standard deviations of a patch's position in one image [px].
-    """
+    """Returns `match_sigma_px` and `stereo_relief_gain` of the error model, fitted to reported standard deviations."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(np.sqrt(x[0] ** 2 + (x[1] * bounds) ** 2 + (x[2] * parallax) ** 2) / sigmas)
 
     limits = [1e-4, 0.0, 0.0], [10.0, 100.0, 10.0]
-    floor_px, slope, gain = least_squares(residuals, [sigmas.min() / 2, 1.0, 0.3], bounds=limits).x.tolist()
+    floor_px, slope, gain = _solve(residuals, [sigmas.min() / 2, 1.0, 0.3], limits)
     return SigmaLaw(floor_px, slope), gain
 
 
 def _fit_fraction_law(bounds: np.ndarray, fractions: np.ndarray, outlier: float = 1.0) -> FractionLaw:
-    """Returns the `FractionLaw` with exponent 4 fitted to fractions (n,) at Cramér-Rao bounds (n,) [px].
-
-    Residuals much larger than `outlier` have less weight.
-    """
+    """Returns the `FractionLaw` with exponent 4 fitted to fractions (n,) at Cramér-Rao bounds (n,) [px]."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.array([FractionLaw(x[0], np.exp(x[1]), 4.0)(b) for b in bounds]) - fractions
 
     start = [min(float(fractions.max()), 0.9999), np.log(4 * bounds.max())]
     limits = ([0.01, np.log(bounds.min())], [1.0, np.log(100 * bounds.max())])
-    solution = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=outlier)
-    return FractionLaw(float(solution.x[0]), float(np.exp(solution.x[1])), 4.0)
+    maximum, log_half_px = _solve(residuals, start, limits, outlier)
+    return FractionLaw(maximum, float(np.exp(log_half_px)), 4.0)
 
 
 def _fit_anticorrelation(statistics: SurveyStatistics) -> float:
@@ -222,22 +202,11 @@ def _fit_link_errors(
 ) -> _LinkErrors:
     """Separates link errors into contributions of patch matching, of relief, and of a bias of each keyframe.
 
-    Errors due to relief grow with the unevenness of the floor and with the distance between the keyframes. The links of
-    each survey are therefore sorted by distance and divided into thirds. Match error ratio, relief gain and the growth
-    of both under lamps are fitted to the mean squared errors of all thirds of all surveys. Residuals are differences of
-    logarithms; large ones have less weight. Over smooth floors the errors do not determine the relief gain. The gain of
-    the compared model, or `RELIEF_GAIN` if that is larger, is therefore a weak prior.
-
-    Due to the bias of a keyframe, the errors of two consecutive links cancel partly, because the keyframe ends the
-    first link and starts the second. Relief causes equal errors in both. The bias fraction is fitted to the scalar
-    products of the errors of consecutive links. Loops of three keyframes do not determine the bias, because links from
-    the same keyframe have correlated errors.
-
-    Args:
-        surveys: statistics of n surveys.
-        match_ratios: (n,) ratio of the standard deviations of matches reported by images and by the compared model.
-        lamp_share: (n,) fraction of the reflected light that comes from the lamps.
-        compared: error model of the surrogate with which the surveys were compared.
+    Errors due to relief grow with unevenness and with the distance between the keyframes. Match error ratio, relief
+    gain and their growth under lamps are therefore fitted to the mean squared errors of the thirds of each survey's
+    links, sorted by distance; a relief gain is a weak prior, for smooth floors do not determine it. The bias of a
+    keyframe, which ends one link and starts the next, makes consecutive errors cancel partly, relief makes them equal:
+    the bias fraction is fitted to the scalar products of the errors of consecutive links.
     """
     images, by_patches, by_relief = np.array([_squared_errors_by_distance(s) for s in surveys]).transpose(2, 0, 1)
     reported, share = np.square(match_ratios)[:, None], lamp_share[:, None]
@@ -249,7 +218,7 @@ def _fit_link_errors(
         return np.append(logs.ravel(), _PRIOR * (x[2] / max(compared.relief_gain, RELIEF_GAIN) - 1))
 
     start, limits = [1.0, 0.5, max(compared.relief_gain, RELIEF_GAIN)], ([1e-3, 0.0, 0.0], [100.0, 10.0, 100.0])
-    ratio, growth, gain = least_squares(residuals, start, bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x.tolist()
+    ratio, growth, gain = _solve(residuals, start, limits, _OUTLIER)
     relief = gain**2 * (1 + (growth * share) ** 2)
     patches = np.median(np.maximum(images - relief * by_relief, images / 10) / by_patches, axis=1)
     products = np.array([[np.mean(s[f"consecutive_product_{name}"]) for name in _SOURCES] for s in surveys])
@@ -261,32 +230,18 @@ def _fit_link_errors(
 
 
 def _fit_lamp_growth(ratios: np.ndarray, lamp_share: np.ndarray) -> tuple[float, float]:
-    """Fits c and k of the law c sqrt(1 + (k lamp_share)^2) to ratios of standard deviations.
-
-    Residuals are differences of logarithms; large ones have less weight.
-
-    Args:
-        ratios: (n,) ratios, one per survey.
-        lamp_share: (n,) fraction of the reflected light that comes from the lamps, one per survey.
-
-    Returns:
-        The ratio c without lamps, and its growth k.
-    """
+    """Fits c and k of the law c sqrt(1 + (k lamp_share)^2) to ratios of standard deviations."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
         return x[0] + np.log1p((x[1] * lamp_share) ** 2) / 2 - np.log(ratios)
 
     start = [float(np.median(np.log(ratios))), 0.5]
-    found = least_squares(residuals, start, bounds=([-10.0, 0.0], [10.0, 10.0]), loss="soft_l1", f_scale=_OUTLIER).x
-    return float(np.exp(found[0])), float(found[1])
+    log_ratio, growth = _solve(residuals, start, ([-10.0, 0.0], [10.0, 10.0]), _OUTLIER)
+    return float(np.exp(log_ratio)), growth
 
 
 def _squared_errors_by_distance(statistics: SurveyStatistics) -> np.ndarray:
-    """Returns mean normalised squared link errors (3, 3), with a row per third of the links and a column per source.
-
-    The links are divided into thirds by distance. The sources are those of `_SOURCES`. The largest 5 % of the squared
-    errors in each third are excluded.
-    """
+    """Returns mean normalised squared link errors (3, 3), with a row per third of the links and a column per source."""
     errors = np.column_stack([statistics[f"link_nees_{name}"] for name in _SOURCES])
     order = np.argsort(statistics["link_distance"])
     thirds = (np.sort(errors[third], axis=0) for third in np.array_split(order, 3))
@@ -298,11 +253,7 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
 
     At distance zero, both stereo pairs of a link contribute the same variance. The contribution of the earlier pair is
     multiplied by 1 + (growth * distance)^2, so the variance of the link is multiplied by
-    1 + (growth * distance)^2 / 2. The distance is computed by `SurrogateVision.distance_in_depths`.
-
-    Returns:
-        The growth; and, for each of n surveys, the ratio of the standard deviation of links reported for image
-        measurements to the one that the surrogate reports, extrapolated to distance zero.
+    1 + (growth * distance)^2 / 2. The distance is computed by `KeyframeTruth.distance_in_depths`.
     """
     half_squares = [np.square(s["link_distance"]) / 2 for s in surveys]
     log_variances = [
@@ -316,16 +267,12 @@ def _fit_distance_growth(surveys: Sequence[SurveyStatistics], compared_growth: f
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.concatenate([(ratios - np.median(ratios)) / np.sqrt(len(ratios)) for ratios in log_ratios(x)])
 
-    start = [max(compared_growth, 1.0)]
-    solution = least_squares(residuals, start, bounds=([0.0], [30.0]), loss="soft_l1", f_scale=0.02).x
+    solution = np.array(_solve(residuals, [max(compared_growth, 1.0)], ([0.0], [30.0]), 0.02))
     return float(solution[0]), np.exp([np.median(ratios) / 2 for ratios in log_ratios(solution)])
 
 
 def _matched_without_relief(surveys: Sequence[SurveyStatistics]) -> np.ndarray:
-    """Returns the median ratio (n,) of matched points, images / surrogate, of the links with the least parallax.
-
-    These are the links up to the median parallax of the survey.
-    """
+    """Returns the median ratio (n,) of matched points, images / surrogate, of the links with the least parallax."""
     ratios = []
     for s in surveys:
         parallax, matched = np.array(s["link_parallax_px"]), np.array(s["link_matched"])
@@ -350,11 +297,7 @@ def _fit_completeness(surveys: Sequence[SurveyStatistics], compared: FractionLaw
 
 
 def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> float:
-    """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey.
-
-    Surveys without smooth cells are left out. Returns the value of the compared model if none of the others has rough
-    cells.
-    """
+    """Fits `edge_half_px` to the fractions of cells with a height, relative to the smooth cells of the same survey."""
     roughness, fractions, weights = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for s in surveys:
         if (smooth := _known_smooth_fraction(s)) is None:
@@ -372,13 +315,7 @@ def _fit_edge_holes(surveys: Sequence[SurveyStatistics], compared_px: float) -> 
 
 
 def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErrorLaw) -> BorderErrorLaw:
-    """Fits the `BorderErrorLaw` to errors and reported standard deviations of cells near the image borders.
-
-    The data are the ratios of `border_error_ratio` and `border_sigma_ratio` (map from images / sampled map), relative
-    to the median of the ratios of the same survey farther than `_FAR_PX` from the border. Residuals are differences of
-    logarithms; large ones have less weight. The result is the compared law if no survey has cells both near the border
-    and far from it.
-    """
+    """Fits the `BorderErrorLaw` to errors and reported standard deviations of cells near the image borders."""
     rows = []
     for s in surveys:
         distance = np.array(s.get("border_distance_px", ()))
@@ -394,17 +331,11 @@ def _fit_border_errors(surveys: Sequence[SurveyStatistics], compared: BorderErro
     def residuals(x: np.ndarray) -> np.ndarray:
         return np.log(BorderErrorLaw(*x)(distance)) - target
 
-    limits = [0.0, 0.5], [10.0, 20.0]
-    x = least_squares(residuals, [1.0, 3.0], bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x
-    return BorderErrorLaw(*x.tolist())
+    return BorderErrorLaw(*_solve(residuals, [1.0, 3.0], ([0.0, 0.5], [10.0, 20.0]), _OUTLIER))
 
 
 def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) -> BorderLaw:
-    """Fits the `BorderLaw` to the fractions of smooth cells without a height, by distance from the image border.
-
-    The fractions are relative to the smooth cells of the same survey away from the border. Every survey with such cells
-    has the same weight; without any, the result is the compared law.
-    """
+    """Fits the `BorderLaw` to the fractions of smooth cells without a height, by distance from the image border."""
     rows: list[tuple[float, ...]] = []
     for s in surveys:
         if (smooth := _known_smooth_fraction(s)) is None:
@@ -422,8 +353,7 @@ def _fit_border_holes(surveys: Sequence[SurveyStatistics], compared: BorderLaw) 
         return weight * (x[0] * np.exp(-distance / BorderLaw(*x).width_px(bounds, lamps)) - hole)
 
     limits = [0.0, 0.05, 1.0, 0.0], [1.0, 20.0, 1000.0, 3.0]
-    x = least_squares(residuals, [0.5, 1.0, 50.0, 1.0], bounds=limits, loss="soft_l1", f_scale=_HOLE_OUTLIER).x
-    return BorderLaw(*x.tolist())
+    return BorderLaw(*_solve(residuals, [0.5, 1.0, 50.0, 1.0], limits, _HOLE_OUTLIER))
 
 
 class _Limits(NamedTuple):
@@ -436,25 +366,16 @@ class _Limits(NamedTuple):
 
 
 class _MapErrors(NamedTuple):
-    """Parameters of the errors of maps, or of their reported variances.
+    """Parameters of the errors of maps, or of their reported variances."""
 
-    Args:
-        depth: law of the standard deviation of depth.
-        lateral_sigma_px: standard deviation of the lateral shift [px].
-        relief_gain, relief_limit_px: gain, and limit [px of disparity], of the error due to relief
-            (`map_model.relief_error_px`).
-        edge: law of the standard deviation per `map_model.edge_strength`.
-        binned: change of the law for binned images.
-        departures: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its
-            classes of cells, because a class may consist of a few cells at one spot of the floor.
-    """
-
-    depth: DepthLaw
-    lateral_sigma_px: float
-    relief_gain: float
-    relief_limit_px: float
-    edge: SigmaLaw
-    binned: BinnedDepthLaw
+    depth: DepthLaw  #: law of the standard deviation of depth
+    lateral_sigma_px: float  #: standard deviation of the lateral shift [px]
+    relief_gain: float  #: gain of the error due to relief (`map_model.relief_error_px`)
+    relief_limit_px: float  #: limit of this error [px of disparity]
+    edge: SigmaLaw  #: law of the standard deviation per `map_model.edge_strength`
+    binned: BinnedDepthLaw  #: change of the law for binned images
+    #: (n,) logarithm of measured / modelled standard deviation of each survey, the median over its classes of cells,
+    #: because a class may consist of a few cells at one spot of the floor
     departures: np.ndarray
 
     def variance(self, classes: _MapClasses) -> np.ndarray:
@@ -468,41 +389,24 @@ class _MapErrors(NamedTuple):
 
 
 class _MapClasses(NamedTuple):
-    """Variances of maps [m^2] and conditions, of m classes of cells.
+    """Variances of maps [m^2] and conditions, of m classes of cells."""
 
-    Args:
-        images: (m,) variance in the map from images.
-        sampled: (m,) variance in the map sampled from the compared model.
-        pose: (m,) variance due to pose errors alone.
-        depth: (m,) variance that an error of depth of 1 px adds.
-        lateral: (m,) variance that a lateral shift of 1 px adds.
-        edge: (m,) variance that errors near walls add if their gain is 1.
-        views, step_baselines: (m,) mean number of keyframes, and distance between them [stereo baselines].
-        roughness_px: (m,) roughness of the cells [px of disparity].
-        bound_px, window_px: (m,) Cramér-Rao bound of the image, and of the median window [px].
-        lamp_share: (m,) fraction of the reflected light that comes from the lamps.
-        metres_per_px: (m,) height per pixel of disparity.
-        binning: (m,) binning of the images.
-        survey: (m,) number of the survey.
-        weight: (m,) weights of the residuals, with which every survey has the same total weight.
-    """
-
-    images: np.ndarray
-    sampled: np.ndarray
-    pose: np.ndarray
-    depth: np.ndarray
-    lateral: np.ndarray
-    edge: np.ndarray
-    views: np.ndarray
-    step_baselines: np.ndarray
-    roughness_px: np.ndarray
-    bound_px: np.ndarray
-    window_px: np.ndarray
-    lamp_share: np.ndarray
-    metres_per_px: np.ndarray
-    binning: np.ndarray
-    survey: np.ndarray
-    weight: np.ndarray
+    images: np.ndarray  #: (m,) variance in the map from images
+    sampled: np.ndarray  #: (m,) variance in the map sampled from the compared model
+    pose: np.ndarray  #: (m,) variance due to pose errors alone
+    depth: np.ndarray  #: (m,) variance that an error of depth of 1 px adds
+    lateral: np.ndarray  #: (m,) variance that a lateral shift of 1 px adds
+    edge: np.ndarray  #: (m,) variance that errors near walls add if their gain is 1
+    views: np.ndarray  #: (m,) mean number of keyframes
+    step_baselines: np.ndarray  #: (m,) mean distance between keyframes [stereo baselines]
+    roughness_px: np.ndarray  #: (m,) roughness of the cells [px of disparity]
+    bound_px: np.ndarray  #: (m,) Cramér-Rao bound of the image [px]
+    window_px: np.ndarray  #: (m,) Cramér-Rao bound of the median window [px]
+    lamp_share: np.ndarray  #: (m,) fraction of the reflected light that comes from the lamps
+    metres_per_px: np.ndarray  #: (m,) height per pixel of disparity
+    binning: np.ndarray  #: (m,) binning of the images
+    survey: np.ndarray  #: (m,) number of the survey
+    weight: np.ndarray  #: (m,) weights of the residuals, with which every survey has the same total weight
 
     def depth_of(self, law: DepthLaw) -> np.ndarray:
         """Returns the variance (m,) that errors of depth with the given law add [m^2]."""
@@ -515,12 +419,7 @@ class _MapClasses(NamedTuple):
 
 
 def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClasses:
-    """Returns the classes of cells of all surveys, with the quantities of `comparison.MAP_STATISTICS`.
-
-    Args:
-        surveys: statistics of n surveys.
-        quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-    """
+    """Returns the classes of cells of all surveys, with the quantities of `comparison.MAP_STATISTICS`."""
     rows, conditions = [], []
     for number, s in enumerate(surveys):
         classes = [name for name in s if name.startswith(f"map_{quantity}_")]
@@ -539,24 +438,12 @@ def _map_classes(surveys: Sequence[SurveyStatistics], quantity: str) -> _MapClas
 def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compared: ErrorModel) -> _MapErrors:
     """Fits the parameters of the map errors to the variances in the maps from images, in all classes of cells.
 
-    The model variance of a class is that of the map with pose errors alone, plus one term for each of depth
-    (`DepthLaw`), lateral shift, relief within the matching window, and walls. The terms for depth, lateral shift and
-    walls are the variance that a unit error adds to a sampled map, times a fitted factor. The relief error is common to
-    all views of a cell, so the fusion of several tracks does not reduce it, and its variance follows from the height
-    per pixel of disparity. The reported variances of the map with pose errors alone already contain the effects of a
-    lateral shift and of relief.
-
-    The sum is not exact, because the map computes part of its variance from the heights around a cell, and errors of
-    these heights have the effect of relief. The model variance is therefore multiplied by the ratio of the variance in
-    the map sampled from the compared model to the model variance with the compared parameters. Repeated fits converge
-    if each uses the result of the previous fit as the compared model. Residuals are differences of logarithms. The
-    parameters of `_MapErrors.binned` are fitted to the surveys with binned images, after all others have been fitted to
-    the surveys without binning.
-
-    Args:
-        surveys: statistics of n surveys.
-        quantity: "error" for the variances of the height errors, "sigma" for the reported variances.
-        compared: compared error model; its values are the start of the fit and a weak prior of the parameters.
+    The model variance of a class is that of the map with pose errors alone, plus terms for depth, lateral shift and
+    walls (the variance that a unit error adds to a sampled map, times a fitted factor) and for relief, which the
+    fusion of several tracks does not reduce. The sum is not exact, because a map computes part of its variance from the
+    heights around a cell. It is therefore multiplied by the ratio of the variance in the map sampled from the compared
+    model to the model variance with the compared parameters; repeated fits, each compared with the result of the one
+    before, converge. Images without binning determine all parameters but `_MapErrors.binned`.
     """
     is_error = quantity == "error"
     edge_law = compared.edge_error if is_error else SigmaLaw(compared.edge_sigma_gain, 0.0)
@@ -581,7 +468,7 @@ def _fit_map_variances(surveys: Sequence[SurveyStatistics], quantity: str, compa
             prior = _PRIOR * (x - start) / np.maximum(start, typical)
             return np.concatenate([weight * departures(model_of(x), chosen), prior])
 
-        return model_of(least_squares(residuals, start, bounds=(lowest, highest), loss="soft_l1", f_scale=_OUTLIER).x)
+        return model_of(np.array(_solve(residuals, start, (lowest, highest), _OUTLIER)))
 
     def full(x: np.ndarray) -> _MapErrors:
         lateral_px, gain, limit_px = x[7:10].tolist() if is_error else (0.0, 0.0, 1.0)
@@ -612,16 +499,7 @@ def _robust_scatter(departures: np.ndarray) -> float:
 
 
 def _fit_texture_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterLaw) -> ScatterLaw:
-    """Fits the `ScatterLaw` of the reported standard deviation of depth over the cells of a map.
-
-    The scatter of a survey is the median over its classes of level cells. Returns the compared law if no survey has
-    such a class. Residuals much larger than `_OUTLIER` have less weight. Surveys with binned images are included: their
-    bounds and textures are those of the binned images.
-
-    Args:
-        surveys: statistics of n surveys.
-        compared: law of the compared model.
-    """
+    """Fits the `ScatterLaw` of the reported standard deviation of depth over the cells of a map."""
     rows = [
         (np.median(s["bound_px"]), s["texture_scatter"][0], np.median([s[x][0] for x in s if x.startswith(_LEVEL)]))
         for s in surveys
@@ -634,9 +512,7 @@ def _fit_texture_scatter(surveys: Sequence[SurveyStatistics], compared: ScatterL
     def residuals(x: np.ndarray) -> np.ndarray:
         return ScatterLaw(*x)(bounds, textures) - scatters
 
-    limits = [0.0, 1e-3], [20.0, 1.0]
-    x = least_squares(residuals, [2.0, 0.02], bounds=limits, loss="soft_l1", f_scale=_OUTLIER).x
-    return ScatterLaw(*x.tolist())
+    return ScatterLaw(*_solve(residuals, [2.0, 0.02], ([0.0, 1e-3], [20.0, 1.0]), _OUTLIER))
 
 
 def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> float:
@@ -646,10 +522,6 @@ def _fit_error_scatter(surveys: Sequence[SurveyStatistics], compared: float) -> 
     the ratio of the 90th percentile of their absolute values to the median grows in proportion to s^2 for small s. The
     tail of a survey is the median of this logarithm over its classes, minus that of normal errors. Returns the compared
     value if no sampled map has heavier tails than normal errors.
-
-    Args:
-        surveys: statistics of n surveys.
-        compared: value of the compared model.
     """
     tails = [
         np.median([np.log(np.divide(s[name], _NORMAL_TAIL)) for name in s if name.startswith(_LEVEL_TAILS)], axis=0)

@@ -43,7 +43,6 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
     Args:
         surveys: statistics of each survey. The model is fitted to the complete ones (`_is_complete`). Lost surveys
             (`_is_lost`) may remove the upper limit of the range of the Cramér-Rao bound.
-        compared: error model of the surrogate with which the surveys were compared.
 
     Raises:
         TwinError: fewer than two surveys have complete statistics.
@@ -66,15 +65,7 @@ def comparison_model(model: ErrorModel) -> ErrorModel:
 
 
 def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveyStatistics]) -> dict[str, Range]:
-    """Returns the smallest and the largest value of each condition in the complete surveys, by name of `QUANTITIES`.
-
-    If a lost survey has a larger Cramér-Rao bound than these, the bound has no upper limit, because surveys with even
-    larger bounds would be lost as well. Conditions without a value are left out.
-
-    Args:
-        complete: surveys to which the model is fitted.
-        lost: surveys that are lost (`_is_lost`).
-    """
+    """Returns the smallest and the largest value of each condition in the complete surveys, by name of `QUANTITIES`."""
     values = {name: [x for s in complete for x in s.get(_CONDITION + name, ())] for name in QUANTITIES}
     ranges = {name: (min(found), max(found)) for name, found in values.items() if found}
     lost_px = [x for s in lost for x in s.get(_CONDITION + _BOUND, ())]
@@ -84,20 +75,13 @@ def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveySta
 
 
 def _is_complete(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey has links and a map, is not lost, and has the same binning as the surrogate.
-
-    The fraction of cells with a height shows that there is a map: statistics of height errors may be missing, because a
-    map of rough ground may have no level cells.
-    """
+    """Returns whether a survey has links and a map, is not lost, and has the same binning as the surrogate."""
     has_both = "consecutive_product_images" in statistics and "hole_known" in statistics
     return has_both and _binned_alike(statistics) and not _is_lost(statistics)
 
 
 def _is_lost(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey lost more than 20 % of its frames or of its links.
-
-    The remaining links of such a survey mostly have gross errors.
-    """
+    """Returns whether a survey lost more than 20 % of its frames or of its links."""
     return any(float(np.mean(statistics.get(name, 0.0))) > _MAX_LOST for name in ("frame_lost", "link_failed_images"))
 
 
@@ -110,13 +94,7 @@ def _binned_alike(statistics: SurveyStatistics) -> bool:
 def all_statistics(
     surveys: Sequence[tuple[Scenario, Path]], compared: ErrorModel, jobs: int = 1
 ) -> Iterator[SurveyStatistics]:
-    """Yields the statistics of rendered surveys, in the order of the surveys; see `survey_statistics`.
-
-    Args:
-        surveys: description and run folder of each survey.
-        compared: error model of the surrogate to compare with.
-        jobs: number of processes; 1: the surveys are flown in this process.
-    """
+    """Yields the statistics of rendered surveys, in the order of the surveys; see `survey_statistics`."""
     scenarios, folders = [scenario for scenario, _ in surveys], [folder for _, folder in surveys]
     one = partial(survey_statistics, compared=compared)
     if jobs == 1:
@@ -131,11 +109,6 @@ def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) ->
 
     Reads them from the folder if they were saved there for the same scenario and error model, else flies the survey. A
     survey whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown, and has no statistics.
-
-    Args:
-        scenario: description of the survey.
-        folder: run folder of the survey.
-        compared: error model of the surrogate to compare with.
 
     Raises:
         ScenarioError: the survey cannot be flown.
@@ -154,10 +127,7 @@ def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStati
 
 
 def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted.
-
-    A survey whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown; its statistics are empty and not saved.
-    """
+    """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted."""
     mission, stopwatch = prepare(scenario), Stopwatch()
     matchability = Matchability(scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
     conditions = survey_conditions(mission, matchability)

@@ -76,6 +76,8 @@ def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
         return np.zeros((0, 0, 0, 3))
     margin = MARGIN if water.multiple else 0
     grid = grid_of(lamps.sources.beam)
+    if water.multiple and not len(lamps.sources.beam):
+        return np.zeros((*grid, RANGES + 1, 3))
     down_px, across_px = (_grid_px(n, size, margin) for n, size in zip(grid, _size(rig), strict=True))
     rows, cols = len(down_px), len(across_px)
     ray = _rays(rig, down_px, across_px)

@@ -40,18 +40,13 @@ class TaskLimits(NamedTuple):
 
 
 class Reply(NamedTuple):
-    """Reply of a worker to one task.
+    """Reply of a worker to one task."""
 
-    Args:
-        kind: "done" if the function returned a value; "raised" if it raised an exception; "timeout" if it ran too long;
-            "killed" if the process ended or was killed.
-        value: the returned value, for the kind "done".
-        reason: why there is no value; "" for the kind "done".
-    """
-
+    #: "done" if the function returned a value; "raised" if it raised an exception; "timeout" if it ran too long;
+    #: "killed" if the process ended or was killed
     kind: Literal["done", "raised", "timeout", "killed"]
-    value: Any = None
-    reason: str = ""
+    value: Any = None  #: the returned value, for the kind "done"
+    reason: str = ""  #: why there is no value; "" for the kind "done"
 
 
 class Worker:
@@ -62,7 +57,7 @@ class Worker:
         self._pipe, child_end = multiprocessing.Pipe()
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as the process)
         self._process = subprocess.Popen(
-            [sys.executable, "-P", "-c", f"from twin.studies import worker; worker.main({child_end.fileno()}, {core})"],
+            [sys.executable, "-P", "-c", f"from twin.engines import worker; worker.main({child_end.fileno()}, {core})"],
             env=os.environ | SINGLE_THREADED | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
             pass_fds=[child_end.fileno()],
             stdin=subprocess.DEVNULL,
@@ -98,10 +93,7 @@ class Worker:
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns how the process ended (signal or exit status), and a line of its output if there is any.
-
-        The line is the last one before the first blank line.
-        """
+        """Returns how the process ended (signal or exit status), and a line of its output if there is any."""
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)
@@ -178,7 +170,6 @@ def main(pipe: int, core: int | None) -> None:
     """Main loop of the worker process: answers each pickled (function, task) with a `Reply`, until the pipe closes.
 
     Args:
-        pipe: file descriptor of the worker's end of the pipe.
         core: CPU core to which the process is pinned; None: not pinned.
     """
     if core is not None:
@@ -202,11 +193,7 @@ def _run_request(request: bytes) -> bytes:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """Ends this process within about a second after its parent process has ended.
-
-    Args:
-        parent: process identifier of the parent.
-    """
+    """Ends this process within about a second after its parent process has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)

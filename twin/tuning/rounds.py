@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from twin.scenario.model import Scenario
-from twin.studies.candidates import (
+from twin.studies.flight import Row
+from twin.studies.results_log import ResultsLog, write_parquet
+from twin.studies.runner import Fleet, open_folder
+from twin.studies.study_file import Study, TuningConfig
+from twin.tuning.candidates import (
     Candidate,
     CandidateSurveys,
     check_bounds,
@@ -18,43 +22,28 @@ from twin.studies.candidates import (
     pareto_front,
     tuning_config,
 )
-from twin.studies.correction import PlanCorrection, correction_at
-from twin.studies.engine import Engine
-from twin.studies.flight import Row, fly
-from twin.studies.progress import StudyProgress
-from twin.studies.results_log import ResultsLog, write_parquet
-from twin.studies.runner import fly_surveys, open_folder
-from twin.studies.search import Search
-from twin.studies.study_file import Study, TuningConfig
-from twin.studies.surveys import Survey
-from twin.studies.verification import Verification, expected_time, verification_of
+from twin.tuning.correction import PlanCorrection, correction_at
+from twin.tuning.search import Search
+from twin.tuning.verification import Verification, expected_time, verification_of
 
 
 class TuningResult(NamedTuple):
-    """Result of a search.
+    """Result of a search."""
 
-    Args:
-        candidates: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if
-            any were flown.
-        finalists: plans that were evaluated again with new samples and seeds, without correction.
-        verifications: plans that were verified by rendered surveys, in the order of flight.
-        recommended: the cheapest plan whose rendered surveys all passed or, if plans are not verified, the cheapest
-            plan confirmed with new samples and seeds; None if there is none or the search was interrupted.
-        scenario: scenario of the recommended plan; None if there is none.
-        interrupted: whether Ctrl-C ended the search.
-        needs_rendering: whether the search used the surrogate, so its results need to be verified by rendered surveys.
-        warnings: for each warning, the number of the finalists' surveys with new seeds that have it.
-        refused: for each reason, the number of plans whose surveys were all refused in the search.
-    """
-
+    #: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if any were
+    #: flown
     candidates: list[Candidate]
-    finalists: list[Candidate]
-    verifications: list[Verification]
+    finalists: list[Candidate]  #: plans that were evaluated again with new samples and seeds, without correction
+    verifications: list[Verification]  #: plans that were verified by rendered surveys, in the order of flight
+    #: the cheapest plan whose rendered surveys all passed or, if plans are not verified, the cheapest plan confirmed
+    #: with new samples and seeds; None if there is none or the search was interrupted
     recommended: Candidate | None
-    scenario: Scenario | None
-    interrupted: bool
+    scenario: Scenario | None  #: scenario of the recommended plan; None if there is none
+    interrupted: bool  #: whether Ctrl-C ended the search
+    #: whether the search used the surrogate, so its results need to be verified by rendered surveys
     needs_rendering: bool
-    warnings: dict[str, int]
+    warnings: dict[str, int]  #: for each warning, the number of the finalists' surveys with new seeds that have it
+    #: for each reason, the number of plans whose surveys were all refused in the search
     refused: Mapping[str, int] = MappingProxyType({})
 
     @property
@@ -64,60 +53,11 @@ class TuningResult(NamedTuple):
         return next((v for v in self.verifications if chosen and v.surrogate.number == chosen.number), None)
 
 
-class TuningFlights(NamedTuple):
-    """Runs the surveys of a search and logs their results.
-
-    Args:
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey.
-        log: log of the results.
-    """
-
-    engine: Engine
-    progress: StudyProgress
-    function: Callable[[Survey], Row]
-    log: ResultsLog
-
-    def fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
-        """Flies those surveys of the given plans that have no result yet.
-
-        Args:
-            surveys: the surveys of all plans; the new results are added to them.
-            plans: values of the searched keys, by number of the plan.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
-            TwinError: the engine lost its connection.
-        """
-
-        def add_row(row: Row) -> None:
-            self.log.add(row)
-            surveys.add(row)
-
-        missing = list(surveys.missing(plans))
-        self.progress.begin(self.progress.total + len(missing))
-        if missing and not fly_surveys(surveys.study, missing, add_row, self.engine, self.progress, self.function):
-            raise KeyboardInterrupt
-
-
-def tune(
-    study: Study,
-    folder: Path,
-    resume: bool,
-    engine: Engine,
-    progress: StudyProgress,
-    function: Callable[[Survey], Row] = fly,
-) -> TuningResult:
+def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult:
     """Searches for the best plan as specified in `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
     Args:
-        study: the study.
-        folder: results folder, new or empty unless `resume` is set.
         resume: continue the search whose results are in the folder; surveys with a result are not flown again.
-        engine: runs the surveys in parallel.
-        progress: display of the progress.
-        function: flies one survey; must be importable by name on the workers.
 
     Raises:
         TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, is written by
@@ -126,11 +66,10 @@ def tune(
         ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
         OSError: the results cannot be written.
     """
-    config = tuning_config(study)
+    config, interrupted = tuning_config(study), False
     check_bounds(study, config)
     with open_folder(folder, resume, search=True) as log:
-        tuning = Tuning(study, config, folder, TuningFlights(engine, progress, function, log))
-        interrupted = False
+        tuning = Tuning(study, config, folder, fleet, log)
         try:
             tuning.run()
         except KeyboardInterrupt:
@@ -143,11 +82,11 @@ def tune(
 class Tuning:
     """State of a search: the evaluated plans, the finalists (evaluated again with new seeds), and the verifications."""
 
-    def __init__(self, study: Study, config: TuningConfig, folder: Path, flights: TuningFlights):
-        self.study, self.config, self.folder, self.flights = study, config, folder, flights
-        self.trials = CandidateSurveys(study, config, folder, flights.log.rows())
-        self.confirmation = self.trials.confirmation(flights.log.rows())
-        self.rendered = self.trials.rendered(flights.log.rows())
+    def __init__(self, study: Study, config: TuningConfig, folder: Path, fleet: Fleet, log: ResultsLog):
+        self.study, self.config, self.folder, self.fleet, self.log = study, config, folder, fleet, log
+        self.trials = CandidateSurveys(study, config, folder, log.rows())
+        self.confirmation = self.trials.confirmation(log.rows())
+        self.rendered = self.trials.rendered(log.rows())
         self.needs_rendering = self.trials.uses_surrogate
         self.plans: dict[int, dict[str, Any]] = {}
         self.finalists: dict[int, Candidate] = {}
@@ -204,13 +143,29 @@ class Tuning:
             self.trials.refusals(self.plans),
         )
 
+    def _fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
+        """Flies those surveys of the given plans that have no result yet.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
+        """
+
+        def add_row(row: Row) -> None:
+            self.log.add(row)
+            surveys.add(row)
+
+        missing, progress = list(surveys.missing(plans)), self.fleet.progress
+        progress.begin(progress.total + len(missing))
+        if missing and not self.fleet.fly(surveys.study, missing, add_row):
+            raise KeyboardInterrupt
+
     def _search(self, search_round: int) -> None:
         """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
         search = Search(self.study, self.config, self.folder, self.trials.fingerprint, search_round)
         if search_round:
             search.add_earlier_candidates((c.values, c.objectives, c.shortfall) for c in self._candidates())
         while batch := search.next_batch():
-            self.flights.fly(self.trials, {proposal.number: proposal.values for proposal in batch})
+            self._fly(self.trials, {proposal.number: proposal.values for proposal in batch})
             for proposal in batch:
                 candidate = self._evaluate(self.trials, proposal.number, proposal.values)
                 search.record(proposal, candidate.objectives, candidate.shortfall)
@@ -219,9 +174,7 @@ class Tuning:
     def _verify_front(self, search_round: int) -> None:
         """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
 
-        Repeats this until the cheapest confirmed plan is one that has passed verification, until no plan is confirmed,
-        or until `config.plans` plans were verified. If plans are not to be verified, only determines the cheapest
-        confirmed plan.
+        Repeats this until that plan has passed before, none is confirmed, or `config.plans` plans were verified.
         """
         for k in range(self.config.plans):
             self.confirmed = chosen = self._cheapest_confirmed()
@@ -230,10 +183,7 @@ class Tuning:
             self._verify(chosen, (self.config.rounds - search_round + 2) * self.config.plans - k, search_round)
 
     def _verify_cheaper(self, search_round: int) -> None:
-        """Verifies plans cheaper than the recommended one, until one does not pass or `config.plans` were verified.
-
-        The surrogate may be pessimistic, so a plan that it rejects can still pass.
-        """
+        """Verifies plans cheaper than the recommended one, until one does not pass or `config.plans` were verified."""
         for k in range(self.config.plans if self.is_verifying else 0):
             if (cheaper := self._next_cheaper()) is None:
                 return
@@ -243,12 +193,10 @@ class Tuning:
                 return
 
     def _next_cheaper(self) -> Candidate | None:
-        """Returns the next plan to verify that is cheaper than the recommended one.
+        """Returns the next plan to verify that is cheaper than the recommended one; None if there is none.
 
-        The costs of all plans, including the recommended one, are the corrected results of the search. The candidates
-        are the plans cheaper than the recommended one that no other cheaper plan dominates. Of those that are not
-        verified, the one with the smallest shortfall of the pass probability is returned; of several with the same
-        shortfall, the most expensive one. Returns None if no plan is recommended, or if all candidates are verified.
+        The costs of all plans are the corrected results of the search. Of the cheaper plans that no other dominates and
+        that are not verified, it has the smallest shortfall of the pass probability and, of those, the highest cost.
         """
         if self.recommended is None:
             return None
@@ -260,36 +208,24 @@ class Tuning:
         return min(front, key=lambda one: (one.shortfall, -one.objectives[cost] * sign[cost]), default=None)
 
     def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
-        """Flies the rendered surveys of a plan and compares them with its surrogate surveys.
-
-        Args:
-            plan: the plan; it is one of the finalists.
-            most_plans: largest number of plans still to be verified in the search, including this one.
-            search_round: round of the search, from 0.
-        """
+        """Flies the rendered surveys of a plan and compares them with its surrogate surveys."""
         self._announce(plan, most_plans)
-        self.flights.fly(self.rendered, {plan.number: plan.values})
+        self._fly(self.rendered, {plan.number: plan.values})
         surrogate = self.finalists[plan.number]
         verification = verification_of(self.rendered, self.confirmation, surrogate, search_round)
         self.verifications[plan.number] = verification
-        self.flights.progress.print_line(verification.notice())
+        self.fleet.progress.print_line(verification.notice())
 
     def _announce(self, plan: Candidate, most_plans: int) -> None:
-        """Prints how many rendered surveys of a plan are to be flown, and their expected run time; nothing if none are.
-
-        Args:
-            plan: the plan.
-            most_plans: largest number of plans still to be verified in the search, including this one.
-        """
+        """Prints the number and the expected run time of a plan's rendered surveys that are to be flown, if any."""
         if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
-            times = expected_time(self.trials, self.rendered, plan, self.flights.log.rows())
-            self.flights.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
+            times = expected_time(self.trials, self.rendered, plan, self.log.rows())
+            self.fleet.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
 
     def _cheapest_confirmed(self) -> Candidate | None:
         """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
 
-        Bisects the front, because a more expensive plan usually has a higher pass probability, and flies the surveys
-        that this requires. Returns None if no plan evaluated in the bisection reaches the required pass probability.
+        Bisects the front, because a more expensive plan usually has a higher pass probability. None if none is found.
         """
         front, found = pareto_front(self._candidates(), self.config), None
         first, end = 0, len(front)
@@ -305,7 +241,7 @@ class Tuning:
     def _confirm(self, plan: Candidate) -> Candidate:
         """Flies a plan with new samples and seeds, adds it to the finalists, and returns its corrected evaluation."""
         number, values = plan.number, plan.values
-        self.flights.fly(self.confirmation, {number: values})
+        self._fly(self.confirmation, {number: values})
         self.finalists[number] = self.confirmation.evaluate(number, values)
         return self._evaluate(self.confirmation, number, values)
 
@@ -314,10 +250,7 @@ class Tuning:
         return [self._evaluate(self.trials, number, values) for number, values in self.plans.items()]
 
     def _evaluate(self, surveys: CandidateSurveys, number: int, values: dict[str, Any]) -> Candidate:
-        """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans.
-
-        If the plan itself was verified by rendered surveys, these alone determine whether it is feasible.
-        """
+        """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans."""
         candidate = surveys.evaluate(number, values, self._correction(values))
         if (verification := self.verifications.get(number)) is None:
             return candidate

@@ -40,10 +40,7 @@ class Search:
         """Starts a search, or continues the search stored in the folder.
 
         Args:
-            study: the study.
             config: section [tune] of the study.
-            folder: results folder.
-            fingerprint: hash of the scenario (`CandidateSurveys.fingerprint`).
             search_round: round of the search, from 0; a further round begins with the candidates given to
                 `add_earlier_candidates`.
 
@@ -117,8 +114,6 @@ class Search:
         """Records the evaluation of a candidate.
 
         Args:
-            proposal: the candidate.
-            objectives: value of each objective.
             shortfall: required minus achieved pass probability; 0 or negative if the candidate is feasible.
         """
         proposal.trial.set_constraint("shortfall", shortfall)

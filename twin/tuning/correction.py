@@ -64,11 +64,6 @@ def correction_at(
     flown plans. The pass factor is the same mean of the fractions of completed surveys, with a prior value of 1.
     The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d and the kernel width w = 0.15; the prior has the
     weight of a plan at the distance 2 w. Without a flown plan, the correction is `NO_CORRECTION`.
-
-    Args:
-        search: distribution of each searched key.
-        flown: plans with both rendered and surrogate surveys.
-        values: searched values of the plan to correct.
     """
     if not flown:
         return NO_CORRECTION
@@ -89,11 +84,7 @@ def plan_distance(search: dict[str, Distribution], one: dict[str, Any], other: d
 
 
 def _difference(distribution: Distribution, one: Any, other: Any) -> float:
-    """Returns the absolute difference of two values as a fraction of the searched range.
-
-    The difference is that of the logarithms for a log-uniform distribution, and that of the ranks for a choice of
-    numbers. For any other choice, returns 0 if the values are equal, otherwise 1.
-    """
+    """Returns the absolute difference of two values as a fraction of the searched range."""
     values = distribution.values
     if distribution.kind == "choice":
         if not all(isinstance(value, int | float) for value in values):

@@ -7,6 +7,7 @@ with new samples and seeds. The plans to be verified are then flown as rendered 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +20,21 @@ from twin.judge.require import meets_limit, more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies.analysis import count_similar
-from twin.studies.correction import NO_CORRECTION, PlanCorrection
-from twin.studies.design import Sample, axis_names, samples, seeds_of_sample
 from twin.studies.flight import Row, has_passed, refused_row
 from twin.studies.statistics import Interval, wilson_interval
 from twin.studies.study_file import Study, TuningConfig
-from twin.studies.surveys import Survey, merge_errors, refusals, scenario_of_sample, surveys_of_sample
+from twin.studies.surveys import (
+    Sample,
+    Survey,
+    axis_names,
+    merge_errors,
+    refusals,
+    samples,
+    scenario_of_sample,
+    seeds_of_sample,
+    surveys_of_sample,
+)
+from twin.tuning.correction import NO_CORRECTION, PlanCorrection
 
 _DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not set one
 _POWER_OF_2 = ("sobol", "saltelli")  # designs that need a power of 2 as number of samples
@@ -121,9 +131,6 @@ class CandidateSurveys:
         floors. The designs "sobol" and "saltelli" need a power of 2 as number of samples; for another number, the
         samples are those of "lhs". Without sampled keys, or with the design "grid", the samples stay the same, with
         `tune.confirm` times as many seeds.
-
-        Args:
-            rows: rows of the surveys flown so far.
         """
         sampling = self.study.sampling
         n_axes = len(axis_names(self.study))
@@ -141,9 +148,6 @@ class CandidateSurveys:
 
         Each design point is combined with every cell of the grids. Without a number of samples in the study, i.e. with
         the design "grid" or without sampled keys, each cell has `tune.verify` seeds instead.
-
-        Args:
-            rows: rows of the surveys flown so far.
         """
         sampling, config = self.study.sampling, self.config
         update: dict[str, Any] = {"seed": sampling.seed + _RENDER_SEEDS, "paired": False, "seeds": 1}
@@ -182,10 +186,7 @@ class CandidateSurveys:
         self._scores[row["sample"], row["seed"]] = score
 
     def _is_done(self, survey: Survey) -> bool:
-        """Returns whether the survey has a result with its scenario hash.
-
-        A result with another hash or with the status "failed" does not count.
-        """
+        """Returns whether the survey has a result with its scenario hash."""
         score = self._scores.get(survey.key)
         return score is not None and score.status != "failed" and score.scenario_hash == survey.scenario_hash
 
@@ -195,12 +196,7 @@ class CandidateSurveys:
             yield Sample(number * self._n_samples + condition.number, condition.point, values | condition.values)
 
     def surveys(self, number: int, values: dict[str, Any]) -> Iterator[Survey | Row]:
-        """Yields the surveys of a candidate; for a survey whose scenario is not valid, the row of a refused survey.
-
-        Args:
-            number: trial number of the candidate.
-            values: value of each searched key.
-        """
+        """Yields the surveys of a candidate; for a survey whose scenario is not valid, the row of a refused survey."""
         for sample in self._samples(number, values):
             try:
                 scenario = scenario_of_sample(self.study, self.base, sample)
@@ -214,17 +210,13 @@ class CandidateSurveys:
         """Yields the surveys of the candidates that have not been flown with the present scenario or have failed.
 
         A survey whose scenario is not valid is not yielded, but recorded as refused.
-
-        Args:
-            candidates: values of the searched keys of each candidate, by its trial number.
         """
         for number, values in candidates.items():
             for survey in self.surveys(number, values):
-                if isinstance(survey, Survey):
-                    if not self._is_done(survey):
-                        yield survey
-                else:
+                if not isinstance(survey, Survey):
                     self.add(survey)
+                elif not self._is_done(survey):
+                    yield survey
 
     def scores(self, number: int, values: dict[str, Any]) -> list[SurveyScore]:
         """Returns the results of a candidate's surveys that were flown or refused.
@@ -257,9 +249,6 @@ class CandidateSurveys:
         """Returns {reason: number of plans whose surveys were all refused for it}, the most frequent first.
 
         The reason of a plan is that of its first survey; reasons that differ only in numbers count as one.
-
-        Args:
-            plans: values of the searched keys, by number of the plan.
         """
         reasons = []
         for number, values in plans.items():
@@ -275,8 +264,6 @@ class CandidateSurveys:
         probability counts it as one that passes. A failed survey is not counted.
 
         Args:
-            number: trial number of the candidate.
-            values: value of each searched key.
             correction: expected ratios of the results of rendered surveys to those of these surveys; by default all
                 are 1.
         """
@@ -304,11 +291,7 @@ class CandidateSurveys:
         return score.status == "complete" and all(met)
 
     def _objective(self, name: str, scores: list[SurveyScore], correction: PlanCorrection) -> float:
-        """Returns the corrected median of a metric over the completed surveys.
-
-        If the median is missing or not finite, returns 1e9, or -1e9 if larger values of the metric are better. For
-        "risk", returns 1, its value without any survey.
-        """
+        """Returns the corrected median of a metric over the completed surveys."""
         if name == "risk":
             return 1.0
         value = correction.apply(name, median_of(scores, name))
@@ -357,18 +340,11 @@ def check_bounds(study: Study, config: TuningConfig) -> None:
 
 
 def _first_valid_sample(study: Study, base: Mapping[str, Any]) -> Sample:
-    """Returns the first sample whose scenario is valid with the original plan; if none is, the first sample.
-
-    Args:
-        study: the study.
-        base: contents of the study's scenario file.
-    """
+    """Returns the first sample whose scenario is valid with the original plan; if none is, the first sample."""
     for sample in samples(study):
-        try:
+        with suppress(ScenarioError):
             scenario_of_sample(study, base, sample)
-        except ScenarioError:
-            continue
-        return sample
+            return sample
     return next(samples(study))
 
 

@@ -20,11 +20,11 @@ from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent, plain
 from twin.scenario.file import dump_toml
 from twin.studies import wording
-from twin.studies.candidates import Candidate, pareto_front, required_probability
 from twin.studies.figures import axis_label, make_panels, spans_decades, unit_axis
 from twin.studies.study_file import Study, TuningConfig
-from twin.studies.tuning import TuningResult
-from twin.studies.verification import Verification
+from twin.tuning.candidates import Candidate, pareto_front, required_probability
+from twin.tuning.rounds import TuningResult
+from twin.tuning.verification import Verification
 
 NOT_VERIFIED = (
     "Not verified: the plan has no rendered surveys (verify = 0), and the surrogate's prediction may not hold."
@@ -56,7 +56,7 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
         "text": read_text(study.source.path),
         "version": version("seabed-twin"),
     }
-    (folder / "tuning.html").write_text(render_page("twin.studies", "tuning.html.j2", page), encoding="utf-8")
+    (folder / "tuning.html").write_text(render_page("twin.tuning", "tuning.html.j2", page), encoding="utf-8")
     if page["recommended"]:
         (folder / "recommended.toml").write_text(page["recommended"], encoding="utf-8")
 
@@ -94,13 +94,7 @@ def _metric(name: str, value: float | None) -> str:
 
 
 def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
-    """Returns the reason why no plan is recommended, as text that follows a colon.
-
-    Args:
-        study: the study.
-        result: result of the search.
-        count: phrase with the number of evaluated plans.
-    """
+    """Returns the reason why no plan is recommended, as text that follows a colon."""
     if result.interrupted:
         return f"{count}, and the search was interrupted before a plan was confirmed."
     if result.verifications:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from twin.studies.candidates import Candidate, CandidateSurveys, median_of
-from twin.studies.correction import PlanRatio, metric_ratio
 from twin.studies.flight import Row
+from twin.tuning.candidates import Candidate, CandidateSurveys, median_of
+from twin.tuning.correction import PlanRatio, metric_ratio
 
 # Run time of a rendered frame on one CPU core of 2025: 0.023 s for 320 x 240 pixels, 0.07 s for 640 x 480 pixels.
 _FRAME_S = 0.008  # part that does not depend on the image size [s]
@@ -15,29 +15,19 @@ _MEGAPIXEL_S = 0.2  # part per megapixel of one camera's image [s]
 
 
 class Verification(NamedTuple):
-    """Comparison of a plan's rendered surveys with its surrogate surveys.
+    """Comparison of a plan's rendered surveys with its surrogate surveys."""
 
-    Args:
-        surrogate: the plan, evaluated by surrogate surveys with new seeds.
-        rendered: the plan, evaluated by its rendered surveys.
-        surveys: number of rendered surveys required.
-        n_passed: number of rendered surveys that were completed and met every requirement.
-        n_failed: number of rendered surveys without a result, because the computer or the program failed.
-        medians: for each metric, the median (surrogate, rendered); None if no survey has a value.
-        ratio: ratio rendered / surrogate of each median, and the fraction of the rendered surveys that were completed.
-        search_round: round of the search, from 0.
-        warnings: for each warning, the number of rendered surveys that have it.
-    """
-
-    surrogate: Candidate
-    rendered: Candidate
-    surveys: int
-    n_passed: int
-    n_failed: int
+    surrogate: Candidate  #: the plan, evaluated by surrogate surveys with new seeds
+    rendered: Candidate  #: the plan, evaluated by its rendered surveys
+    surveys: int  #: number of rendered surveys required
+    n_passed: int  #: number of rendered surveys that were completed and met every requirement
+    n_failed: int  #: number of rendered surveys without a result, because the computer or the program failed
+    #: for each metric, the median (surrogate, rendered); None if no survey has a value
     medians: dict[str, tuple[float | None, float | None]]
+    #: ratio rendered / surrogate of each median, and the fraction of the rendered surveys that were completed
     ratio: PlanRatio
-    search_round: int
-    warnings: dict[str, int]
+    search_round: int  #: round of the search, from 0
+    warnings: dict[str, int]  #: for each warning, the number of rendered surveys that have it
 
     @property
     def passed(self) -> bool:
@@ -53,14 +43,7 @@ class Verification(NamedTuple):
 def verification_of(
     rendered: CandidateSurveys, confirmation: CandidateSurveys, surrogate: Candidate, search_round: int
 ) -> Verification:
-    """Returns the verification of a plan whose rendered surveys have been flown.
-
-    Args:
-        rendered: rendered surveys of the candidates.
-        confirmation: surrogate surveys with new seeds, which confirm plans.
-        surrogate: the plan, evaluated by `confirmation`.
-        search_round: round of the search, from 0.
-    """
+    """Returns the verification of a plan whose rendered surveys have been flown."""
     number, values = surrogate.number, surrogate.values
     scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
     medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
@@ -85,24 +68,14 @@ def verification_of(
 
 
 class ExpectedTime(NamedTuple):
-    """Expected run time of one rendered survey on one CPU core.
+    """Expected run time of one rendered survey on one CPU core."""
 
-    Args:
-        survey_s: run time [s].
-        measured: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate.
-    """
-
-    survey_s: float
+    survey_s: float  #: run time [s]
+    #: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate
     measured: bool
 
     def notice(self, number: int, surveys: int, most_surveys: int) -> str:
-        """Returns a line that announces rendered surveys of a plan with their expected run time.
-
-        Args:
-            number: number of the plan.
-            surveys: number of surveys to fly for this plan.
-            most_surveys: largest number of rendered surveys until the end of the search, including these.
-        """
+        """Returns a line that announces rendered surveys of a plan with their expected run time."""
         source = "as measured" if self.measured else "a rough estimate"
         return (
             f"Flying plan {number} rendered: {surveys} surveys of about {duration(self.survey_s)} on one core each "
@@ -119,12 +92,6 @@ def expected_time(
     It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second. The
     run time per simulated second is measured in the rendered surveys flown so far; before the first one, it is
     estimated from the frame rate and the image size.
-
-    Args:
-        trials: surrogate surveys of the candidates.
-        rendered: rendered surveys of the candidates.
-        plan: the plan.
-        rows: rows of all surveys flown so far.
     """
     run_s = simulated_s = longest = 0.0
     own = set(trials.keys(plan.number, plan.values))

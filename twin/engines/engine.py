@@ -1,4 +1,4 @@
-"""Execution engine that runs tasks in worker processes on this machine."""
+"""Engines that run many tasks in parallel: their interface, and the engine of this machine."""
 
 from __future__ import annotations
 
@@ -6,10 +6,39 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import islice
-from typing import Any
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 
-from twin.studies.engine import Outcome, Result, Task
-from twin.studies.worker import TaskLimits, WorkerPool
+from twin.engines.worker import TaskLimits, WorkerPool
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+class Outcome(NamedTuple, Generic[Task, Result]):
+    """Outcome of one task."""
+
+    task: Task  #: the task
+    result: Result | None  #: result of the function; None if the task failed
+    failure: str  #: reason of the failure; "" if the task did not fail
+    attempts: int  #: number of attempts
+
+
+class Engine(Protocol):
+    """Runs a function on many tasks in parallel."""
+
+    def run_many(
+        self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
+    ) -> Iterator[Outcome[Task, Result]]:
+        """Runs `function` on every task and yields the outcomes in order of completion.
+
+        A task fails if it raises an exception, runs longer than `limits.timeout_s`, or loses its process more than
+        `limits.retries` times. A failed task does not affect the others.
+
+        Args:
+            function: function of one task. The workers must be able to import it by name, as well as the classes of
+                the tasks and results.
+        """
+        ...
 
 
 class LocalEngine:

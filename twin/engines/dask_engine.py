@@ -12,9 +12,9 @@ from typing import Any
 import dask.config
 from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
 
+from twin.engines.engine import Outcome, Result, Task
+from twin.engines.worker import Reply, TaskLimits, WorkerPool, describe_exception
 from twin.errors import TwinError
-from twin.studies.engine import Outcome, Result, Task
-from twin.studies.worker import Reply, TaskLimits, WorkerPool, describe_exception
 
 _CONNECT_TIMEOUT_S = 20
 _QUEUED_PER_THREAD = 8  # keeps every worker busy without submitting all tasks (up to 100,000) at once
@@ -52,16 +52,7 @@ def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
 
 
 def _slurm_cluster(jobs: int) -> Any:
-    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration.
-
-    Where they give no cores or no memory, a job has one core or 4 GB.
-
-    Args:
-        jobs: number of SLURM jobs.
-
-    Raises:
-        TwinError: dask-jobqueue is not installed.
-    """
+    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration."""
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError:

@@ -1,0 +1,1 @@
+"""Search for a survey plan with the surrogate, verified by rendered surveys."""
