@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.light import water_tables
-from twin.imaging.light.bands import CENTRE_NM, NM, WIDTH_NM, band_weights, effective_per_m, sensitivity
+from twin.imaging.light import spectra
 from twin.imaging.light.illumination import illumination_of
-from twin.imaging.light.light_spectra import LED_B5, spectrum_of
+from twin.imaging.light.spectra import (
+    CENTRE_NM,
+    LED_B5,
+    NM,
+    WIDTH_NM,
+    band_weights,
+    effective_per_m,
+    provenance_of,
+    sensitivity,
+    spectrum_of,
+    water_spectrum,
+)
 from twin.imaging.light.water import Medium, downwelling_per_m, medium
-from twin.imaging.light.water_tables import provenance_of, water_spectrum
 from twin.scenario.file import load_scenario
 from twin.scenario.model import WaterConfig
 from twin.scenario.water_sources import WATER_SOURCES
@@ -76,7 +85,7 @@ def test_missing_absorption_lies_between_neighbouring_types_and_near_the_other_s
 def test_the_rule_for_missing_absorption_predicts_the_printed_values_of_3c():
     nm = np.arange(575.0, 651.0, 25.0)
     printed, clearer, murkier = (jerlov.water(name, source="solonenko2015").a(nm) for name in ("3C", "1C", "7C"))
-    predicted = water_tables._filled(np.where(nm > 575.0, np.nan, printed), clearer, murkier)
+    predicted = spectra._filled(np.where(nm > 575.0, np.nan, printed), clearer, murkier)
     np.testing.assert_allclose(predicted, printed, rtol=0.005)
 
 
@@ -188,7 +197,7 @@ def test_a_type_that_the_source_does_not_have_is_rejected_when_the_scenario_is_l
 
 def test_the_tables_load_without_data_frames_and_colour_libraries():
     code = (
-        "import sys; from twin.imaging.light.water_tables import water_spectrum; water_spectrum('II'); "
+        "import sys; from twin.imaging.light.spectra import water_spectrum; water_spectrum('II'); "
         "sys.exit(bool({'pandas', 'colour', 'matplotlib'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

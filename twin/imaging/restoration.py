@@ -57,13 +57,7 @@ class Restoration:
     """Restoration of the images of the left camera of a survey.
 
     Args:
-        scenario: believed lamps and sensor, and whether the floor casts shadows (`imaging.shadows`).
-        illumination: believed water and daylight.
-        rig: believed calibration.
         elevation: estimated map, with at least one height.
-
-    Raises:
-        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(self, scenario: Scenario, illumination: Illumination, rig: StereoRig, elevation: ElevationMap):
@@ -90,7 +84,6 @@ class Restoration:
 
         Args:
             image: (H, W, 3) uint8 left image.
-            exposure: exposure of the image (`Frame.exposure`).
             map_from_camera: (4, 4) pose of the camera in the axes of the estimated map.
 
         Raises:

@@ -45,19 +45,12 @@ BLOCK = 512  # number of particles whose positions are computed at a time
 
 
 class VisibleParticles(NamedTuple):
-    """Particles in view of a camera.
+    """Particles in view of a camera."""
 
-    Args:
-        pixel: (n, 2) column and row [px].
-        points_m: (n, 3) positions in the axes of the camera.
-        radiance: (n, 3) radiance per colour band [cd/m2].
-        diameter_m: (n,) diameters.
-    """
-
-    pixel: Array
-    points_m: Array
-    radiance: Array
-    diameter_m: Array
+    pixel: Array  # (n, 2) column and row [px]
+    points_m: Array  # (n, 3) positions in the axes of the camera
+    radiance: Array  # (n, 3) radiance per colour band [cd/m2]
+    diameter_m: Array  # (n,) diameters
 
     @property
     def depth_m(self) -> Array:
@@ -69,12 +62,7 @@ class MarineSnow:
     """Marine snow particles of one survey.
 
     Args:
-        snow: density, sizes and albedo of the particles.
         current_mps: (3,) velocity of the particles in the world.
-        rig: the rendered cameras.
-        water: optical properties of the water.
-        lamp_light: light of the lamps, and daylight, in the axes of the left and of the right camera.
-        rng: random stream of the particle positions and diameters.
         defocus: aperture and focus of the lens; None = an aperture of `APERTURE_M`, focused at infinity.
     """
 
@@ -109,9 +97,6 @@ class MarineSnow:
         Args:
             world_from_left: (4, 4) pose of the left camera.
             camera: 0 left, 1 right.
-            time_s: time since the start of the survey.
-            reach_m: distance outside the view up to which particles are included, as they may move into the view.
-            farthest_m: largest depth of a particle.
         """
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
@@ -146,7 +131,6 @@ class MarineSnow:
             depth: (H, W) depth of the floor [m].
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
             camera: 0 left, 1 right.
-            time_s: time since the start of the survey.
             motion: motion of the camera during the exposure; None = no motion.
         """
         rig, defocus = self._rig, self._defocus
@@ -208,13 +192,7 @@ class MarineSnow:
 
 
 def diameters(snow: SnowConfig, n: int, rng: np.random.Generator) -> Array:
-    """Returns the diameters of n particles [m]: (n,) of the Junge distribution, or (1,) if all are equal.
-
-    Args:
-        snow: exponent and limits of the distribution.
-        n: number of particles.
-        rng: random stream, of which n numbers are drawn if the diameters differ.
-    """
+    """Returns the diameters of n particles [m]: (n,) of the Junge distribution, or (1,) if all are equal."""
     if snow.junge_exponent is None:
         return np.array([snow.diameter_m])
     power = 1 - snow.junge_exponent
@@ -230,14 +208,7 @@ def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float
 
 @kernel(error_model="numpy")
 def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
-    """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`.
-
-    Args:
-        points: (n, 3) positions of the particles in the axes of the camera [m].
-        day_per_m, loss_per_m: (3,) attenuation of daylight with depth, and of light on the path [1/m].
-        below_m: depth of the camera relative to the planned depth [m].
-        fading, path_loss: (n, 3) arrays to fill.
-    """
+    """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`."""
     for k in range(points.shape[0]):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         range_m = np.sqrt(x * x + y * y + z * z)
@@ -252,16 +223,6 @@ def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
     A rolling shutter reads the row v at t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row
     v_0 at mid-exposure and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the
     divisor 1 - v' readout / (n_rows - 1) limited to 0.1 or more.
-
-    Args:
-        points: (n, 3) positions in the axes of the camera [m].
-        pixel: (n, 2) positions in the image at mid-exposure [px].
-        depth: (H, W) depth of the floor [m].
-        lens: focal length, and column and row of the principal point [px].
-        drift: (3,) velocity of the particles, in the axes of the camera [m/s].
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        moves: exposure time and read-out time [s], and whether the rolling shutter is applied to the image later. If
-            so, the displacement of the floor behind a particle by the rolling shutter is subtracted.
     """
     (focal, cx, cy), (exposure_s, readout_s, rolls_later) = lens, moves
     row_s, bottom, right, still = readout_s / (depth.shape[0] - 1), depth.shape[0] - 1, depth.shape[1] - 1, np.zeros(3)
@@ -351,12 +312,6 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
     A particle is a disc with an antialiased edge that moves along a straight path: `path` (n, 2) [px] is the vector
     from the start to the end of each path, `centre` (n, 2) [px] its middle.
-
-    Args:
-        z: (n,) depths [m].
-        radiance: (n, 3) radiance of the particles [cd/m2].
-        width: (n,) diameters of the discs, including blur [px].
-        cover: (n,) areas that the particles cover without blur [px^2].
     """
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):

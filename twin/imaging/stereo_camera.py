@@ -47,28 +47,18 @@ class StereoCapture(NamedTuple):
 
 
 class DecomposedImage(NamedTuple):
-    """A left image without noise, with the intermediate results of its computation.
+    """A left image without noise, with the intermediate results of its computation."""
 
-    Args:
-        albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
-        depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
-        components: direct signal, backscatter and other components of the radiance.
-        setting: exposure, metered on this image.
-        noise_free: (H, W, 3) image without noise.
-        raw: digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a
-            Bayer filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor.
-        linear: whether the image is proportional to the radiance: linear tone curve, white balance for white light.
-        objects: normals and labels (H, W) of the objects in the image; None without objects.
-    """
-
-    albedo: Image
-    depth: Depth
-    components: RadianceComponents
-    setting: ExposureSetting
-    noise_free: Image
+    albedo: Image  # (H, W, 3) uint8 albedo of floor and objects, 255 = white
+    depth: Depth  # (H, W) depth along the optical axis [m]; inf where there is no floor
+    components: RadianceComponents  # direct signal, backscatter and other components of the radiance
+    setting: ExposureSetting  # exposure, metered on this image
+    noise_free: Image  # (H, W, 3) image without noise
+    # digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a Bayer
+    # filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor
     raw: Raw | None
-    linear: bool
-    objects: ObjectView | None = None
+    linear: bool  # whether the image is proportional to the radiance: linear tone curve, white balance for white light
+    objects: ObjectView | None = None  # normals and labels (H, W) of the objects in the image; None without objects
 
     @property
     def gain(self) -> float:
@@ -93,16 +83,7 @@ class StereoCamera:
     """Stereo camera: both cameras share one auto-exposure; their noise is independent.
 
     Args:
-        renderer: renderer of albedo and depth of the floor.
-        image_formation: model of the radiance that reaches the cameras through the water.
-        scenario: settings of the cameras and the sensor.
-        left_rng, right_rng: random streams of the image noise.
-        stopwatch: timer of the stages "render" and "optics".
         true_cameras: geometry of the true cameras; None = as defined by the scenario.
-
-    Raises:
-        TwinError: `true_cameras` is None and the scenario's cameras are invalid, see `make_true_cameras`; or the water
-            is invalid, see `sensor_of`.
     """
 
     def __init__(
@@ -134,7 +115,6 @@ class StereoCamera:
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            stereo: whether the right camera is used too.
             twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
         """
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
@@ -187,7 +167,6 @@ class StereoCamera:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
             twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s]; affects the
                 image and the digital numbers, not the components.
-            time_s: time since the start of the survey, at which snow, waves and swaying plants are drawn.
         """
         albedo, depth = self._renderer.render(world_from_left)
         pose = StampedPose(world_from_left, time_s)
@@ -223,13 +202,7 @@ class StereoCamera:
         return self._meter(self._sensor, light, view.depth)
 
     def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
-        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels.
-
-        Args:
-            view: rendered view of this camera.
-            twist_body: see `capture`.
-            setting: exposure of this frame.
-        """
+        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels."""
         pose, camera, albedo, depth, objects = view
         motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
         floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from twin.core.records import StereoRig
 from twin.core.row_parallel import in_row_bands
 from twin.imaging.camera.port import pinhole
-from twin.imaging.light.bands import CENTRE_NM
+from twin.imaging.light.spectra import CENTRE_NM
 from twin.kernels import kernel
 from twin.scenario.model import LensConfig, Scenario, SensorConfig
 
@@ -60,10 +60,6 @@ def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
     """Returns aperture and focus of the lenses; None without a sensor, or if `lens.focus_m` is 0.
 
     The aperture is the focal length in air divided by the f-number.
-
-    Args:
-        scenario: lens, port and sensor.
-        rig: the rendered cameras, with the focal length in water.
     """
     lens, sensor = scenario.lens, scenario.sensor
     if sensor is None or not lens.focus_m:
@@ -73,13 +69,7 @@ def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
 
 
 def diffraction_mtf(cycles_per_px: Array, wavelength_nm: float, sensor: SensorConfig) -> Array:
-    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px].
-
-    Args:
-        cycles_per_px: spatial frequencies.
-        wavelength_nm: wavelength of the light in air.
-        sensor: f-number and size of the pixels.
-    """
+    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px]."""
     s = np.abs(cycles_per_px) / sensor.pixel_um * wavelength_nm * 1e-3 * sensor.f_number
     s = np.minimum(s, 1.0)
     return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
@@ -90,7 +80,6 @@ class LensPsf:
 
     Args:
         scenario: lens, port and sensor; without a sensor there is neither diffraction nor depth of field.
-        rig: the rendered cameras.
     """
 
     def __init__(self, scenario: Scenario, rig: StereoRig):
@@ -196,20 +185,14 @@ def _separable(kernel: Array) -> list[tuple[float, Array]]:
 
 
 class _Magnification(NamedTuple):
-    """Lateral colour: the images of the red and the blue band are magnified relative to the green one.
+    """Lateral colour: the images of the red and the blue band are magnified relative to the green one."""
 
-    Args:
-        runs: (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band,
-            first column, end column (exclusive), and this offset.
-        across: (3, TAPS, W) weights along the rows, for each band.
-        lines: (3, H) offset of the first tap of each row from the row.
-        down: (3, H, TAPS) weights along the columns.
-    """
-
+    # (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band, first
+    # column, end column (exclusive), and this offset
     runs: NDArray[np.int64]
-    across: NDArray[np.float32]
-    lines: NDArray[np.int64]
-    down: NDArray[np.float32]
+    across: NDArray[np.float32]  # (3, TAPS, W) weights along the rows, for each band
+    lines: NDArray[np.int64]  # (3, H) offset of the first tap of each row from the row
+    down: NDArray[np.float32]  # (3, H, TAPS) weights along the columns
 
 
 def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
@@ -227,17 +210,7 @@ def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
 
 
 def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Returns the taps of the magnification along an axis of n pixels, by cubic interpolation (Keys 1981).
-
-    Args:
-        n: number of pixels.
-        middle_px: position that the magnification does not move.
-        scales: (3,) magnification of the bands.
-
-    Returns:
-        For R, G, B, the offset (3, n) of the first tap of each pixel from this pixel [px], and the weights (3, n, TAPS)
-        of the TAPS consecutive pixels from there.
-    """
+    """Returns the taps of the magnification along an axis of n pixels, by cubic interpolation (Keys 1981)."""
     at = middle_px + (np.arange(n) - middle_px) / scales[:, None]
     whole = np.floor(at)
     t = at - whole
@@ -282,9 +255,6 @@ def _convolve(light, down, across, out, first, end):
 
     The bands are kept apart, so that the weights of a row are constant. The latest rows of the image are stored in
     `lines`: row v in lines[v modulo their number].
-
-    Args:
-        down, across: weights of `_taps` along columns and rows.
     """
     rows, _, width = out.shape
     n, terms = 2 * REACH_PX + 1, down.shape[1]
@@ -385,14 +355,7 @@ def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
 
 @kernel
 def _defocus(light, near, scale, focus, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
-
-    Args:
-        near: (H, W) inverse depth [1/m].
-        scale: diameter of the aperture times the focal length [px m]; this times the absolute difference between the
-            inverse depth and `focus` is the diameter of the disc [px].
-        focus: inverse of the depth in focus [1/m].
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus."""
     rows, width = near.shape
     wide = np.empty(3 * width, np.float32)
     for v in range(first, end):

@@ -41,11 +41,7 @@ def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
     """Returns a scenario's sensor in its initial state: `PhotoSensor` with a section [sensor], else `PlainSensor`.
 
     Args:
-        scenario: survey scenario.
         raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
-
-    Raises:
-        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
     """
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
@@ -57,12 +53,8 @@ class PhotoSensor:
     the image, so it does not oscillate if an image saturates.
 
     Args:
-        scenario: survey scenario.
         sensor: section [sensor] of the scenario.
         raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
-
-    Raises:
-        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
     """
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
@@ -112,7 +104,6 @@ class PhotoSensor:
 
         Args:
             twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-            setting: exposure of this frame.
             n_rows: number of rows of the rendered image, which may have a margin around the rows of the sensor; the
                 read-out time of the result is that of these rows.
         """

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
-from twin.imaging.light.bands import NM, sensitivity
+from twin.imaging.light.spectra import NM, sensitivity
 from twin.scenario.model import SensorConfig
 
 Array = NDArray[np.float64]

@@ -24,23 +24,14 @@ MOST_ELECTRONS = 80  # largest number that `_poisson` returns; for means below 1
 
 
 class PixelResponse(NamedTuple):
-    """Response of the pixels in one exposure.
+    """Response of the pixels in one exposure."""
 
-    Args:
-        electrons_per_cd: (3,) expected number of electrons on the axis at 1 cd/m2, for R, G, B.
-        full_well_e: full-well capacity [e-].
-        read_noise_e: standard deviation of the read noise [e-].
-        dn_per_e: digital numbers per electron, K of EMVA 1288.
-        black_dn: black level, as a digital number.
-        top_dn: largest digital number.
-    """
-
-    electrons_per_cd: NDArray[np.float64]
-    full_well_e: float
-    read_noise_e: float
-    dn_per_e: float
-    black_dn: float
-    top_dn: float
+    electrons_per_cd: NDArray[np.float64]  # (3,) expected number of electrons on the axis at 1 cd/m2, for R, G, B
+    full_well_e: float  # full-well capacity [e-]
+    read_noise_e: float  # standard deviation of the read noise [e-]
+    dn_per_e: float  # digital numbers per electron, K of EMVA 1288
+    black_dn: float  # black level, as a digital number
+    top_dn: float  # largest digital number
 
 
 def read_out(
@@ -55,8 +46,6 @@ def read_out(
     Args:
         light: (H, W, 3) light per colour band in photometric units [cd/m2].
         vignetting: (H, W) illuminance relative to the axis.
-        response: response of the pixels.
-        bayer: whether each pixel records only one colour band.
         rng: random stream, of which one number is drawn per image; None = no noise.
     """
     height, width = vignetting.shape
@@ -70,14 +59,7 @@ def read_out(
 
 @kernel
 def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`.
-
-    Args:
-        response: (8,) float32 fields of `PixelResponse`, one after the other.
-        normal: table of `normal_numbers`.
-        seed: seed of the random numbers of this image.
-        noisy: whether to add noise.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`."""
     width, bands = out.shape[1:]
     n, few = width * bands, np.float32(FEW_ELECTRONS)
     expected, shot, read = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)

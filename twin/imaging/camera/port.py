@@ -28,15 +28,10 @@ SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
 
 
 class Pinhole(NamedTuple):
-    """Pinhole camera in water that is equivalent, near the optical axis, to a camera behind a port.
+    """Pinhole camera in water that is equivalent, near the optical axis, to a camera behind a port."""
 
-    Args:
-        centre_m: position of the pinhole on the optical axis, positive in front of the entrance pupil.
-        focal_ratio: focal length of the pinhole camera divided by that of the lens in air.
-    """
-
-    centre_m: float
-    focal_ratio: float
+    centre_m: float  # position of the pinhole on the optical axis, positive in front of the entrance pupil
+    focal_ratio: float  # focal length of the pinhole camera divided by that of the lens in air
 
 
 def pinhole(port: PortConfig) -> Pinhole:
@@ -56,7 +51,6 @@ def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
     port. Without a port, rays start at the entrance pupil.
 
     Args:
-        port: geometry and refractive indices.
         normalised: (..., 2) normalised coordinates X / Z, Y / Z of the rays in air.
     """
     ray = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
@@ -109,7 +103,6 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
     Args:
         ray: (..., 3) unit directions of incidence.
         normal: (..., 3) unit normals in the direction of propagation.
-        ratio: refractive index before the face, divided by the index behind the face.
     """
     cosine = (ray * normal).sum(axis=-1, keepdims=True)
     with np.errstate(invalid="ignore"):

@@ -32,19 +32,12 @@ INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaini
 
 
 class RowMotion(NamedTuple):
-    """Motion of a camera while the rows of an image are exposed one after the other.
+    """Motion of a camera while the rows of an image are exposed one after the other."""
 
-    Args:
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        readout_s: time from the first sampled row of the raw image to the last.
-        focal_px: focal length of the rendered image.
-        principal_px: (2,) column and row of its principal point.
-    """
-
-    twist: Array
-    readout_s: float
-    focal_px: float
-    principal_px: tuple[float, float]
+    twist: Array  # (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s]
+    readout_s: float  # time from the first sampled row of the raw image to the last
+    focal_px: float  # focal length of the rendered image
+    principal_px: tuple[float, float]  # (2,) column and row of its principal point
 
 
 def intersect(
@@ -79,7 +72,6 @@ def sample_rays(
 
     Args:
         light: (H, W, 3) radiance; beyond its border, the values of the nearest border pixel are repeated.
-        depth, positions, parallax_px_m, motion: see `intersect`.
     """
     out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
     source = np.ascontiguousarray(light).reshape(len(light), -1)

@@ -34,8 +34,6 @@ class AutoExposure:
     camera; the gain of the first frame is computed from that frame itself.
 
     Args:
-        gray_level: target mean as a fraction of full scale.
-        frame_rate_hz: frames per second.
         lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
         limits: smallest and largest gain [1 / (cd/m2)].
 
@@ -79,28 +77,19 @@ class AutoExposure:
 
 
 class ExposureSetting(NamedTuple):
-    """Exposure of one frame.
+    """Exposure of one frame."""
 
-    Args:
-        gain: linear image signal per unit of radiance on the optical axis, with the white balance for white light
-            [1 / (cd/m2)]; a signal of 1 saturates.
-        exposure_s: exposure time; 0 for the plain sensor.
-        analogue_gain: amplification before digitization.
-        white: (3,) factors that the white balance applies to R, G, B; None = those for white light.
-    """
-
+    # linear image signal per unit of radiance on the optical axis, with the white balance for white light [1 /
+    # (cd/m2)]; a signal of 1 saturates
     gain: float
-    exposure_s: float = 0.0
-    analogue_gain: float = 1.0
+    exposure_s: float = 0.0  # exposure time; 0 for the plain sensor
+    analogue_gain: float = 1.0  # amplification before digitization
+    # (3,) factors that the white balance applies to R, G, B; None = those for white light
     white: tuple[float, float, float] | None = None
 
 
 class PlainSensor:
-    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`.
-
-    Args:
-        scenario: survey scenario.
-    """
+    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`."""
 
     def __init__(self, scenario: Scenario):
         self._imaging = scenario.imaging
@@ -143,8 +132,6 @@ def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.rand
     Args:
         radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
         gain: image signal per unit of radiance [1 / (cd/m2)]; a signal of 1 saturates.
-        imaging: standard deviations of read noise and of shot noise at full signal, as fractions of full scale.
-        rng: random stream of this camera, from which one number is drawn per image.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)

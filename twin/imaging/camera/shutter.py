@@ -41,19 +41,13 @@ SHORT_PX = 2.8  # largest column and row extent of a path for the 3 x 3 kernel; 
 
 
 class ExposureMotion(NamedTuple):
-    """Motion of a camera during one exposure.
+    """Motion of a camera during one exposure."""
 
-    Args:
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        exposure_s: exposure time of each row; 0 = no motion blur.
-        readout_s: time from the first row of the rendered image to the last; 0 = global shutter.
-        rolls_later: whether the rolling shutter is applied where the raw image is sampled from the rendered one
-            (`true_cameras.TrueCameras.sample`), so that the image is resampled only once.
-    """
-
-    twist: Array
-    exposure_s: float
-    readout_s: float
+    twist: Array  # (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s]
+    exposure_s: float  # exposure time of each row; 0 = no motion blur
+    readout_s: float  # time from the first row of the rendered image to the last; 0 = global shutter
+    # whether the rolling shutter is applied where the raw image is sampled from the rendered one
+    # (`true_cameras.TrueCameras.sample`), so that the image is resampled only once
     rolls_later: bool = False
 
 
@@ -65,8 +59,6 @@ def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMo
     Args:
         light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
         depth: (H, W) depth along the optical axis in the same image [m].
-        focal_px: focal length of that image.
-        motion: velocity of the camera, exposure time and read-out time.
     """
     if motion.readout_s and not motion.rolls_later:
         light = apply_rolling_shutter(light, depth, focal_px, motion.twist, motion.readout_s)
@@ -81,9 +73,7 @@ def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array,
     Args:
         light: (H, W, 3) radiance at mid-exposure.
         depth: (H, W) depth along the optical axis [m]; points at inf move by rotation alone.
-        focal_px: focal length.
         twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        exposure_s: exposure time of each row.
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     flat, focal, open_s = light.reshape(-1, 3), np.float32(focal_px), np.float32(exposure_s)
@@ -92,12 +82,7 @@ def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array,
 
 
 def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
-    """Returns the radiance (H, W, 3) that a camera with a rolling shutter records.
-
-    Args:
-        light, depth, focal_px, twist: see `blur_by_motion`.
-        readout_s: time from the first row of the image to the last.
-    """
+    """Returns the radiance (H, W, 3) that a camera with a rolling shutter records."""
     out, motion = np.empty_like(light), twist.astype(np.float32)
     focal, whole_s = np.float32(focal_px), np.float32(readout_s)
     scene = light, depth, focal, motion, whole_s, out

@@ -34,9 +34,6 @@ class WhiteBalance:
     Attributes:
         is_of_white_light: whether the white balance is that for white light.
         of_white_light: (3,) factors for white light.
-
-    Raises:
-        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
     """
 
     def __init__(self, scenario: Scenario, electrons_per_cd: Array):
@@ -55,7 +52,6 @@ class WhiteBalance:
 
         Args:
             mean: (3,) mean radiance of this frame in photometric units.
-            share: fraction by which the logarithm of the factors approaches that of this frame.
         """
         if self._mode != "grey_world":
             return self._fixed
@@ -74,11 +70,7 @@ class WhiteBalance:
         return 1.0 if self.is_of_white_light else factors / self.of_white_light
 
     def _preset(self, scenario: Scenario) -> Array:
-        """Returns the constant factors (3,) of a scenario; with grey world, they are not used.
-
-        Raises:
-            TwinError: the water is invalid, see `water.medium`.
-        """
+        """Returns the constant factors (3,) of a scenario; with grey world, they are not used."""
         sensor = scenario.sensor
         assert sensor is not None
         if sensor.white_balance == "gains":

@@ -35,8 +35,6 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
     With multiple scattering it is that of the lamps alone; see `daylight.DaylightVeil` for daylight.
 
     Args:
-        lamps: light of the lamps in the axes of the camera, and daylight.
-        water: optical properties of the water.
         ray: (..., 3) unit viewing direction in the axes of the camera.
         range_m: (..., n) distances along the ray [m].
 
@@ -55,10 +53,6 @@ def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> 
     """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3].
 
     The daylight is assumed to travel along the optical axis, away from the camera.
-
-    Args:
-        lamps, water, ray: see `backscatter_per_m`.
-        points: (..., n, 3) points on the rays in the axes of the camera [m].
     """
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
@@ -103,12 +97,7 @@ def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
 
 
 def grid_rays(rig: StereoRig, grid: tuple[int, int]) -> Array:
-    """Returns the unit directions (rows, cols, 3) of a pixel grid that spans the image, in the axes of the camera.
-
-    Args:
-        rig: the camera.
-        grid: rows and columns, see `grid_of`.
-    """
+    """Returns the unit directions (rows, cols, 3) of a pixel grid that spans the image, in the axes of the camera."""
     return _rays(rig, *(_grid_px(n, size, 0) for n, size in zip(grid, _size(rig), strict=True)))
 
 
@@ -126,15 +115,7 @@ def table_range_m() -> Array:
 
 
 def _spread(steps: Array, range_m: Array, grid_px: tuple[Array, Array], rig: StereoRig, water: Medium) -> Array:
-    """Returns the backscatter (rows, cols, ranges, 3) with the blur of the part that is scattered again on its way.
-
-    Args:
-        steps: (rows + 2 MARGIN, cols + 2 MARGIN, ranges, 3) backscatter of each step of range, with the margin.
-        range_m: (ranges,) range in the middle of each step [m].
-        grid_px: positions of the rows and of the columns of the grid, with the margin [px].
-        rig: the camera.
-        water: optical properties of the water.
-    """
+    """Returns the backscatter (rows, cols, ranges, 3) with the blur of the part that is scattered again on its way."""
     levels = int(np.log2(WIDEST_TAN * rig.focal_px))
     weights = level_weights(water.bands, rig.focal_px, levels, range_m)
     spacing_px = max(np.diff(grid_px[0])[MARGIN], np.diff(grid_px[1])[MARGIN])

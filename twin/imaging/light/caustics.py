@@ -52,7 +52,6 @@ class Caustics:
         illumination: optical properties of the water, depth of the reference plane, and the fraction of the daylight
             that the waves focus; the rest of the daylight is diffuse and uniform.
         wind_mps: wind speed 10 m above the sea.
-        seed: seed of the scenario.
 
     Attributes:
         tile_m: side of the tile.
@@ -130,13 +129,7 @@ class Caustics:
         return closed
 
     def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
-        """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves.
-
-        Args:
-            depth_m: depth of the plane below the surface.
-            water: optical properties of the water, of which those of the green band are used.
-            unresolved: variances of the slopes along and across the wind due to waves that the cells do not resolve.
-        """
+        """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves."""
         kx, ky = _wave_numbers(self.tile_m)
         along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
         rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
@@ -158,7 +151,6 @@ def scattering_blur(k: Array, depth_m: float, per_m: tuple[float, float], phase:
         k: wave numbers of the pattern, of any shape [rad/m].
         depth_m: depth of the plane below the surface.
         per_m: absorption coefficient a and scattering coefficient b of the water [1/m].
-        phase: phase function p of the water.
     """
     absorption, scattering = per_m
     if scattering * depth_m == 0:
@@ -186,9 +178,6 @@ def _packed(transfer: Array) -> Array:
 
     OpenCV stores the real and the imaginary part of a coefficient in consecutive columns 2 k - 1 and 2 k, or in such
     rows in the first and the last column, whose coefficients are symmetric.
-
-    Args:
-        transfer: (CELLS, CELLS / 2 + 1) real and symmetric transfer function.
     """
     index = np.arange(CELLS)
     half = (index + 1) // 2
@@ -201,12 +190,6 @@ def _add_waves(east, north, cosine, sine, spectrum):
     """Adds waves to the spectrum of a complex image: real part slope towards east, imaginary part slope towards north.
 
     Both slopes are real: the coefficient of a wave number determines that of the opposite wave number.
-
-    Args:
-        east, north: (n, n / 2 + 1) complex amplitudes of the slopes at time 0.
-        cosine, sine: (n, n / 2 + 1) cosine and sine of the phase by which the waves have advanced.
-        spectrum: (n, n, 2) real and imaginary part of the spectrum, modified in place: that of the slopes towards east
-            plus i times that of the slopes towards north.
     """
     n, half = spectrum.shape[0], spectrum.shape[1] // 2
     for i in range(n):
@@ -225,13 +208,7 @@ def _add_waves(east, north, cosine, sine, spectrum):
 
 @kernel(error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Traces one vertical ray per cell through the surface; adds each to four cells of `light` with bilinear weights.
-
-    Args:
-        east, north: (n, n) slopes of the surface.
-        cells_per_slope: displacement of a ray on the floor, towards west and south, per unit of slope [cells].
-        light: (n, n) illuminance relative to its mean, initially 0; filled in place. n is a power of two.
-    """
+    """Traces one vertical ray per cell through the surface; adds it to four cells of `light`, bilinearly."""
     n, one = light.shape[0], np.float32(1.0)
     for i in range(n):
         for j in range(n):

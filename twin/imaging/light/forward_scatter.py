@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
 from twin.core.row_parallel import in_row_bands
-from twin.imaging.light.pixel_sum import sum_of_entries
 from twin.imaging.light.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.light.spread import NODES_M, Absorbed, camera_mixture, over_path
+from twin.imaging.light.vector_math import sum_of_entries
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 
@@ -45,27 +45,17 @@ PLANE_STEP_PX = 8  # spacing of the pixels to whose depth the plane is fitted
 
 
 class Surroundings(NamedTuple):
-    """Coarse grid that covers the image and the floor around it.
+    """Coarse grid that covers the image and the floor around it."""
 
-    Args:
-        level: level of the image pyramid with the same pixel size as this grid.
-        pad: number of grid pixels before the first one of the image, in both directions.
-        shape: rows and columns of the grid.
-        focal_px: focal length in pixels of the grid; the optical axis is in its centre, within a quarter of a pixel.
-    """
-
-    level: int
-    pad: int
-    shape: tuple[int, int]
+    level: int  # level of the image pyramid with the same pixel size as this grid
+    pad: int  # number of grid pixels before the first one of the image, in both directions
+    shape: tuple[int, int]  # rows and columns of the grid
+    # focal length in pixels of the grid; the optical axis is in its centre, within a quarter of a pixel
     focal_px: float
 
 
 class ForwardScatter:
     """Blur of the light of the floor by scattering on its way to the camera.
-
-    Args:
-        rig: the rendered cameras.
-        water: optical properties of the water.
 
     Attributes:
         range_per_depth: range divided by depth of the pixels of the surroundings.
@@ -115,7 +105,6 @@ class ForwardScatter:
 
         Args:
             floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
-            place: fractional row index into `kept` for every second pixel in both directions, see `place_of`.
             around: light and fractional row index into `kept` of the surroundings; their pixels inside the image are
                 overwritten.
             light: (H, W, 3) image to which the light is added.
@@ -148,7 +137,6 @@ class ForwardScatter:
         """Returns all light (H, W, 3) of the floor that was scattered between floor and camera [cd/m2].
 
         Args:
-            floor, around: see `add`.
             range_m: (H, W) distance of the floor from the camera; inf is valid.
         """
         light = (floor * self.core(range_m)).astype(np.float32)
@@ -184,9 +172,7 @@ def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) 
     """Returns the weights of the pyramid levels in the kernel of the blur, at the ranges `NODES_M`.
 
     Args:
-        bands: water in the bands R, G, B.
         focal_px: focal length [px].
-        levels: number of levels of the pyramid.
 
     Returns:
         (levels + 1, 3, nodes) weights of the levels of the kernel of scattered light; level 0 is light scattered by
@@ -202,9 +188,7 @@ def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, ran
     Level 0 is light scattered by less than a pixel; unscattered light is not included.
 
     Args:
-        bands: water in the bands R, G, B.
         focal_px: focal length [px].
-        levels: number of levels of the pyramid.
         range_m: (n,) ranges [m].
     """
     nodes = level_weights_of(bands, focal_px, levels)
@@ -246,10 +230,6 @@ def _moved(weights: Array, focal_px: float) -> Array:
 
     Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths; the last level
     does not count as narrow.
-
-    Args:
-        weights: (levels, n, 3) weights of the levels from 1.
-        focal_px: focal length.
     """
     leaves = np.array([level_sigma_px(k + 1) <= WIDENED_TAN * focal_px for k in range(len(weights))])
     leaves[-1] = False
@@ -268,12 +248,6 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
     """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid.
 
     Each element of the list has the shares (rows, cols) of the pixels of one level.
-
-    Args:
-        rig: the camera.
-        grid: grid of the surroundings, which the coarse levels cover.
-        per_depth: range divided by depth, 1 / cos(theta), on that grid.
-        levels: number of levels.
     """
     v, u = ((np.arange(0.0, n, 2) - (n - 1) / 2) / rig.focal_px for n in (rig.height_px, rig.width_px))
     secants = [np.sqrt(1 + v[:, None] ** 2 + u**2)]
@@ -286,15 +260,7 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
 
 @kernel(error_model="numpy")
 def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
-    """Fills `plane` and `place` with the results of `ForwardScatter.plane`.
-
-    Args:
-        depth: (H, W) depth of the floor [m], of which every `PLANE_STEP_PX`-th pixel in both directions is used.
-        fit: (3, n) map from 1 / depth of those pixels to the coefficients of 1 / depth of the plane.
-        terms: (rows cols, 3) factors of the coefficients for each pixel of the grid.
-        range_per_depth: (rows, cols) range divided by depth of each pixel of the grid.
-        plane, place: (rows, cols) arrays to fill.
-    """
+    """Fills `plane` and `place` with the results of `ForwardScatter.plane`."""
     one, two, three, k = 0.0, 0.0, 0.0, 0
     for v in range(0, depth.shape[0], PLANE_STEP_PX):
         for u in range(0, depth.shape[1], PLANE_STEP_PX):
@@ -314,16 +280,7 @@ def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _weigh(image, place, table, widening, wider):
-    """Multiplies one level by its weights and adds the wider levels, in place.
-
-    Args:
-        image: (rows, cols, 3) light of the floor at this level.
-        place: (rows, cols) fractional row of `table` for each pixel.
-        table: (n, 8) weights of this level for R, G, B and a zero, then their change if all light of each narrow level
-            moves to the next one, and a zero.
-        widening: (rows, cols) share of the light that moves, for each pixel.
-        wider: (rows, cols, 3) weighted light of the wider levels.
-    """
+    """Multiplies one level by its weights and adds the wider levels, in place."""
     last, one = np.int32(table.shape[0] - 2), np.float32(1.0)
     flat, cols = table.reshape(-1), place.shape[1]
     cell, part = np.empty(cols, np.int32), np.empty(cols, np.float32)
@@ -348,11 +305,6 @@ def _add_upsampled(small, light, first, end):
 
     Along each axis, the filter of the even pixels is (1, 6, 1) / 8 and that of the odd pixels (1, 1) / 2. Rows before
     the first one are mirrored, and the last row is repeated. The same holds for columns.
-
-    Args:
-        small: (rows, 3 cols) image with rows = ceil(H / 2) and cols = ceil(W / 2).
-        light: (H, 3 W) image to which the upsampled image is added in place.
-        first, end: range of rows.
     """
     last, width = small.shape[0] - 1, light.shape[1] // 3
     cols = small.shape[1] // 3

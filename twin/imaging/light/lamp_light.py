@@ -38,10 +38,6 @@ class LampLight:
     """Light of the lamps on particles in the water, at points in the axes of one camera.
 
     See `floor_tables` for their light on the floor.
-
-    Args:
-        sources: lamps in the axes of the camera.
-        water: optical properties of the water.
     """
 
     def __init__(self, sources: LightSources, water: Medium):
@@ -57,7 +53,6 @@ class LampLight:
         directions. Distances below `LAMP_RADIUS_M` count as `LAMP_RADIUS_M`; there the directions are shorter than 1.
 
         Args:
-            lamp: number of the lamp.
             points: (..., 3) points in the axes of the camera [m].
         """
         sources, position, axis = self.sources, self.sources.position_m[lamp], self.sources.axis[lamp]
@@ -97,10 +92,6 @@ def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32] | 
     Axes: lamp; scattered light S, which the floor is assumed not to block, then all light, I exp(-c d) + S; even steps
     of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. The result is None in water
     without multiple scattering, and without lamps.
-
-    Args:
-        sources: lamps in the axes of a camera.
-        water: optical properties of the water.
     """
     if not (water.scatters_repeatedly and len(sources.beam)):
         return None
@@ -113,16 +104,7 @@ def with_a_zero(table: Array) -> NDArray[np.float32]:
 
 
 def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array]:
-    """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`.
-
-    Args:
-        beam: (m, 2) beam table of the lamp.
-        water: optical properties of the water.
-        receiver: floor or particle that the light meets, which determines S.
-
-    Returns:
-        (ANGLE_STEPS + 1, PATH_STEPS + 1, 3) each, with the axes of `floor_tables`.
-    """
+    """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`."""
     at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
     low = np.minimum(at.astype(int), SOFT_STEPS - 1)
     coarse = _softened(beam, water, receiver)
@@ -177,13 +159,7 @@ def _on_rings(beam: Beam) -> Array:
 
 @kernel(error_model="numpy", fastmath={"arcp", "contract"})
 def _from_table(points, position, axis, strength, table, lux, from_lamp):
-    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
-
-    Args:
-        position, axis: (3,) position [m] and unit beam axis of the lamp.
-        strength: (3,) intensity for R, G, B, to which `table` is relative [cd].
-        table: (n, m, 3) all light of the lamp, see `_light`.
-    """
+    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`."""
     rows, cols = table.shape[0] - 1, table.shape[1] - 1
     for k in range(points.shape[0]):
         x, y, z = points[k, 0] - position[0], points[k, 1] - position[1], points[k, 2] - position[2]

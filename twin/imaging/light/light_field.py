@@ -38,17 +38,11 @@ _SLOPES = np.deg2rad(np.linspace(0.0, STEEPEST_DEG, 16)), np.deg2rad(np.linspace
 
 
 class BandOptics(NamedTuple):
-    """Optical properties of the water in one colour band.
+    """Optical properties of the water in one colour band."""
 
-    Args:
-        absorption_per_m: absorption coefficient a [1/m].
-        scattering_per_m: scattering coefficient b [1/m].
-        phase: table of the phase function.
-    """
-
-    absorption_per_m: float
-    scattering_per_m: float
-    phase: PhaseTable
+    absorption_per_m: float  # absorption coefficient a [1/m]
+    scattering_per_m: float  # scattering coefficient b [1/m]
+    phase: PhaseTable  # table of the phase function
 
 
 class _Scaled(NamedTuple):
@@ -60,24 +54,17 @@ class _Scaled(NamedTuple):
 
 
 class _Mode(NamedTuple):
-    """Solutions of one term of the series in azimuth.
+    """Solutions of one term of the series in azimuth."""
 
-    Args:
-        decay_per_m: (n,) eigenvalues.
-        down, up: (n, n) downwelling and upwelling parts of the decaying eigenvectors, as columns; the growing ones have
-            these parts exchanged.
-        beam_down, beam_up: (n,) particular solution at depth 0.
-        sky: (n,) radiance of the sky at the surface.
-        kernel: (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes, with P_l^m normalised as in `_legendre`.
-    """
-
-    decay_per_m: Array
+    decay_per_m: Array  # (n,) eigenvalues
+    # (n, n) downwelling and upwelling parts of the decaying eigenvectors, as columns; the growing ones have these parts
+    # exchanged
     down: Array
     up: Array
-    beam_down: Array
+    beam_down: Array  # (n,) particular solution at depth 0
     beam_up: Array
-    sky: Array
-    kernel: Array
+    sky: Array  # (n,) radiance of the sky at the surface
+    kernel: Array  # (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes, with P_l^m normalised as in `_legendre`
 
 
 def legendre_moments(phase: PhaseTable, orders: int) -> Array:
@@ -97,8 +84,6 @@ class LightField:
     """Radiance of daylight in water over a black floor, for 1 lx just below the surface.
 
     Args:
-        water: optical properties.
-        daylight: direction of the sun and share of the sky.
         modes: number of terms of the series in azimuth; one is used for a sun at the zenith or without a beam.
     """
 
@@ -121,7 +106,6 @@ class LightField:
 
         Args:
             depth_m: depth below the surface.
-            floor_m: depth of the black floor.
         """
         down, up = zip(*(self._at(mode, np.array([floor_m]), depth_m) for mode in self._modes), strict=True)
         return np.array(down)[:, 0], np.array(up)[:, 0]
@@ -131,7 +115,6 @@ class LightField:
 
         Args:
             depth_m: depth of the plane below the surface.
-            floor_m: depth of the black floor.
         """
         beam = self._daylight.beam_lx * self._daylight.sun_cosine * np.exp(-self.beam_per_m * depth_m)
         down, _ = self.scattered(depth_m, floor_m)
@@ -163,7 +146,6 @@ class LightField:
         """Returns the upwelling radiance at a depth, above black floors, as a cosine series in azimuth [cd/m2].
 
         Args:
-            depth_m: depth of the camera.
             cosine: (views,) cosine of the angle between line of sight and straight down, above 0.
             floor_m: (floors,) depths of the floor.
 
@@ -259,10 +241,6 @@ class LightField:
         """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0.
 
         The light is given per metre of the line of sight [cd/m3].
-
-        Args:
-            m: number of the term, from 0.
-            cosine: (views,) cosine of the angle between line of sight and straight down.
         """
         turns = 64
         azimuth = 2 * np.pi * (np.arange(turns) + 0.5) / turns
@@ -306,13 +284,7 @@ def _quadrature() -> tuple[Array, Array]:
 
 
 def _legendre(order: Array | int, m: int, cosine: Array) -> Array:
-    """Returns the associated Legendre function P_l^m times sqrt((l - m)! / (l + m)!), without the factor (-1)^m.
-
-    Args:
-        order: degree l.
-        m: order m.
-        cosine: argument of the function.
-    """
+    """Returns the associated Legendre function P_l^m times sqrt((l - m)! / (l + m)!), without the factor (-1)^m."""
     order = np.asarray(order, np.float64)
     return (-1.0) ** m * lpmv(m, order, cosine) / np.sqrt(poch(order - m + 1, 2 * m))
 

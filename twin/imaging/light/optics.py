@@ -28,13 +28,12 @@ from numpy.typing import NDArray
 from twin.core.records import Image, StereoRig
 from twin.core.row_parallel import in_row_bands
 from twin.imaging.light.backscatter import backscatter_table, grid_of, grid_rays, table_range_m
-from twin.imaging.light.daylight import DaylightVeil, floor_daylight
+from twin.imaging.light.daylight import DaylightVeil, Sky, floor_daylight, world_axes
 from twin.imaging.light.forward_scatter import ForwardScatter, Place
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.lamp_light import LampLight, floor_tables, with_a_zero
 from twin.imaging.light.lamps import LightSources, beam_share, light_sources_in_camera
 from twin.imaging.light.shading import shade
-from twin.imaging.light.sky import Sky, world_axes
 from twin.imaging.light.water import Medium
 from twin.imaging.scene.facets import FacetView
 from twin.imaging.scene.materials import Material
@@ -60,16 +59,13 @@ BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which 
 
 
 class WaterSurface(NamedTuple):
-    """The water surface above a camera: its caustics, and its position relative to the camera.
+    """The water surface above a camera: its caustics, and its position relative to the camera."""
 
-    Args:
-        caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
-            first row and column. None if daylight is uniform.
-        from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics`, which grow towards east
-            and north, and depth below the surface [m].
-    """
-
+    # (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the first row and
+    # column. None if daylight is uniform.
     caustics: NDArray[np.float32] | None
+    # (3, 4) map from a point in the camera axes to column and row in `caustics`, which grow towards east and north, and
+    # depth below the surface [m]
     from_camera: Array
 
 
@@ -87,71 +83,52 @@ def calm_surface(world_from_camera: Array, reference_depth_m: float) -> WaterSur
 
 
 class FloorView(NamedTuple):
-    """Properties of the floor that the shading of a camera needs besides its depth.
+    """Properties of the floor that the shading of a camera needs besides its depth."""
 
-    Args:
-        facets: triangles of the floor; None = the normals are computed from the depth.
-        lit: (lamps, H, W) uint8, 0 where floor or objects block the light of the lamp, else 1; the last one is for the
-            sun if it casts shadows; None = no shadows.
-        material: reflection of the unscattered light of lamps; None = Lambertian.
-        objects: normals of the pixels that show objects; None = the image shows the floor alone.
-    """
-
-    facets: FacetView | None = None
+    facets: FacetView | None = None  # triangles of the floor; None = the normals are computed from the depth
+    # (lamps, H, W) uint8, 0 where floor or objects block the light of the lamp, else 1; the last one is for the sun if
+    # it casts shadows; None = no shadows
     lit: Lit | None = None
-    material: Material | None = None
-    objects: ObjectView | None = None
+    material: Material | None = None  # reflection of the unscattered light of lamps; None = Lambertian
+    objects: ObjectView | None = None  # normals of the pixels that show objects; None = the image shows the floor alone
 
 
 class LightParts(NamedTuple):
-    """Parts of the light that reaches a camera, per colour band in photometric units [cd/m2]; (H, W, 3) float32 each.
+    """Parts of the light that reaches a camera, per band in photometric units [cd/m2]; (H, W, 3) float32 each."""
 
-    Args:
-        direct: light of the floor that was not scattered between floor and camera.
-        forward: light of the floor that was scattered between floor and camera; None without multiple scattering.
-        backscatter: light that the water scattered into the camera without reflection by the floor.
-    """
-
-    direct: Radiance
+    direct: Radiance  # light of the floor that was not scattered between floor and camera
+    # light of the floor that was scattered between floor and camera; None without multiple scattering
     forward: Radiance | None
-    backscatter: Radiance
+    backscatter: Radiance  # light that the water scattered into the camera without reflection by the floor
 
 
 class WhiteFloor(NamedTuple):
-    """Light of an image of a white floor, from which the light of a floor of any albedo follows.
+    """Light of an image of a white floor, from which the light of a floor of any albedo follows."""
 
-    Args:
-        floor: (H, W, 3) light of the white floor at the camera [cd/m2]. With multiple scattering, the path to the
-            camera attenuates it by absorption alone; otherwise by absorption and scattering.
-        backscatter: (H, W, 3) light that the water scatters into the camera [cd/m2].
-        unscattered: (H, W, 3) share of `floor` that is not scattered; ones (3,) without multiple scattering.
-        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) without
-            multiple scattering.
-        spread: returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption
-            alone, and its albedo (H, W, 3), 1 = white; the floor around the image has the mean of this albedo. None
-            without multiple scattering.
-    """
-
+    # (H, W, 3) light of the white floor at the camera [cd/m2]. With multiple scattering, the path to the camera
+    # attenuates it by absorption alone; otherwise by absorption and scattering.
     floor: Radiance
-    backscatter: Radiance
-    unscattered: Array
+    backscatter: Radiance  # (H, W, 3) light that the water scatters into the camera [cd/m2]
+    unscattered: Array  # (H, W, 3) share of `floor` that is not scattered; ones (3,) without multiple scattering
+    # (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) without multiple
+    # scattering
     core: Array
+    # returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption alone, and
+    # its albedo (H, W, 3), 1 = white; the floor around the image has the mean of this albedo. None without multiple
+    # scattering.
     spread: Callable[[Radiance, Radiance], Radiance] | None
 
 
 class _Tables(NamedTuple):
-    """Lookup tables of the shading kernel (`shading.shade`) for one camera.
+    """Lookup tables of the shading kernel (`shading.shade`) for one camera."""
 
-    Args:
-        beams: (lamps, n) intensity relative to `intensity_cd`, at equal steps of sqrt(1 - cos(angle)) in [0, 1].
-        soft: (lamps, 2, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; empty without multiple
-            scattering or without lamps.
-        backscatter: (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of
-            r / (r + `RANGE_SCALE_M`), with r the range; R, G, B and a zero.
-    """
-
+    # (lamps, n) intensity relative to `intensity_cd`, at equal steps of sqrt(1 - cos(angle)) in [0, 1]
     beams: NDArray[np.float32]
+    # (lamps, 2, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; empty without multiple
+    # scattering or without lamps
     soft: NDArray[np.float32]
+    # (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of r / (r + `RANGE_SCALE_M`), with r the
+    # range; R, G, B and a zero
     backscatter: NDArray[np.float32]
 
 
@@ -167,17 +144,9 @@ class _Output(NamedTuple):
 class Optics:
     """Model of the light that reaches each camera, for R, G, B.
 
-    Args:
-        rig: the rendered cameras.
-        illumination: water and daylight.
-        lamps: lamps on the vehicle.
-
     Attributes:
         light_sources: lamps and daylight in the axes of the left and of the right camera.
         lamp_light: light of the lamps in the water, in the axes of the left and of the right camera.
-
-    Raises:
-        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(self, rig: StereoRig, illumination: Illumination, lamps: Sequence[LampConfig]):
@@ -319,16 +288,7 @@ class Optics:
         focal_px: float | None = None,
         day_loss_per_m: Array | None = None,
     ) -> None:
-        """Fills `out` by `shading.shade`.
-
-        Args:
-            image: albedo and depth.
-            camera, floor, surface: see `radiance`.
-            out: arrays to fill.
-            focal_px: focal length of the image of the surroundings, which gets no backscatter; None: the image is that
-                of `rig`, with backscatter.
-            day_loss_per_m: (3,) loss of daylight between floor and camera [1/m]; None: that of the illumination.
-        """
+        """Fills `out` by `shading.shade`."""
         albedo, depth = image
         focal = np.float32(focal_px or self._rig.focal_px)
         above = self._calm_surface if surface is None else surface

@@ -48,18 +48,12 @@ class PhaseTable(NamedTuple):
     The cells are narrow where the function is steep: with n = 4096, their width is 0.0017 deg at 0.1 deg and 0.017 deg
     at 10 deg. The Monte Carlo reference evaluates and samples this piecewise constant function; `phase_at` interpolates
     linearly between the centres of the cells.
-
-    Args:
-        density_per_sr: (n,) mean of the phase function over each cell.
-        cumulative: (n + 1,) share of the scattered light whose scattering angle is below each cell boundary.
-        cumulative_angle: (n + 1,) integral of density times angle up to each boundary, divided by `angle_integral`.
-        angle_integral: integral of density times angle from 0 to pi [rad^2/sr].
     """
 
-    density_per_sr: Array
-    cumulative: Array
-    cumulative_angle: Array
-    angle_integral: float
+    density_per_sr: Array  # (n,) mean of the phase function over each cell
+    cumulative: Array  # (n + 1,) share of the scattered light whose scattering angle is below each cell boundary
+    cumulative_angle: Array  # (n + 1,) integral of density times angle up to each boundary, divided by `angle_integral`
+    angle_integral: float  # integral of density times angle from 0 to pi [rad^2/sr]
 
     @property
     def mean_cosine(self) -> float:
@@ -84,16 +78,11 @@ ParticleFunction = Literal["petzold", "fournier_forand", "henyey_greenstein"]
 
 
 class Scatterer(NamedTuple):
-    """Molecules and particles that scatter the light of one band.
+    """Molecules and particles that scatter the light of one band."""
 
-    Args:
-        particles: phase function of the particles.
-        molecular_share: share of the molecules in the scattering coefficient.
-        parameters: those of the phase function: index and slope (Fournier-Forand), mean cosine (Henyey-Greenstein).
-    """
-
-    particles: ParticleFunction = "petzold"
-    molecular_share: float = 0.0
+    particles: ParticleFunction = "petzold"  # phase function of the particles
+    molecular_share: float = 0.0  # share of the molecules in the scattering coefficient
+    # those of the phase function: index and slope (Fournier-Forand), mean cosine (Henyey-Greenstein)
     parameters: tuple[float, ...] = ()
 
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.imaging.light.pixel_sum import sum_of_entries
-from twin.imaging.light.powers import LOG2_E, two_to
+from twin.imaging.light.vector_math import LOG2_E, sum_of_entries, two_to
 from twin.imaging.scene.facets import UNIT
 from twin.imaging.scene.materials import add_reflected
 from twin.kernels import kernel
@@ -133,12 +132,6 @@ def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, 
     of their unit normals at `SAMPLES`: the light of a matt facet is proportional to a component of its normal, so this
     is the light of the whole area of the pixel. The points of the floor at the samples are those of the plane of the
     facet at the centre of the pixel.
-
-    Args:
-        facets: `facets.FacetView`; its docstring defines the stored normals that are unpacked here.
-        cells: (n + 1, W) int32 working memory for the facet at each of the n `SAMPLES` and at the centre.
-        stored, mixed: (W,) int32 working memory.
-        work: (3, W) float32 working memory.
     """
     normals, origin, grid, turn = facets
     zero, one, half, far = np.float32(0), np.float32(1), np.float32(0.5), np.float32(FAR_M)
@@ -185,16 +178,7 @@ def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, 
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _cells_of_points(facets, floor, y, focal, shift, cells):
-    """Fills `cells` (W,) with the number of the facet that each pixel of a row shows at a point within the pixel.
-
-    Args:
-        facets: `facets.FacetView`.
-        floor: (W,) depth of the floor, and its relative decrease per pixel along the row and down.
-        y: ratio of y and depth at the centres of the pixels.
-        focal: focal length [px].
-        shift: column and row of the point, relative to the centre of the pixel [px].
-        cells: result; the first facet of cell (row, col) has the number 2 (row cols + col).
-    """
+    """Fills `cells` (W,) with the number of the facet that each pixel of a row shows at a point within the pixel."""
     normals, origin, grid, _ = facets
     z, along, down = floor
     rows, cols, _ = normals.shape

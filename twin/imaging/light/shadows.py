@@ -36,30 +36,20 @@ BIAS_M = 1e-4  # the floor must be this much higher than a ray to occlude it, as
 
 
 class _Grid(NamedTuple):
-    """Floor heights prepared for ray casting.
+    """Floor heights prepared for ray casting."""
 
-    Args:
-        height_m: (ny, nx) heights of the grid nodes; row 0 = south, column 0 = west.
-        cell_top_m: (ny - 1, nx - 1) height of the highest corner of each cell.
-        block_top_m: (rows, cols) height of the highest node of each block of cells.
-        west_m, south_m: position of the first node.
-        spacing_m: distance between neighbouring nodes.
-    """
-
-    height_m: NDArray[np.float32]
-    cell_top_m: NDArray[np.float32]
-    block_top_m: NDArray[np.float32]
-    west_m: float
+    height_m: NDArray[np.float32]  # (ny, nx) heights of the grid nodes; row 0 = south, column 0 = west
+    cell_top_m: NDArray[np.float32]  # (ny - 1, nx - 1) height of the highest corner of each cell
+    block_top_m: NDArray[np.float32]  # (rows, cols) height of the highest node of each block of cells
+    west_m: float  # position of the first node
     south_m: float
-    spacing_m: float
+    spacing_m: float  # distance between neighbouring nodes
 
 
 class Shadows:
     """Shadow casting: determines which pixels each lamp and the sun illuminate.
 
     Args:
-        floor: heights of the floor.
-        rig: the rendered cameras.
         lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
         to_sun: (3,) unit direction to the sun in the axes of the floor; None = no sun, or one that casts no shadow.
     """
@@ -135,16 +125,7 @@ def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
 
 @kernel(error_model="numpy")
 def _find_floor(here, y, focal, pose, there, east, north, up):
-    """Fills the positions in the world of the points that the pixels of a row show.
-
-    Args:
-        here: (W,) depths of the pixels [m]; infinite where a pixel shows no floor.
-        y: row coordinate of the pixels on the image plane at depth 1.
-        focal: focal length [px].
-        pose: (4, 4) world_from_camera.
-        there: (W,) filled with whether each pixel shows the floor.
-        east, north, up: (W,) filled with the positions [m].
-    """
+    """Fills the positions in the world of the points that the pixels of a row show."""
     a, b, c = pose[0, 0], pose[0, 1] * y + pose[0, 2], pose[0, 3]
     d, e, f = pose[1, 0], pose[1, 1] * y + pose[1, 2], pose[1, 3]
     g, h, i = pose[2, 0], pose[2, 1] * y + pose[2, 2], pose[2, 3]
@@ -260,11 +241,7 @@ def _cast(grid, depth, focal, pose, lamp, v, u):
 
 @kernel(error_model="numpy", inline="always")
 def _grid_steps(at, along, cell, size):
-    """Prepares the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart.
-
-    Returns:
-        Step of the cell index (-1, 0 or 1), t at the next grid line, and increment of t from line to line.
-    """
+    """Prepares the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart."""
     if along == 0:
         return 0, np.inf, np.inf
     per_along = 1 / along

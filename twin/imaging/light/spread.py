@@ -50,17 +50,11 @@ LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
 
 
 class Absorbed(NamedTuple):
-    """Optical properties of the water in one band, for the kernels of scattered light.
+    """Optical properties of the water in one band, for the kernels of scattered light."""
 
-    Args:
-        absorption_per_m: absorption coefficient a [1/m].
-        scattering_per_m: scattering coefficient b [1/m].
-        scatterer: molecules and particles that scatter the light.
-    """
-
-    absorption_per_m: float
-    scattering_per_m: float
-    scatterer: Scatterer
+    absorption_per_m: float  # absorption coefficient a [1/m]
+    scattering_per_m: float  # scattering coefficient b [1/m]
+    scatterer: Scatterer  # molecules and particles that scatter the light
 
 
 @lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
@@ -68,9 +62,7 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
     """Returns the kernel of scattered light of a lamp, relative to exp(-a d), as a mixture of Gaussians.
 
     Args:
-        water: one band of the water.
         distances_m: (n,) distances from the lamp.
-        receiver: where the light arrives, on a floor or on a particle in the water.
 
     Returns:
         (n, m) weights of normalised Gaussians in the angle at the lamp, with the standard deviations `LAMP_SIGMA_RAD`.
@@ -85,7 +77,6 @@ def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[f
     """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), as a mixture of Gaussians.
 
     Args:
-        water: one band of the water.
         ranges_m: (n,) ranges of the floor.
         sigmas: (m,) standard deviations of the Gaussians, as tangents; 0 is light that is not blurred.
 
@@ -162,12 +153,7 @@ def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array
 
 @cache
 def _camera_geometry() -> tuple[Array, Array, Array]:
-    """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera.
-
-    Returns:
-        Index of the ring of tan(beta), and excess length of the scattered path over the straight one, divided by the
-        range, each (STEPS, ANGLES) over u and t; solid angles (ANGLES,) of the cells of t [sr].
-    """
+    """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera."""
     edges = _rings(np.pi / 2 * 0.999)
     t = _middle(edges)
     u = (np.arange(STEPS) + 0.5)[:, None] / STEPS
@@ -194,12 +180,6 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
     """Returns the weights (n, m) of the Gaussians for light that is scattered at least once.
 
     The transform of that light, exp(-t) (exp(t K) - 1), is fitted by Gaussians with weights of 0 or more.
-
-    Args:
-        once: (n, rings) light scattered once in each ring, per optical thickness of scattering.
-        edges: (rings + 1,) edges of the rings.
-        thickness: (n,) optical thickness of scattering t.
-        sigmas: (m,) standard deviations of the Gaussians.
     """
     k = _frequencies(float(sigmas[sigmas > 0].min()), float(sigmas.max()))
     transform = once @ _ring_transforms(k, edges).T
@@ -212,13 +192,7 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
 
 
 def _fit(basis: Array, wanted: Array) -> Array:
-    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel.
-
-    Args:
-        basis: (frequencies, m) transforms of the Gaussians; the first row, at frequency 0, is multiplied by
-            `WEIGHT_OF_TOTAL`, so that the integral is fitted best.
-        wanted: (frequencies,) transform of the kernel.
-    """
+    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel."""
     total = wanted[0]
     if total <= 0:
         return np.zeros(basis.shape[1])
@@ -228,12 +202,7 @@ def _fit(basis: Array, wanted: Array) -> Array:
 
 
 def _frequencies(least: float, most: float) -> Array:
-    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least.
-
-    Args:
-        least, most: smallest and largest standard deviation of the Gaussians; the frequencies are in radians per unit
-            of these.
-    """
+    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least."""
     return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
 
 

@@ -21,15 +21,10 @@ CRITICAL_COSINE = float(np.sqrt(1 - 1 / SEA_WATER_INDEX**2))  # cosine of the ed
 
 
 class SunSky(NamedTuple):
-    """Daylight just below the surface, for an illuminance of 1 lx on the horizontal plane.
+    """Daylight just below the surface, for an illuminance of 1 lx on the horizontal plane."""
 
-    Args:
-        to_sun: (3,) unit direction to the refracted sun, east, north, up.
-        sky_share: share of the illuminance that is light of the sky; the rest is the beam of the sun.
-    """
-
-    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    sky_share: float = 0.0
+    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)  # (3,) unit direction to the refracted sun, east, north, up
+    sky_share: float = 0.0  # share of the illuminance that is light of the sky; the rest is the beam of the sun
 
     @property
     def sun_cosine(self) -> float:
@@ -52,7 +47,6 @@ def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, f
 
     Args:
         elevation_deg: elevation of the sun above the horizon, in air.
-        azimuth_deg: direction to the sun, counter-clockwise from x (east).
     """
     sine = np.cos(np.deg2rad(elevation_deg)) / SEA_WATER_INDEX if elevation_deg < 90 else 0.0
     east, north = sine * np.cos(np.deg2rad(azimuth_deg)), sine * np.sin(np.deg2rad(azimuth_deg))

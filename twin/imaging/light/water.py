@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from twin.core.user_files import reading
 from twin.errors import TwinError
-from twin.imaging.light.bands import CENTRE_NM, NM, band_weights, effective_per_m
-from twin.imaging.light.light_spectra import Light, spectrum_of
 from twin.imaging.light.phase_function import Scatterer, molecular_scattering_per_m
+from twin.imaging.light.spectra import CENTRE_NM, NM, Light, band_weights, effective_per_m, spectrum_of, water_spectrum
 from twin.imaging.light.spread import Absorbed
-from twin.imaging.light.water_tables import water_spectrum
 from twin.scenario.model import ScatteringModel, WaterConfig
 
 Array = NDArray[np.float64]
@@ -25,18 +23,13 @@ MAX_SPECTRUM_BYTES = 10_000_000
 
 
 class Medium(NamedTuple):
-    """Optical properties of the water in the bands R, G, B.
+    """Optical properties of the water in the bands R, G, B."""
 
-    Args:
-        absorption_per_m: (3,) absorption coefficient a [1/m].
-        scattering_per_m: (3,) scattering coefficient b [1/m].
-        scatterers: for each band, phase function of the particles and molecular share of b.
-        multiple: whether multiple scattering is modelled; else all light that is scattered from its path is lost.
-    """
-
-    absorption_per_m: Array
-    scattering_per_m: Array
+    absorption_per_m: Array  # (3,) absorption coefficient a [1/m]
+    scattering_per_m: Array  # (3,) scattering coefficient b [1/m]
+    # for each band, phase function of the particles and molecular share of b
     scatterers: tuple[Scatterer, ...] = (Scatterer(),) * 3
+    # whether multiple scattering is modelled; else all light that is scattered from its path is lost
     multiple: bool = True
 
     @property
@@ -67,11 +60,9 @@ def medium(
     """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
 
     Args:
-        water: the water of a scenario.
         scattering: `imaging.scattering`; with "none", the water does not scatter.
         path_m: path length of the light for which the effective absorption of each band is computed [m]; 0: mean
             absorption of the band.
-        light: light whose spectrum weights absorption and scattering in a band.
 
     Raises:
         TwinError: absorption or scattering is missing or given twice, the spectrum cannot be read (`read_spectrum`), or
@@ -89,7 +80,6 @@ def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, 
     b, and the rest of b is due to particles; otherwise all scattering is due to particles.
 
     Args:
-        water: the water of a scenario.
         scattering_per_m: (3,) scattering coefficient b of molecules and particles [1/m].
     """
     if water.phase_function == "sea":
@@ -105,11 +95,7 @@ def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, 
 
 
 def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
-    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type.
-
-    Raises:
-        TwinError: see `medium`.
-    """
+    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
     if given and water.spectrum_file is not None:
@@ -167,7 +153,6 @@ def downwelling_per_m(water: Medium, mean_cosine: float = 1.0) -> Array:
     function of Petzold's harbour water, b / a of 2 to 6 and mu0 of 0.85 to 1, `light_field` agrees with it within 4 %.
 
     Args:
-        water: optical properties of the water.
         mean_cosine: mean cosine of the zenith angle of the light just below the surface, mu0.
     """
     a, b = water.absorption_per_m, water.scattering_per_m

@@ -81,7 +81,6 @@ def slope_variance(wind_mps: float, above_rad_per_m: float = 1e-3) -> tuple[floa
 
     Args:
         wind_mps: wind speed 10 m above the sea.
-        above_rad_per_m: wave number of the longest wave that is included.
     """
     k = np.geomspace(above_rad_per_m, max(_SHORTEST_RAD_PER_M, 2 * above_rad_per_m), 4000)
     per_k, quarter = curvature_spectrum(k, wind_mps) / k, directionality(k, wind_mps) / 4

@@ -17,7 +17,6 @@ def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
 
     Args:
         is_plane: whether the floor is the plane z = 0; if not, it is `field`.
-        field: height field (`floor_rays.HeightField`).
         dx, dy, dz: unit direction, z up.
     """
     if is_plane:

@@ -97,7 +97,6 @@ def guide_density(density_per_sr, beyond, angle_integral, cosine):
         density_per_sr: (n,) phase function table [1/sr].
         beyond: (n + 1,) integral of the phase function over the angle, from each cell boundary to pi [rad/sr].
         angle_integral: integral of phase function times angle from 0 to pi [rad^2/sr].
-        cosine: cosine of the angle from the lamp or the sun.
     """
     g, cells = GUIDE_G, density_per_sr.shape[0]
     x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 1e-18)))

@@ -67,8 +67,6 @@ def response(scene, kind, normal, direction, ox, oy, oz):
     """Returns the share of the light from a direction that a vertex sends back along the path, per solid angle [1/sr].
 
     Args:
-        scene: `pixel_light.KernelScene`.
-        kind: ON_FLOOR (albedo / pi times the cosine of the angle of incidence) or IN_WATER (phase function).
         normal: unit normal of the floor; not used in water.
         direction: unit direction in which the backward path arrived.
         ox, oy, oz: unit direction from the vertex towards the light.
@@ -91,12 +89,8 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
     """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
 
     Args:
-        scene, kind, normal, direction: see `response`.
-        point: the vertex.
-        before: the previous vertex of the walk.
         density: density with which the direction from `before` to this vertex was sampled [1/sr]; if it is above 0, the
             light of each lamp is weighted by `share_of_walk`.
-        step_m: distance between the two vertices.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -191,7 +185,6 @@ def share_of_escape(scene, density, path_m):
 
     Args:
         density: density with which the walk samples the direction [1/sr].
-        path_m: distance to the surface in this direction.
     """
     by_walk = density * np.exp(-scene.scattering * path_m)
     by_connection = 1 / (2 * np.pi * (1 - scene.sun_cosine))
@@ -205,9 +198,7 @@ def light_above(scene, from_water, density, path_m, x, y, z):
     The disc is included only for a last vertex in the water; its radiance is weighted by `share_of_escape`.
 
     Args:
-        from_water: whether the last vertex of the walk is a scattering in the water.
         density: density with which the direction was sampled at the last vertex [1/sr].
-        path_m: distance from the last vertex to the surface.
         x, y, z: unit direction towards the light, in world axes.
     """
     last = scene.sky.shape[0] - 1
@@ -262,9 +253,7 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
     """Returns the density [1/sr] of `next_direction` at the direction (x, y, z).
 
     Args:
-        kind: ON_FLOOR or IN_WATER.
         direction: unit direction in which the backward path arrived at the vertex.
-        guided: share of the directions that are sampled around lamps and sun.
         own: response of the vertex to the direction (x, y, z). It is the density of the directions sampled from the
             phase function; divided by the albedo, that of the directions sampled from Lambert's cosine.
     """
@@ -292,11 +281,8 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
     1 / step_m^2 of both densities is left out.
 
     Args:
-        lamp_m: distance of the lamp from the previous vertex of the walk, where light scattered at the point arrives.
         phase: value of the phase function for the scattering at the point [1/sr].
-        to_lamp_m: distance of the lamp from the point.
         density: density with which the walk samples the direction from the previous vertex to the point [1/sr].
-        step_m: distance of the point from the previous vertex.
     """
     by_walk = density * scene.scattering * np.exp(-scene.scattering * step_m)
     by_connection = phase * lamp_m / (2 * np.pi * scene.angle_integral * to_lamp_m * to_lamp_m)
@@ -334,13 +320,8 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
     """Adds the light of one random walk to `sums`.
 
     Args:
-        scene: `pixel_light.KernelScene`.
-        view, bin_edges_px: see `bin_of`.
-        kind: ON_FLOOR if the first vertex is the floor point of the pixel, IN_WATER if it is a scattering on its ray.
         point: (3,) first vertex.
         direction: (3,) unit direction in which the backward path arrives there.
-        weight: weight of the first vertex.
-        rng: random stream.
         sums: (FIRST_BIN + 2 n,) sums of light [cd/m2], modified in place: DIRECT, LAMP_SCATTERED, VEIL_ONCE and
             VEIL_MORE; then the light from the floor that was scattered on its way to the camera, in n bins for light
             that had illuminated the floor without scattering or reflection, and in n bins for all other light.
@@ -454,11 +435,8 @@ def trace_plane(scene, point, normal, n_walks, rng):
     light of lamps is not included.
 
     Args:
-        scene: `pixel_light.KernelScene`.
         point: a point of the plane [m].
         normal: unit normal of the plane; light that arrives from the side of the normal counts.
-        n_walks: number of walks.
-        rng: random stream.
     """
     out, sums, no_view, edges = np.zeros(3), np.zeros(FIRST_BIN + 2), np.zeros((5, 3)), np.zeros(1)
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]

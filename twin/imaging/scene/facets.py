@@ -35,29 +35,21 @@ class Heights(Protocol):
 
 
 class FacetView(NamedTuple):
-    """Facets of the floor relative to a camera.
+    """Facets of the floor relative to a camera."""
 
-    Args:
-        normals: (rows, cols, 2) int32 stored normals of the two triangles of each cell, south-east and north-west of
-            the diagonal from the cell's south-west to its north-east node.
-        origin: (2,) column and row of the cell near the camera to which `grid_from_camera` refers, so that single
-            precision suffices.
-        grid_from_camera: (2, 4) map from a point in the axes of the camera [m] to column and row relative to `origin`.
-        camera_from_world: (3, 3) rotation from world axes to those of the camera.
-    """
-
+    # (rows, cols, 2) int32 stored normals of the two triangles of each cell, south-east and north-west of the diagonal
+    # from the cell's south-west to its north-east node
     normals: NDArray[np.int32]
+    # (2,) column and row of the cell near the camera to which `grid_from_camera` refers, so that single precision
+    # suffices
     origin: NDArray[np.int32]
+    # (2, 4) map from a point in the axes of the camera [m] to column and row relative to `origin`
     grid_from_camera: NDArray[np.float32]
-    camera_from_world: NDArray[np.float32]
+    camera_from_world: NDArray[np.float32]  # (3, 3) rotation from world axes to those of the camera
 
 
 class Facets:
-    """Facets of a floor, for cameras in any pose.
-
-    Args:
-        floor: heights of the floor.
-    """
+    """Facets of a floor, for cameras in any pose."""
 
     def __init__(self, floor: Heights):
         self._normals = _stored_normals(np.ascontiguousarray(floor.height_m, np.float32), floor.spacing_m)
@@ -94,10 +86,6 @@ def _store(rise_east, rise_north, spacing):
     """Returns the stored normal (x, y, z) of a triangle, with x east and y north.
 
     Its upper 16 bits are `UNIT` x / (1 + z), its lower 16 bits `UNIT` y / (1 + z).
-
-    Args:
-        rise_east, rise_north: change of height over one cell towards east and north [m].
-        spacing: side of a cell [m].
     """
     per = -UNIT / (spacing + np.sqrt(rise_east * rise_east + rise_north * rise_north + spacing * spacing))
     return np.int32((np.int64(np.round(rise_east * per)) << 16) | (np.int64(np.round(rise_north * per)) & 0xFFFF))

@@ -41,20 +41,13 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}
 
 
 class Material(NamedTuple):
-    """Reflection of the floor.
+    """Reflection of the floor."""
 
-    Args:
-        kind: LAMBERT, OREN_NAYAR or HAPKE.
-        a, b: coefficients A and B of Oren and Nayar's model.
-        specular: share F of the light that is mirrored.
-        alpha_squared: square of GGX's width parameter, the tangent of the highlight's `specular_width_deg`.
-    """
-
-    kind: int
-    a: np.float32
+    kind: int  # LAMBERT, OREN_NAYAR or HAPKE
+    a: np.float32  # coefficients A and B of Oren and Nayar's model
     b: np.float32
-    specular: np.float32
-    alpha_squared: np.float32
+    specular: np.float32  # share F of the light that is mirrored
+    alpha_squared: np.float32  # square of GGX's width parameter, the tangent of the highlight's `specular_width_deg`
 
 
 def material_of(terrain: TerrainConfig) -> Material | None:
@@ -76,10 +69,8 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
     """Returns the bidirectional reflectance [1/sr].
 
     Args:
-        material: `Material`.
         albedo: albedo, 0 to 1; like the following arguments in single precision.
         mu_i, mu_o: cosines of the angles of incidence and of view, above 0.
-        phase: cosine of the phase angle.
     """
     kind, a, b, specular, alpha_squared = material
     one, two, zero = np.float32(1), np.float32(2), np.float32(0)
@@ -109,11 +100,9 @@ def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, refl
     """Adds the light of one lamp that the floor reflects to the camera to `reflected`, for one row of W pixels.
 
     Args:
-        material: `Material`.
         lamp: properties of the lamp, of which the first three are its position in the axes of the camera [m].
         albedo: (W, 3) uint8, 255 = white.
         here: (W,) depth [m].
-        y: tangent of the row's angle from the optical axis.
         focal: focal length [px].
         normal: (3, W) unit normals in the axes of the camera.
         arriving: (3, W) illuminance by the lamp, attenuated on the path from lamp to floor [lx].

@@ -34,69 +34,45 @@ MARGIN_PX = 1e-3  #: the same, in the image
 
 
 class Projection(NamedTuple):
-    """Projection of points in the axes of a camera (x right, y down, z forward).
+    """Projection of points in the axes of a camera (x right, y down, z forward)."""
 
-    Args:
-        focal_px: focal length of a perspective view [px], or pixels per metre of a parallel view.
-        cx_px, cy_px: column and row of the optical axis.
-        near_m: triangles with a corner at a smaller depth are left out.
-        perspective: whether columns and rows are those of a pinhole camera.
-    """
-
-    focal_px: float
-    cx_px: float
+    focal_px: float  # focal length of a perspective view [px], or pixels per metre of a parallel view
+    cx_px: float  # column and row of the optical axis
     cy_px: float
-    near_m: float
-    perspective: bool
+    near_m: float  # triangles with a corner at a smaller depth are left out
+    perspective: bool  # whether columns and rows are those of a pinhole camera
 
 
 class ObjectView(NamedTuple):
-    """Objects in an image.
+    """Objects in an image."""
 
-    Args:
-        normal: (H, W, 3) float32 unit normals in the axes of the camera, valid where `label` is not 0.
-        label: (H, W) uint16, 1 + number of the object that the pixel shows; 0: the floor, or nothing.
-    """
-
+    # (H, W, 3) float32 unit normals in the axes of the camera, valid where `label` is not 0
     normal: NDArray[np.float32]
-    label: NDArray[np.uint16]
+    label: NDArray[np.uint16]  # (H, W) uint16, 1 + number of the object that the pixel shows; 0: the floor, or nothing
 
 
 class Target(NamedTuple):
-    """Images (H, W) that a mesh is drawn into, in the pixels where the mesh is nearer than `depth`.
+    """Images (H, W) that a mesh is drawn into, in the pixels where the mesh is nearer than `depth`."""
 
-    Args:
-        depth: depth along the optical axis [m]; inf where there is nothing.
-        albedo: (H, W, 3) uint8; None: not drawn.
-        normal: (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn.
-        label: (H, W) uint16 number that identifies the mesh in each pixel; None: not drawn.
-        uv: (H, W, 3) float32 values interpolated between `DrawnMesh.uv` of the vertices; None: not drawn.
-    """
-
-    depth: Depth
-    albedo: NDArray[np.uint8] | None = None
+    depth: Depth  # depth along the optical axis [m]; inf where there is nothing
+    albedo: NDArray[np.uint8] | None = None  # (H, W, 3) uint8; None: not drawn
+    # (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn
     normal: NDArray[np.float32] | None = None
+    # (H, W) uint16 number that identifies the mesh in each pixel; None: not drawn
     label: NDArray[np.uint16] | None = None
+    # (H, W, 3) float32 values interpolated between `DrawnMesh.uv` of the vertices; None: not drawn
     uv: NDArray[np.float32] | None = None
 
 
 class DrawnMesh(NamedTuple):
-    """A mesh to draw into images.
+    """A mesh to draw into images."""
 
-    Args:
-        mesh: triangles.
-        camera_from_object: (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera.
-        label: number to write into `Target.label`.
-        closed: whether the mesh is closed, so that the triangles that face away are not drawn.
-        parts: bounds of the parts of the mesh.
-        uv: (n, 3) values of the vertices, drawn into `Target.uv`; None: `Target.uv` is not drawn.
-    """
-
-    mesh: Mesh
-    camera_from_object: Array
-    label: int = 0
-    closed: bool = False
-    parts: Parts = UNKNOWN
+    mesh: Mesh  # triangles
+    camera_from_object: Array  # (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera
+    label: int = 0  # number to write into `Target.label`
+    closed: bool = False  # whether the mesh is closed, so that the triangles that face away are not drawn
+    parts: Parts = UNKNOWN  # bounds of the parts of the mesh
+    # (n, 3) values of the vertices, drawn into `Target.uv`; None: `Target.uv` is not drawn
     uv: NDArray[np.float32] | None = None
 
 
@@ -104,8 +80,6 @@ def draw_meshes(drawn: Sequence[DrawnMesh], projection: Projection, target: Targ
     """Draws meshes into images, in the pixels where a mesh is nearer than what they show, in parallel bands of rows.
 
     Args:
-        drawn: the meshes, in the order in which they are drawn.
-        projection: projection of the camera.
         target: images to draw into, modified in place.
     """
     draw = []
@@ -236,12 +210,7 @@ def _list_parts(parts, matrix, projection, window, closed, shown):
 
 @kernel(error_model="numpy", forceinline=True)
 def _interval(row, centre, half):
-    """Returns centre and half extent of a box along one axis of the camera.
-
-    Args:
-        row: (4,) row of the map from the axes of the box to this axis.
-        centre, half: (3,) centre and half extent of the box in its own axes [m].
-    """
+    """Returns centre and half extent of a box along one axis of the camera."""
     middle = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2] + row[3]
     return middle, abs(row[0]) * half[0] + abs(row[1]) * half[1] + abs(row[2]) * half[2]
 
@@ -322,10 +291,6 @@ def _list_pixels(
     The rectangle around a triangle is divided into blocks of 2 x 2 pixels, of which most triangles need one. For each
     block, the function writes its triangle, its first column and row, and the weights of the second and third corner
     at its pixels. A hit is 4 times the number of a block plus that of a pixel in it.
-
-    Returns:
-        Number of hits, and the values of `k` and `row` at which to continue if the arrays are full; `n_kept` for `k` if
-        all triangles are listed.
     """
     u, v = place[0], place[1]
     n_blocks, n_hits = 0, 0

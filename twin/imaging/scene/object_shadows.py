@@ -33,27 +33,18 @@ STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias g
 
 
 class _LightView(NamedTuple):
-    """View from a light, for its shadow map.
+    """View from a light, for its shadow map."""
 
-    Args:
-        light_from_camera: (4, 4) transform from the axes of the camera to those of the view.
-        projection: projection of the map.
-        limits: (k, 4) planes of the view, see `Objects.in_view`.
-        shape: rows and columns of the map.
-    """
-
-    light_from_camera: Array
-    projection: Projection
-    limits: Array
-    shape: tuple[int, int]
+    light_from_camera: Array  # (4, 4) transform from the axes of the camera to those of the view
+    projection: Projection  # projection of the map
+    limits: Array  # (k, 4) planes of the view, see `Objects.in_view`
+    shape: tuple[int, int]  # rows and columns of the map
 
 
 class ObjectShadows:
     """Shadow casting by objects.
 
     Args:
-        objects: the objects.
-        rig: the rendered cameras.
         lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
         to_sun: (3,) unit direction to the sun in world axes; None: the sun casts no shadow.
     """
@@ -77,7 +68,6 @@ class ObjectShadows:
         Args:
             lit: 0 where the floor occludes the light, else 1; modified in place.
             depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
-            view: the objects in the image.
             world_from_camera: (4, 4) pose of this camera.
             moment: camera (0 left, 1 right), and time since the start of the survey [s].
         """
@@ -114,13 +104,7 @@ class ObjectShadows:
 
 
 def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
-    """Returns the view from a lamp, with its axis in the mean direction of the points; None if no point is ahead of it.
-
-    Args:
-        lamp_m: (3,) position of the lamp in the axes of the camera.
-        points: (n, 3) points that the map shows, in the axes of the camera [m].
-        shape: rows and columns of the image.
-    """
+    """Returns the view from a lamp, its axis in the mean direction of the points; None if no point is ahead."""
     away = points - lamp_m
     rotation = _axes_along((away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0))
     seen = away @ rotation
@@ -141,13 +125,7 @@ def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightVi
 
 
 def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
-    """Returns the parallel view from the sun.
-
-    Args:
-        to_sun: (3,) unit direction to the sun in the axes of the camera.
-        points: (n, 3) points that the map shows, in the axes of the camera [m].
-        shape: rows and columns of the image.
-    """
+    """Returns the parallel view from the sun."""
     rotation = _axes_along(-to_sun)
     seen = points @ rotation
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
@@ -160,13 +138,7 @@ def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightVie
 
 
 def _scale(low: Array, high: Array, shape: tuple[int, int]) -> float:
-    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image.
-
-    Args:
-        low, high: (2,) lower and upper ends of the map along columns and rows: tangents for a focal length, metres for
-            a scale.
-        shape: rows and columns of the image.
-    """
+    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image."""
     area = np.maximum(high - low, 1e-3).prod()
     return float(np.sqrt(shape[0] * shape[1] / area))
 
@@ -186,12 +158,7 @@ def _axes_along(forward: Array) -> Array:
 
 
 def _looking(rotation: Array, position_m: Array) -> Array:
-    """Returns the transform (4, 4) from the axes of the camera to those of a view.
-
-    Args:
-        rotation: (3, 3) axes of the view, as columns, in the axes of the camera.
-        position_m: (3,) origin of the view in the axes of the camera.
-    """
+    """Returns the transform (4, 4) from the axes of the camera to those of a view."""
     return geometry.inverse(geometry.pose(rotation, position_m))
 
 
@@ -227,19 +194,7 @@ def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first
 
 @kernel(error_model="numpy", forceinline=True)
 def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
-    """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map.
-
-    Args:
-        depth: (w,) depth of the points in the camera [m].
-        x: (w,) their horizontal tangents in the camera.
-        y: vertical tangent of the row.
-        matrix: (3, 4) map from the axes of the camera to those of the view.
-        projection: projection of the map.
-        shape: rows and columns of the map.
-        cell: filled with the numbers of the pixels.
-        reach: filled with the depths of the points in the view [m].
-        bias: filled with the size of a pixel at these depths [m].
-    """
+    """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map."""
     scale, cx, cy, _, perspective = projection
     rows, cols = shape
     for u in range(depth.size):

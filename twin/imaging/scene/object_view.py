@@ -27,7 +27,6 @@ class Objects:
     """Objects in the world, with the level of detail that a view needs.
 
     Args:
-        placed: the objects.
         current_mps: (3,) velocity of the current, in which plants sway.
         floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: the floor is no mesh.
     """
@@ -55,8 +54,6 @@ class Objects:
         Args:
             camera_from_world: (4, 4) transform from world axes to those of the camera.
             limits: (k, 4) planes of the view frustum in these axes: unit normal, which points inward, and offset [m].
-            pixel: projection, whose pixels determine the levels of detail.
-            time_s: time since the start of the survey.
         """
         centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
@@ -74,11 +71,7 @@ class Objects:
         return drawn
 
     def uv_of(self, number: int) -> NDArray[np.float32] | None:
-        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes.
-
-        Args:
-            number: index of the mesh in `placed`.
-        """
+        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes."""
         return self._uv[number - self._n_objects] if number >= self._n_objects else None
 
 
@@ -89,9 +82,7 @@ def draw_objects(
     """Draws the objects in view into images, with their numbers + 1 as labels, and the textures of a mesh floor.
 
     Args:
-        objects: the objects.
         target: images to draw into; with textures, none of them is None.
-        camera_from_world, limits, projection, time_s: see `Objects.in_view`.
     """
     draw_meshes(objects.in_view(camera_from_world, limits, projection, time_s), projection, target)
     if objects.surface is not None:
@@ -99,12 +90,7 @@ def draw_objects(
 
 
 class ObjectRenderer:
-    """Renderer that draws objects into images of the floor.
-
-    Args:
-        objects: the objects.
-        rig: calibration of the rendered cameras.
-    """
+    """Renderer that draws objects into images of the floor."""
 
     def __init__(self, objects: Objects, rig: StereoRig):
         self._objects = objects
@@ -118,7 +104,6 @@ class ObjectRenderer:
             albedo: (H, W, 3) uint8 albedo of the floor.
             depth: (H, W) float32 depth of the floor along the optical axis [m]; inf where there is no floor.
             world_from_camera: (4, 4) pose of the camera.
-            time_s: time since the start of the survey.
         """
         view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
         uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)

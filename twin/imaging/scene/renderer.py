@@ -26,9 +26,7 @@ class Renderer:
     A renderer owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
 
     Args:
-        scene: MuJoCo model of the scene.
         width_px, height_px, vfov_deg: image size and vertical field of view; square pixels, centred principal point.
-        znear_m, zfar_m: depths of the clipping planes.
 
     Raises:
         TwinError: OpenGL is not available.
@@ -115,11 +113,7 @@ class Renderer:
 
 
 def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
-    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded.
-
-    Raises:
-        TwinError: OpenGL is not available.
-    """
+    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded."""
     try:
         gl = offscreen_context(width_px, height_px)
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -149,7 +143,6 @@ def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Ar
     """Returns a mask (n,) of the floor tiles that may be in view; all others lie outside a plane of the view frustum.
 
     Args:
-        scene: MuJoCo model of the scene.
         world_from_camera: (4, 4) pose of the camera.
         half_tangents: (2,) tangents of half the horizontal and vertical field of view.
     """

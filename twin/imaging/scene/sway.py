@@ -26,10 +26,7 @@ def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) ->
     """Returns the mesh of a plant as the current bends it; unchanged without a horizontal current.
 
     Args:
-        mesh: a level of detail of the upright plant, in the axes of the object.
-        item: the plant, of which `mesh` is a level of detail.
         current_mps: (3,) velocity of the current in the world.
-        time_s: time since the start of the survey.
     """
     speed = float(np.hypot(*current_mps[:2]))
     if speed == 0:
@@ -53,7 +50,6 @@ def largest_displacement_m(item: PlacedObject, current_mps: Array) -> float:
     It is 0 for an object that does not sway.
 
     Args:
-        item: the object.
         current_mps: (3,) velocity of the current in the world.
     """
     if not item.model.sways:

@@ -37,30 +37,20 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depth
 
 
 class WallSurface(NamedTuple):
-    """Steep parts of a floor for the compiled kernels. All coordinates are texels of the texture of the walls.
+    """Steep parts of a floor for the compiled kernels. All coordinates are texels of the texture of the walls."""
 
-    Args:
-        height: (ny, nx) float32 heights of the floor below its highest point.
-        number: (ny - 1, nx - 1), weights: (n, 2, 2, 2): see `twin.terrains.walls.Walls`.
-        texels: (n,) uint64 colours of all levels, row by row.
-        levels: (LEVELS, 3) int64: number of the first texel, rows and columns of each level, finest first. A texel of a
-            level is the mean of 2 x 2 texels of the level before.
-        spacing, length: distance between the nodes, length of the texture [texels].
-        corner_m: (2,) x and y of the south-west corner of the floor [m].
-        high_m: greatest height of the floor [m].
-        texel_m: side of a texel [m].
-    """
-
-    height: NDArray[np.float32]
-    number: NDArray[np.int32]
+    height: NDArray[np.float32]  # (ny, nx) float32 heights of the floor below its highest point
+    number: NDArray[np.int32]  # (ny - 1, nx - 1), weights: (n, 2, 2, 2): see `twin.terrains.walls.Walls`
     weights: NDArray[np.float32]
-    texels: NDArray[np.uint64]
+    texels: NDArray[np.uint64]  # (n,) uint64 colours of all levels, row by row
+    # (LEVELS, 3) int64: number of the first texel, rows and columns of each level, finest first. A texel of a level is
+    # the mean of 2 x 2 texels of the level before.
     levels: NDArray[np.int64]
-    spacing: np.float32
+    spacing: np.float32  # distance between the nodes, length of the texture [texels]
     length: np.float32
-    corner_m: Array
-    high_m: float
-    texel_m: float
+    corner_m: Array  # (2,) x and y of the south-west corner of the floor [m]
+    high_m: float  # greatest height of the floor [m]
+    texel_m: float  # side of a texel [m]
 
 
 def wall_surface(terrain: Terrain) -> WallSurface | None:
@@ -99,7 +89,6 @@ def paint_walls(
     """Blends the texture of the walls into an image of the floor, in place.
 
     Args:
-        surface: steep parts of the floor.
         albedo: (H, W, 3) uint8 albedo with the texture projected from above.
         depth: (H, W) depth of the floor along the optical axis [m]; inf where there is no floor.
         world_from_camera: (4, 4) pose of the camera; x right, y down, z forward.
@@ -123,11 +112,9 @@ def paint_walls_from_above(
     """Blends the texture of the walls into a parallel view of the floor from above, in place.
 
     Args:
-        surface: steep parts of the floor.
         albedo: (rows, cols, 3) uint8 albedo with the texture projected from above.
         x_m: (cols,) x of the samples.
         y_m: (rows,) y of the samples.
-        step_m: distance between the samples.
     """
     spacing_m = float(surface.spacing) * surface.texel_m
     columns, rows = (x_m - surface.corner_m[0]) / spacing_m, (y_m - surface.corner_m[1]) / spacing_m
@@ -136,13 +123,7 @@ def paint_walls_from_above(
 
 @kernel(fastmath=_FAST, error_model="numpy")
 def _paint(surface, albedo, depth, view, origin, focal, first, end):
-    """Compiled kernel of `paint_walls` for the rows first to end - 1.
-
-    Args:
-        view: (3, 4) map from the axes of the camera [m] to east and north of the cell `origin`, and down from the
-            highest point of the floor [texels].
-        origin: (2,) column and row of this cell.
-    """
+    """Compiled kernel of `paint_walls` for the rows first to end - 1."""
     height, width = depth.shape
     work, steep = np.empty((_N_WORK, width), np.float32), np.empty((3, width), np.int32)
     total, used = np.empty(width, np.uint64), np.empty(width, np.int64)
@@ -306,9 +287,6 @@ def _footprints(across, down, work, n):
     With J the (2, 2) displacement in the texture to the next pixel along both axes, the footprint is an ellipse, and
     its squared axes are the eigenvalues of J J^T. There are as many samples along the major axis as it is longer than
     the minor axis, MOST_SAMPLES at most, and the texels of the level are as large as the distance between the samples.
-
-    Args:
-        across, down: (W,) displacement along the columns of the texture; that along its rows is in `work`.
     """
     zero, one, half, most = np.float32(0), np.float32(1), np.float32(0.5), np.float32(MOST_SAMPLES)
     size = work[_LEVEL]
@@ -330,14 +308,7 @@ def _footprints(across, down, work, n):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _filtered(texels, levels, weight, along, turned, work, i, total, used):
-    """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added.
-
-    Args:
-        weight: weight of the texture in this pixel, 0 to 1.
-        along: column in the texture [texels].
-        turned: -1 if the texture runs from right to left, else 1.
-        of_pixel: column of `work`.
-    """
+    """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added."""
     samples, level = np.int64(work[_SAMPLES, i]), min(work[_LEVEL, i], np.float32(LEVELS - 1.001))
     fine = np.int64(level)
     each = np.int64(weight * np.float32(WHOLE) / work[_SAMPLES, i] + np.float32(0.5))
