@@ -56,10 +56,8 @@ class ImageFormation:
     """Model of the light that reaches each camera of the stereo camera, given albedo and depth of the floor.
 
     Args:
-        floor: heights of the floor, which has facets and, with `imaging.shadows`, casts shadows; None = a smooth floor
-            whose normals follow from its depth, and no shadows, not even of objects.
+        floor: heights with facets and, with `imaging.shadows`, shadows; None = a smooth floor without any shadows.
         rig: the rendered cameras; None = the believed rig.
-        objects: objects on the floor; None = none.
     """
 
     def __init__(
@@ -110,7 +108,7 @@ class ImageFormation:
             albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
             camera: 0 left, 1 right.
-            objects: the objects that were drawn into `albedo` and `depth`; None: the image shows the floor alone.
+            objects: those drawn into `albedo` and `depth`; None: the image shows the floor alone.
         """
         light = self.radiance_without_snow(albedo, depth, camera, pose, objects)
         self.add_snow(light, depth, camera, pose)
@@ -126,12 +124,7 @@ class ImageFormation:
     def add_snow(
         self, light: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None = None
     ) -> None:
-        """Draws marine snow, if enabled, into `light` (H, W, 3) in place.
-
-        Args:
-            light: (H, W, 3) light of floor and water.
-            motion: motion of the camera during the exposure, which images particles as streaks; None = no motion.
-        """
+        """Draws marine snow, if enabled, into `light` (H, W, 3) in place, as streaks along the `motion` of the camera."""
         if self._snow is not None:
             self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion)
 

@@ -1,20 +1,14 @@
 """Restoration: the albedo of the floor from an image, without the effects of lamps, daylight and water.
 
-It inverts the model of `optics` with the believed calibration, lamps and water, and with the estimated floor. With rho
-the albedo, W the light of a white floor that absorption alone attenuates on its way to the camera, u = exp(-b r) the
-unscattered share (b the scattering coefficient, r the range), k the share that arrives without blur, F the scattered
-light of the floor (`forward_scatter`) and B the backscatter, the radiance of an image is
-
-    L = rho W u + F(rho W) + B.
-
-A floor of uniform albedo gives the first estimate rho = (L - B) / (W u + F(W)). Then the blurred light of this estimate
-is subtracted, and the rest is light without blur:
+It inverts the model of `optics` with the believed calibration, lamps and water, and the estimated floor. With rho the
+albedo, W the light of a white floor attenuated by absorption, u = exp(-b r), k the share without blur, F the scattered
+light of the floor and B the backscatter, L = rho W u + F(rho W) + B. The first estimate is that of a uniform albedo,
+rho = (L - B) / (W u + F(W)), corrected by
 
     rho <- (L - B - (F(rho W) - (k - u) rho W)) / (k W).
 
-The first estimate is right for all detail that is wider than the blur, so few steps suffice. With single scattering,
-rho = (L - B) / W, where scattering attenuates W too. Marine snow, caustics, shadows of objects, blur of the lens and of
-motion, and saturation are not corrected; the floor is taken to be Lambertian.
+With single scattering, rho = (L - B) / W. Snow, caustics, shadows of objects, blur of lens and motion, and saturation
+are not corrected; the floor is taken to be Lambertian.
 """
 
 from __future__ import annotations

@@ -1,18 +1,11 @@
 """Marine snow: small particles that drift with the current through the light of lamps and sun.
 
-The particles fill a periodic box around the left camera: when the vehicle moves, a particle that leaves the box on one
-side re-enters on the opposite side. Both cameras and consecutive frames therefore show the same particles. A particle
-of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, f the focal length. Its image is
-blurred by one pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens with an aperture of
-diameter A, focused at depth s. During the exposure the particle moves through the image; its light is spread evenly
-along this path, whose length is its velocity in the image times the exposure time. A rolling shutter images it where it
-is when its row is read. If the rolling shutter is applied to the whole image after the particles are drawn, it
-displaces them like the floor behind them; they are therefore drawn displaced by the difference between their own
-displacement and the floor's.
-
-The particles have one diameter or a size distribution: Junge (1963) found that the number of particles per interval of
-diameter falls as a power of the diameter, n(D) ~ D^-j. The cumulative distribution between the limits a and b is
-(a^(1-j) - D^(1-j)) / (a^(1-j) - b^(1-j)).
+The particles fill a periodic box around the left camera, so both cameras and consecutive frames show the same ones. A
+particle of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, blurred by one pixel and
+by the circle of confusion A f |1/z - 1/s|, and spread evenly along its path during the exposure. A rolling shutter
+images it where it is when its row is read; if the whole image is displaced later, it is drawn displaced by the
+difference from the floor behind it. Diameters follow a power law n(D) ~ D^-j between a and b (Junge 1963), with the
+cumulative distribution (a^(1-j) - D^(1-j)) / (a^(1-j) - b^(1-j)).
 """
 
 from __future__ import annotations
@@ -92,12 +85,7 @@ class MarineSnow:
     def visible_particles(
         self, world_from_left: Array, camera: int, time_s: float, reach_m: float = 0.0, farthest_m: float = np.inf
     ) -> VisibleParticles:
-        """Returns the particles in view of a camera (0 left, 1 right) with their radiance.
-
-        Args:
-            world_from_left: (4, 4) pose of the left camera.
-            camera: 0 left, 1 right.
-        """
+        """Returns the particles in view of a camera (0 left, 1 right) with their radiance."""
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
         low = world_from_left[:3, 3] - BOX_M / 2
@@ -124,14 +112,8 @@ class MarineSnow:
         time_s: float,
         motion: ExposureMotion | None = None,
     ) -> None:
-        """Draws the particles in front of the floor into the radiance `light` (H, W, 3) of a camera, in place.
-
-        Args:
-            light: (H, W, 3) radiance.
-            depth: (H, W) depth of the floor [m].
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            camera: 0 left, 1 right.
-            motion: motion of the camera during the exposure; None = no motion.
+        """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance `light` (H, W, 3), in
+        place.
         """
         rig, defocus = self._rig, self._defocus
         farthest_m = float(depth.max())
@@ -174,9 +156,7 @@ class MarineSnow:
     def _radiance(self, points: Array, lamps: LampLight, height_m: float) -> Array:
         """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
 
-        Light that is scattered between a particle and the camera is lost. At the camera, daylight has the illuminance
-        that belongs to the camera's height `height_m` above the reference plane z = 0; it decreases along the optical
-        axis.
+        Light scattered between particle and camera is lost; daylight decreases along the optical axis.
         """
         day, loss_per_m = lamps.sources.daylight, self._water.attenuation_per_m
         below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
@@ -220,9 +200,8 @@ def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
 def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
     """Fills `centre` (n, 2) with the middle of each particle's path, and `path` (n, 2) with the vector along it [px].
 
-    A rolling shutter reads the row v at t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row
-    v_0 at mid-exposure and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the
-    divisor 1 - v' readout / (n_rows - 1) limited to 0.1 or more.
+    A rolling shutter reads the row v = v_0 + v' t at t = readout (v / (n_rows - 1) - 1/2), with the divisor 1 - v'
+    readout / (n_rows - 1) limited to 0.1 or more.
     """
     (focal, cx, cy), (exposure_s, readout_s, rolls_later) = lens, moves
     row_s, bottom, right, still = readout_s / (depth.shape[0] - 1), depth.shape[0] - 1, depth.shape[1] - 1, np.zeros(3)
@@ -252,12 +231,10 @@ def _image_velocity(x, y, z, focal, drift, twist):
 
 @kernel
 def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_px, reach_px_m, farthest_m):
-    """Returns the indices (n,) of the particles in view, their positions in the axes of the camera, and their pixels.
+    """Returns indices (n,), positions (n, 3) in camera axes [m] and pixels (n, 2) of the particles in view.
 
-    The positions are (n, 3), the pixels (n, 2). A particle is in view if its depth is between NEAREST_M and
-    `farthest_m`, and its projection is less than `margin_px` + `reach_px_m` / depth outside the image. With `start`
-    (m, 3) the positions in the box at time 0, `low` (3,) the lower corner of the present box and `shift` (3,) the drift
-    minus `low`, the positions in the world are `low` + mod(`start` + `shift`, BOX_M) [m].
+    In view are depths between NEAREST_M and `farthest_m` and projections up to `margin_px` + `reach_px_m` / depth
+    outside the image. Positions in the world are `low` + mod(`start` + `shift`, BOX_M) [m].
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
     pixel, focal, (cx, cy) = np.empty((len(start), 2)), focals[0], (middle[0], middle[1])

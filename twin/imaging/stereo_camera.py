@@ -109,9 +109,8 @@ class StereoCamera:
         self._n_captures = 0
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
-        """Returns the image of the left camera and, if `stereo`, the simultaneous image of the right camera.
-
-        Each call advances the time by one frame.
+        """Returns the image of the left camera and, if `stereo`, of the right one; each call advances the time by one
+        frame.
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
@@ -138,13 +137,8 @@ class StereoCamera:
         return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
 
     def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
-        """Returns the left and the right image (H, W, 3) at the time of the last capture.
-
-        Has no effect on later captures. The noise is that of the next capture.
-
-        Args:
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
+        """Returns both images (H, W, 3) at the time of the last capture, with the noise of the next; has no effect on
+        that.
         """
         kept = self._sensor, self._rngs, self._n_captures
         self._sensor, self._rngs = copy.deepcopy(kept[:2])
@@ -163,10 +157,7 @@ class StereoCamera:
     def decompose(self, world_from_left: Array, twist_body: Array = AT_REST, time_s: float = 0.0) -> DecomposedImage:
         """Returns the left image at a pose and time with intermediate results; has no effect on later captures.
 
-        Args:
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s]; affects the
-                image and the digital numbers, not the components.
+        The motion affects the image and the digital numbers, not the components.
         """
         albedo, depth = self._renderer.render(world_from_left)
         pose = StampedPose(world_from_left, time_s)
@@ -216,12 +207,9 @@ class StereoCamera:
     def _through_lens(
         self, floor: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None
     ) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water.
+        """Returns the radiance (h, w, 3) at the raw pixels from the light of floor and water, which may be modified.
 
-        The array `floor` may be modified.
-
-        Depth of field and motion blur depend on depth; marine snow, which has other depths and velocities, is drawn
-        with its own blur afterwards.
+        Marine snow, which has other depths and velocities, is drawn with its own blur afterwards.
         """
         light = self._psf.out_of_focus(floor, depth)
         if motion is not None:

@@ -1,21 +1,13 @@
 """Point spread function of a lens: diffraction, aberrations, lateral colour and depth of field.
 
-The image of a point is described by the modulation transfer function (MTF), the contrast at a spatial frequency nu
-relative to that at frequency 0. A lens of f-number N without aberrations has, in light of wavelength l (Goodman,
-Introduction to Fourier Optics, section 6.3; Hopkins 1955), with x = nu l N,
+The modulation transfer function (MTF) of a lens of f-number N at the spatial frequency nu and the wavelength l is, with
+x = nu l N (Goodman, Introduction to Fourier Optics, section 6.3; Hopkins 1955),
 
     MTF = 2 / pi (arccos(x) - x sqrt(1 - x^2)),    0 for x > 1
 
-Aberrations are described by a Gaussian of standard deviation sigma in the image, MTF = exp(-2 pi^2 sigma^2 nu^2).
-Diffraction and aberrations may differ between the colour bands, as may the scale of the image (lateral colour).
-
-A point at depth z is imaged as a disc of the diameter (circle of confusion)
-
-    c = A f |1/z - 1/s|
-
-for a lens with an aperture of diameter A, focused at depth s, with f the focal length in water [px] (thin lens; the
-focal length is negligible compared with s). A pixel gets the mean light over the disc that belongs to its own depth, so
-the blur of a near object does not spread over the background.
+times exp(-2 pi^2 sigma^2 nu^2) for aberrations. A point at depth z is imaged as a disc of the diameter A f |1/z - 1/s|,
+with the aperture A, the depth s in focus and the focal length f in water [px] (thin lens). A pixel gets the mean light
+over the disc of its own depth.
 """
 
 from __future__ import annotations
@@ -89,11 +81,8 @@ class LensPsf:
         self._scales = _magnification(lens, rig) if any(lens.lateral_colour) else None
 
     def out_of_focus(self, light: Radiance, depth: Depth) -> Radiance:
-        """Returns the radiance (H, W, 3) with defocus blur; `light` itself if the blur is off or negligible.
-
-        Args:
-            light: (H, W, 3) radiance.
-            depth: (H, W) depth along the optical axis [m]; inf is valid.
+        """Returns the radiance (H, W, 3) with defocus blur at depths (H, W) [m]; `light` itself if it is off or
+        negligible.
         """
         if self._defocus is None:
             return light

@@ -1,9 +1,7 @@
 """Pixel model: shot noise, full well, read noise, gain and quantization to digital numbers.
 
-The linear model of EMVA 1288: photons generate electrons with Poisson statistics, read-out adds normal noise, and the
-camera outputs a black level plus K (electrons + noise), with K the system gain, clipped to the largest digital number.
-Dark current, which is negligible for exposures of milliseconds in cold water, and non-uniformity of the pixels are not
-modelled.
+The linear model of EMVA 1288: Poisson-distributed electrons, normal read noise, and a black level plus K (electrons +
+noise), clipped to the largest digital number. Dark current and non-uniformity are not modelled.
 """
 
 from __future__ import annotations
@@ -91,9 +89,8 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 def _normal_to_poisson(expected, shot):
     """Replaces standard normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
 
-    The counts are m + s z + (z^2 - 1) / 6, rounded, with m the mean: the first terms of the Cornish-Fisher expansion
-    (1938), which give the skewness. s^2 = m - 1/18 - 1/12 compensates for the variance of the quadratic term and of the
-    rounding.
+    The counts are round(m + s z + (z^2 - 1) / 6), the first terms of the Cornish-Fisher expansion (1938); s^2 = m -
+    1/18 - 1/12 compensates for the variance of the quadratic term and of the rounding.
     """
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(shot.size):

@@ -1,15 +1,9 @@
 """Sampling of a rendered image along the rays of the true pixels: lens, port and rolling shutter in one resampling.
 
-A pixel of the raw image has a ray o + s d in the axes of the rendered camera, with the origin o, the direction d and
-the parameter s. A rolling shutter exposes row v of h rows at
-
-    t = readout (v / (h - 1) - 1/2)
-
-after the middle of the read-out, when a camera with constant twist xi has moved by exp(xi t), so the ray in the axes of
-the camera at mid-exposure is turned and shifted by that pose. Relative to the principal point, the column where
-the ray meets the floor is f d_x / d_z + f (o_x - o_z d_x / d_z) / z, with z the depth of the floor there and f the
-focal length; the row is that with y in place of x. This equation is solved for the position by iteration, for a whole
-row at a time so that the compiler can vectorize it; it starts from the depths that the rays of the previous row meet.
+A pixel of the raw image has a ray o + s d in the axes of the rendered camera. A rolling shutter exposes row v of h at t
+= readout (v / (h - 1) - 1/2) after mid-exposure, when a camera with twist xi has moved by exp(xi t). The ray meets the
+floor of depth z at the column f d_x / d_z + f (o_x - o_z d_x / d_z) / z from the principal point; rows alike. This is
+solved by iteration for a whole row, from the depths that the rays of the previous row meet.
 """
 
 from __future__ import annotations
@@ -111,9 +105,8 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
 
-    Rows 2 and 3 are filled with the vanishing points of the rays, rows 4 and 5 with their parallax, and row 6 with the
-    inverse depth of the floor. The iteration starts from the inverse depth of the previous row or, if `is_first`, from
-    that at the vanishing points. Row 7 is not used; `cells` (w,) int32 is working memory.
+    Rows 2 and 3 get the vanishing points, 4 and 5 the parallax, 6 the inverse depth, from which the next row starts
+    unless `is_first`.
     """
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]

@@ -1,9 +1,7 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps are not used, because they round positions to 1/32 px. For radiance, the B-spline is the point spread
-function of a pixel: it suppresses spatial frequencies above half a cycle per pixel, which would alias. Sensor images
-are interpolated: a prefilter makes the spline pass through the value of every pixel (Unser et al. 1993, doi
-10.1109/78.193221).
+OpenCV's warps round positions to 1/32 px. For radiance, the B-spline is the point spread function of a pixel; sensor
+images are interpolated after a prefilter (Unser et al. 1993, doi 10.1109/78.193221).
 """
 
 from __future__ import annotations

@@ -29,16 +29,9 @@ DARK_CD_M2 = 1e-6  # lower limit of the metered radiance
 class AutoExposure:
     """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest band reaches `gray_level`.
 
-    The brightest band is used because water absorbs the colours unequally: if the mean of all bands were metered, the
-    least absorbed band would saturate. The gain of a frame is computed from the previous frames, as in a real
-    camera; the gain of the first frame is computed from that frame itself.
-
-    Args:
-        lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
-        limits: smallest and largest gain [1 / (cd/m2)].
-
-    Attributes:
-        share: fraction by which log gain approaches its target per frame.
+    The mean of all bands would let the least absorbed one saturate. The gain follows from the previous frames, that of
+    the first frame from itself. `lag_s` is a time constant, 0 = no lag; `limits` are the smallest and largest gain [1 /
+    (cd/m2)]; `share` is the fraction by which log gain approaches its target per frame.
     """
 
     def __init__(
@@ -125,13 +118,9 @@ class PlainSensor:
 
 
 def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
-    """Returns the noisy 8-bit image (H, W, 3) of a radiance image.
+    """Returns the noisy 8-bit image (H, W, 3) of a radiance image [cd/m2].
 
-    With signals as fractions of full scale, the noise variance is noise_sd^2 + shot_noise^2 * signal.
-
-    Args:
-        radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
-        gain: image signal per unit of radiance [1 / (cd/m2)]; a signal of 1 saturates.
+    With signals as fractions of full scale, `gain` per cd/m2, the noise variance is noise_sd^2 + shot_noise^2 * signal.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)

@@ -1,12 +1,8 @@
 """Geometry of the true cameras: maps rendered images to raw images, and raw images to rectified frames.
 
-The floor is rendered for two parallel pinhole cameras in water, with images larger than the frames where necessary.
-Each pixel of a raw image has its own ray through lens and port; the radiance of the pixel is sampled from the rendered
-image at the point where its ray intersects the rendered floor. The sensor model converts the sampled radiance to the
-raw image, which is rectified with the believed calibration to obtain the frame. If both true cameras equal the believed
-pinhole cameras, apart from the baseline, the rendered image is used unchanged.
-
-Raw images have the size of the frames plus a border that the rectification needs.
+The floor is rendered for two parallel pinhole cameras in water, with a margin where necessary. Each raw pixel has its
+own ray through lens and port and gets the radiance where this ray meets the rendered floor; the raw image is rectified
+with the believed calibration. If both true cameras equal the believed ones, the rendered image is used unchanged.
 """
 
 from __future__ import annotations
@@ -64,11 +60,9 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in the axes of the believed camera.
+        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in front of the believed camera, in its axes.
 
-        The points must lie in front of the camera; whether they lie inside the image is not checked. The result is NaN
-        for a point without a ray through the port, and for one that is too far off the optical axis for the distortion
-        model or more than arctan(`WIDEST_TANGENT`) off it.
+        They are NaN for a point without a ray through the port, or too far off the axis for the distortion model.
         """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
@@ -112,9 +106,7 @@ class TrueCameras:
         Args:
             light: (H, W, 3) radiance in the rendered image.
             depth: (H, W) depth in the rendered image [m].
-            camera: 0 left, 1 right.
-            motion: motion of the camera during the exposure; its rolling-shutter effect is applied if the rendered
-                images are resampled (`sampling` is not None). None: no motion.
+            motion: its rolling shutter is applied if `sampling` is not None. None: no motion.
         """
         if self.sampling is None:
             return light
@@ -141,13 +133,8 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points without an image.
-
-        Points outside the borders of the frame have pixel coordinates too.
-
-        Args:
-            points_m: (n, 3) points in the axes of the rendered camera [m].
-            camera: 0 left, 1 right.
+        """Returns the pixels (n, 2) in the rectified frame or beyond of points (n, 3) [m] in the rendered camera; NaN
+        if none.
         """
         rig = self.rendered_rig
         if self.sampling is None:

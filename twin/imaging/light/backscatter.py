@@ -1,9 +1,8 @@
 """Backscatter: light of lamps and daylight that the water scatters into the camera, between camera and floor.
 
-The light of a lamp, softened by scattering (`lamp_light`), is scattered into a ray of the camera with the coefficient
-b p(angle). On its way to the camera it is blurred like the light of the floor (`spread.camera_mixture`); the blur is
-computed on the coarse grid of the table, separately for each range. With single scattering, there is no blur, and the
-light of the lamps is attenuated by c = a + b.
+The light of a lamp (`lamp_light`), scattered with the coefficient b p(angle), is blurred on its way to the camera like
+the light of the floor (`spread.camera_mixture`), on the coarse grid of the table; with single scattering it is
+attenuated by a + b instead.
 """
 
 from __future__ import annotations
@@ -30,16 +29,10 @@ MARGIN = 6  # rows and columns of the grid outside each side of the image, whose
 
 
 def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Array) -> Array:
-    """Returns the backscatter per metre of range as it arrives at the camera, without its blur on the way.
+    """Returns the backscatter (..., n, 3) per metre of range at the camera, without its blur on the way [cd/m3].
 
-    With multiple scattering it is that of the lamps alone; see `daylight.DaylightVeil` for daylight.
-
-    Args:
-        ray: (..., 3) unit viewing direction in the axes of the camera.
-        range_m: (..., n) distances along the ray [m].
-
-    Returns:
-        (..., n, 3) radiance per metre of range, per colour band in photometric units [cd/m3].
+    With multiple scattering it is that of the lamps alone, see `daylight.DaylightVeil`. `ray` (..., 3) is the unit
+    viewing direction in the axes of the camera, `range_m` (..., n) the distances along it.
     """
     points = ray[..., None, :] * range_m[..., None]
     total = lamps.scattered_once_per_m(points, ray) * np.exp(-water.camera_loss_per_m * range_m[..., None])
@@ -86,11 +79,8 @@ def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
 
 
 def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
-    """Returns the numbers of rows and columns of the pixel grid on which the backscatter of lamps is computed.
-
-    Args:
-        beams: for each lamp, (m, 2) angle from the beam axis [deg] and relative intensity; narrow beams need a finer
-            grid.
+    """Returns rows and columns of the grid of the backscatter: a finer one for narrow beams, each (m, 2) angle [deg]
+    and share.
     """
     half_deg = [float(beam[beam[:, 1] >= beam[0, 1] / 2, 0].max()) for beam in beams]
     return NARROW_GRID if min(half_deg, default=90.0) < NARROW_DEG else GRID

@@ -1,8 +1,7 @@
 """Daylight on floors of any slope, and its backscatter in the lines of sight of a camera, from the light field.
 
-The tables are computed once per scenario, those of the backscatter at the planned depth of the cameras; `optics` uses
-them for every image. Light that the floor reflects and the water scatters back to the floor is neglected: 8 % of the
-light on a floor of albedo 0.5 in water of Jerlov type III.
+The tables are computed once per scenario, those of the backscatter at the planned depth. Light that floor and water
+send back to the floor is neglected: 8 % on a floor of albedo 0.5 in water of Jerlov type III.
 """
 
 from __future__ import annotations
@@ -33,13 +32,12 @@ LEAST_LX = 1e-12  # lower limit of the illuminance by all light but the beam, pe
 class FloorDaylight(NamedTuple):
     """Daylight on the floor in the bands R, G, B.
 
-    The light on a floor at depth z with the unit normal n is
+    The light on a floor at depth z with the unit normal n is, for each band,
 
-        E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0)
-                  + (n, 1) rest_lx (n, 1)' exp(d k1 + min(max(d, low), high)^2 k2),
+        E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0) + (n, 1) rest_lx (n, 1)' exp(d k1 + clip(d, *fitted_m)^2
+        k2)
 
-    for each band, with d = z - reference_depth_m, (k1, k2) its row of `rest_per_m`, and (low, high) = fitted_m. A
-    negative quadratic form counts as 0.
+    with d = z - reference_depth_m and (k1, k2) = rest_per_m. A negative quadratic form counts as 0.
     """
 
     to_sun: Array  # (3,) unit direction to the refracted sun, east, north, up
@@ -54,9 +52,8 @@ class FloorDaylight(NamedTuple):
 def floor_daylight(daylight: Daylight) -> FloorDaylight:
     """Returns the daylight on the floor.
 
-    Without multiple scattering, beam and diffuse light keep their shares, and both decrease with depth at the rate of
-    the diffuse attenuation; without a surface they are constant. With multiple scattering, the beam is scattered into
-    diffuse light on its way.
+    Without multiple scattering, beam and diffuse light decrease at the rate of the diffuse attenuation; without a
+    surface they are constant. With it, the beam is scattered into diffuse light.
     """
     source, water, east_north = daylight.source, daylight.water, _turn(daylight.source)
     beam, deep = daylight.surface_lx * source.beam_lx, daylight.reference_depth_m
@@ -105,10 +102,8 @@ class DaylightVeil:
         """Returns the radiance (..., ranges, 3) [cd/m2] along lines of sight, in front of a black floor at each range.
 
         Args:
-            ray: (..., 3) unit directions of sight, east, north, up; those more than `LARGEST_VIEW_DEG` from straight
-                down get the radiance at that angle.
-            depth_m: depth of the camera below the surface; the radiance tabulated at the planned depth is scaled with
-                the attenuation of the illuminance there.
+            ray: (..., 3) unit directions, east, north, up; at most `LARGEST_VIEW_DEG` from straight down.
+            depth_m: depth of the camera; the tabulated radiance is scaled with the attenuation of the illuminance.
         """
         dark = np.zeros((*ray.shape[:-1], self._terms.shape[-1] // 4, 4), np.float32)
         return self.added_to(dark, ray, depth_m)[..., :3]
@@ -199,8 +194,6 @@ def _field(band: Absorbed, source: SunSky, modes: int) -> LightField:
     optics = BandOptics(band.absorption_per_m, band.scattering_per_m, table_of(band.scatterer))
     return LightField(optics, source, modes)
 
-
-Array = NDArray[np.float64]
 
 _NO_CAUSTICS = np.zeros((0, 0), np.float32)
 #: Rows and columns of the terms of a quadratic form in (n, 1), in the order of the argument `sky` of `shading.shade`.

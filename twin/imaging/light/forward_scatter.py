@@ -1,14 +1,10 @@
 """Forward scatter: light of the floor, scattered on its way to the camera, arrives blurred.
 
-Of the light that is not absorbed, the fraction exp(-b r) arrives unscattered; the scattered light is blurred by a
-kernel with a sharp core and a long tail (`spread.camera_mixture`). The kernel is a mixture of Gaussians, the levels of
-an image pyramid: each level is about twice as wide as the one before, and its weight depends on band and range. The
-weights of a pixel are those of its own range: its ray receives light from the floor around it. The kernel is a function
-of angle. At the angle theta from the optical axis, a small angle covers more pixels by the factor k = 1 /
-cos(theta)^1.5, the geometric mean of 1 / cos^2 (radially) and 1 / cos (tangentially); therefore a fraction log2(k) of
-the light of each level moves to the next, wider level, except for the widest levels (`WIDENED_TAN`). Much of the tail
-lies outside the image. There the floor is taken to be the plane that fits the depth of the image, with the mean albedo
-of the image; the coarse levels of the pyramid cover it. The fine levels are mirrored at the borders of the image.
+The fraction exp(-b r) arrives unscattered; the rest is blurred by a kernel with a sharp core and a long tail
+(`spread.camera_mixture`), a mixture of the levels of an image pyramid with weights by band and range of the pixel. Off
+the axis a small angle covers k = 1 / cos(theta)^1.5 more pixels, so a fraction log2(k) of the light of each level moves
+to the next, except for the widest (`WIDENED_TAN`). Outside the image, the floor is the plane that fits the depth, with
+the mean albedo of the image.
 """
 
 from __future__ import annotations
@@ -60,9 +56,8 @@ class ForwardScatter:
     Attributes:
         range_per_depth: range divided by depth of the pixels of the surroundings.
         surroundings: grid on which `add` expects the light of the floor around the image.
-        kept: (SHARE_STEPS + 1, 4) share of the light of the floor, attenuated by absorption alone, that arrives without
-            blur: the unscattered light and the core of the kernel, narrower than a pixel; for R, G, B and a zero, at
-            even steps of r / (r + RANGE_SCALE_M).
+        kept: (SHARE_STEPS + 1, 4) share of the light that arrives without blur (unscattered, or scattered by less than
+            a pixel), for R, G, B and a zero, at even steps of r / (r + RANGE_SCALE_M).
     """
 
     def __init__(self, rig: StereoRig, water: Medium):
@@ -86,12 +81,9 @@ class ForwardScatter:
         self._widening = _widening(rig, self.surroundings, self.range_per_depth, levels)
 
     def plane(self, depth: Depth) -> tuple[Depth, Place]:
-        """Returns the plane fitted to the floor in an image, on the grid `surroundings`.
+        """Returns depth [m] and fractional row of `kept` of the plane fitted to the floor, on the grid `surroundings`.
 
-        In an image of a plane, 1 / depth is linear in column and row.
-
-        Returns:
-            Depth (rows, cols) [m], inf beyond `FAR_M`, and the fractional row index (rows, cols) into `kept`.
+        In an image of a plane, 1 / depth is linear in column and row. Depths beyond `FAR_M` are inf.
         """
         shape = self.surroundings.shape
         plane, place = np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -99,15 +91,12 @@ class ForwardScatter:
         return plane, place
 
     def add(self, floor: Radiance, place: Place, around: tuple[Radiance, Place], light: Radiance) -> None:
-        """Adds the blurred light of the floor to `light` in place.
-
-        The core of the kernel is left out: `kept` includes it in the share that arrives without blur.
+        """Adds the blurred light of the floor, without the core of the kernel (see `kept`), to `light` in place.
 
         Args:
             floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
-            around: light and fractional row index into `kept` of the surroundings; their pixels inside the image are
-                overwritten.
-            light: (H, W, 3) image to which the light is added.
+            place: fractional row of `kept` for every second pixel in both directions, see `place_of`.
+            around: light and fractional row of the surroundings; their pixels inside the image are overwritten.
         """
         grid = self.surroundings
         images: list[Radiance] = [np.asarray(cv2.pyrDown(floor), np.float32)]
@@ -169,28 +158,17 @@ def level_sigma_px(level: int) -> float:
 
 @lru_cache(maxsize=64)
 def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
-    """Returns the weights of the pyramid levels in the kernel of the blur, at the ranges `NODES_M`.
+    """Returns the weights (levels + 1, 3, nodes) of the pyramid levels in the kernel of the blur, at the ranges
+    `NODES_M`.
 
-    Args:
-        focal_px: focal length [px].
-
-    Returns:
-        (levels + 1, 3, nodes) weights of the levels of the kernel of scattered light; level 0 is light scattered by
-        less than a pixel.
+    Level 0 is light scattered by less than a pixel.
     """
     sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))
     return np.array([camera_mixture(band, NODES_M, sigmas).T for band in bands]).swapaxes(0, 1)
 
 
 def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, range_m: Array) -> Array:
-    """Returns the weights (levels + 1, n, 3) of the levels of the kernel of scattered light.
-
-    Level 0 is light scattered by less than a pixel; unscattered light is not included.
-
-    Args:
-        focal_px: focal length [px].
-        range_m: (n,) ranges [m].
-    """
+    """Returns the weights (levels + 1, n, 3) of the levels of the kernel of scattered light at ranges (n,) [m]."""
     nodes = level_weights_of(bands, focal_px, levels)
     rows = [
         over_path(nodes[:, k], band.scattering_per_m, range_m) if band.scattering_per_m else nodes[:, k, :1] * range_m

@@ -39,11 +39,9 @@ class Illumination(NamedTuple):
 def illumination_of(scenario: Scenario) -> Illumination:
     """Returns the optical properties of a scenario's water, and the daylight in the water.
 
-    The absorption of a band is the effective one (`bands`) for the spectrum of the light and the length of its path.
-    For lamps, and for the blur of all light on the path to the camera, the path is twice the planned altitude: to the
-    floor and back. For daylight it is the slant path from the surface to the reference plane (the planned altitude
-    where there is no surface). The loss of daylight between floor and camera is chosen so that the transmission of a
-    band is exact for the whole path from the surface to the floor and up to the camera.
+    The absorption of a band is the effective one (`spectra`) for the light and its path: twice the planned altitude for
+    lamps and for the blur, the slant path from the surface to the reference plane for daylight. The loss of daylight
+    between floor and camera makes the transmission of the whole path exact.
 
     Raises:
         TwinError: the water is invalid (see `medium`), the planned altitude is not below the surface, or caustics are

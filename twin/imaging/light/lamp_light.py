@@ -4,10 +4,9 @@ A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular 
 
     (I(theta) exp(-c d) + S(theta, d)) / d^2,
 
-with c the attenuation. S is exp(-a d), with a the absorption, times the beam convolved with the kernel of
-`spread.lamp_mixture`: the scattered light is not lost, but makes the beam wider and its edge softer. In water without
-scattering, or with single scattering, S is 0. Light that the floor reflects and the water scatters back to it is
-neglected, and so are the shadows of the floor in scattered light.
+with c the attenuation and S = exp(-a d) times the beam convolved with the kernel of `spread.lamp_mixture`; S is 0 with
+single scattering. Light that floor and water send back to the floor is neglected, and so are shadows in scattered
+light.
 """
 
 from __future__ import annotations
@@ -49,11 +48,8 @@ class LampLight:
     def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
         """Returns the light (..., 3) of a lamp on particles for R, G, B [lx], and unit directions (..., 3) from it.
 
-        The light is the illuminance of a plane that faces the lamp, except that scattered light counts equally from all
-        directions. Distances below `LAMP_RADIUS_M` count as `LAMP_RADIUS_M`; there the directions are shorter than 1.
-
-        Args:
-            points: (..., 3) points in the axes of the camera [m].
+        It is the illuminance of a plane that faces the lamp; scattered light counts equally from all directions. Below
+        the distance `LAMP_RADIUS_M` the light is that at this distance, and the directions are shorter than 1.
         """
         sources, position, axis = self.sources, self.sources.position_m[lamp], self.sources.axis[lamp]
         strength = sources.intensity_cd[lamp] * sources.colour[lamp]
@@ -70,9 +66,8 @@ class LampLight:
         return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
 
     def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
-        """Returns the light (..., n, 3) that the water scatters into a ray to the camera, per metre of the ray [cd/m3].
-
-        Its loss on the way from these points to the camera is not included.
+        """Returns the light (..., n, 3) scattered into a ray to the camera, per metre, without its loss on the way
+        [cd/m3].
 
         Args:
             points: (..., n, 3) points of the ray in the axes of the camera [m].
@@ -89,9 +84,8 @@ class LampLight:
 def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32] | None:
     """Returns the light of each lamp on a floor (lamps, 2, n, m, 4), relative to `LightSources.intensity_cd`.
 
-    Axes: lamp; scattered light S, which the floor is assumed not to block, then all light, I exp(-c d) + S; even steps
-    of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. The result is None in water
-    without multiple scattering, and without lamps.
+    Axes: lamp; scattered light S, then all light, I exp(-c d) + S; even steps of sqrt(1 - cos(angle)) and of d / (d +
+    RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. None in water without multiple scattering, and without lamps.
     """
     if not (water.scatters_repeatedly and len(sources.beam)):
         return None

@@ -79,13 +79,7 @@ def _beam(number: int, lamp: LampConfig) -> Array:
 
 
 def beam_share(cos_angle: Array, table: Array) -> Array:
-    """Returns the relative intensity of a lamp by its beam table.
-
-    It is 0 beyond the last angle of the table, and behind the lamp: at angles above 90 deg from the beam axis.
-
-    Args:
-        table: (m, 2) angle [deg] and relative intensity, interpolated linearly.
-    """
+    """Returns the relative intensity by a beam table (m, 2) of angle [deg] and share; 0 behind it and above 90 deg."""
     angle_deg = np.rad2deg(np.arccos(np.clip(cos_angle, -1.0, 1.0)))
     return np.where(np.asarray(cos_angle) < 0, 0.0, np.interp(angle_deg, *table.T, right=0.0))
 

@@ -1,18 +1,16 @@
 """Radiance of daylight in water with a flat surface, by the method of discrete ordinates, for one colour band.
 
-The water is homogeneous and lies between a surface, which reflects no upwelling light, and a black floor. With the
-depth z, the cosine mu of the angle of propagation from straight down and the azimuth from that of the sun's beam, the
-radiance is a cosine series in the azimuth whose terms L_m obey (Chandrasekhar 1960; Stamnes et al. 1988, Appl. Opt. 27,
-2502)
+The water is homogeneous, between a surface without internal reflection and a black floor. With the depth z, the cosine
+mu of the angle from straight down and the azimuth from the beam, the radiance is a cosine series in the azimuth whose
+terms L_m obey (Chandrasekhar 1960; Stamnes et al. 1988, Appl. Opt. 27, 2502)
 
     mu dL_m/dz = -c L_m + b integral h_m(mu, mu') L_m(mu') dmu' + beam,
     h_m = 1/2 sum_l (2 l + 1) chi_l P_l^m(mu) P_l^m(mu'),
 
-with chi_l the Legendre moments of the phase function, and P_l^m the associated Legendre functions multiplied by
-sqrt((l - m)! / (l + m)!). At the nodes of a quadrature this is a system of linear differential equations with constant
-coefficients, which is solved by eigenvectors. The forward peak counts as unscattered (delta-M+, Lin et al. 2018, J.
-Quant. Spectrosc. Radiat. Transf. 208, 140), and sunlight that is scattered once into the line of sight is computed with
-the phase function itself (Nakajima & Tanaka 1988, J. Quant. Spectrosc. Radiat. Transf. 40, 51).
+chi_l being the Legendre moments of the phase function, P_l^m the associated Legendre functions times sqrt((l - m)! / (l
++ m)!). At the nodes of a quadrature this is a linear system, solved by eigenvectors. The forward peak counts as
+unscattered (delta-M+, Lin et al. 2018, J. Quant. Spectrosc. Radiat. Transf. 208, 140); sunlight scattered once into the
+line of sight uses the phase function itself (Nakajima & Tanaka 1988, ibid. 40, 51).
 """
 
 from __future__ import annotations
@@ -100,13 +98,7 @@ class LightField:
         return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
-        """Returns the downwelling and the upwelling radiance without the beam [cd/m2].
-
-        Each is an array (modes, nodes): the terms of the series in azimuth at the nodes of the quadrature.
-
-        Args:
-            depth_m: depth below the surface.
-        """
+        """Returns the downwelling and the upwelling radiance without the beam at a depth, (modes, nodes) each [cd/m2]."""
         down, up = zip(*(self._at(mode, np.array([floor_m]), depth_m) for mode in self._modes), strict=True)
         return np.array(down)[:, 0], np.array(up)[:, 0]
 
@@ -123,10 +115,9 @@ class LightField:
     def slope_form(self, depth_m: float, floor_m: float) -> Array:
         """Returns the light without the beam on a slope as a quadratic form (4, 4) of its normal [lx].
 
-        With the unit normal n in the axes x horizontally towards the sun, y to the left of x, and z up, the illuminance
-        is (n, 1) Q (n, 1)'. Q is fitted to floors of slopes up to `STEEPEST_DEG`, whose light follows from the moments
-        of the radiance and of Lambert's cosine (Ramamoorthi & Hanrahan 2001, J. Opt. Soc. Am. A 18, 2448); the
-        illuminance of a level floor, which has the weight `LEVEL_WEIGHT`, is almost exact.
+        With the unit normal n (x towards the sun, z up), the illuminance is (n, 1) Q (n, 1)'. Q is fitted to floors up
+        to `STEEPEST_DEG`, whose light follows from the moments of the radiance and of Lambert's cosine (Ramamoorthi &
+        Hanrahan 2001, J. Opt. Soc. Am. A 18, 2448); a level floor has the weight `LEVEL_WEIGHT`.
         """
         down, up = self.scattered(depth_m, floor_m)
         tilt, azimuth = (grid.ravel() for grid in np.meshgrid(*_SLOPES))
@@ -143,14 +134,10 @@ class LightField:
         return _fitted_form(np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt), light)
 
     def veil(self, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns the upwelling radiance at a depth, above black floors, as a cosine series in azimuth [cd/m2].
+        """Returns the upwelling radiance above black floors at depths `floor_m`: azimuth series (modes, views, floors)
+        [cd/m2].
 
-        Args:
-            cosine: (views,) cosine of the angle between line of sight and straight down, above 0.
-            floor_m: (floors,) depths of the floor.
-
-        Returns:
-            (modes, views, floors) terms of the series.
+        `cosine` (views,) is that of the angle between line of sight and straight down, above 0.
         """
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 
@@ -257,9 +244,8 @@ class LightField:
 def _without_peak(water: BandOptics) -> _Scaled:
     """Returns the water without the forward peak of its phase function, a narrow Gaussian (delta-M+).
 
-    The peak has the moments f exp(-l^2 / (2 s^2)) of degree l, with f and s such that the remaining moments are 0 at
-    l = `ORDERS` and `ORDERS` + 1, i.e. reach 0 with slope 0. Moments that end with another slope (delta-M) cause
-    oscillations of the radiance, up to 6 % opposite the sun.
+    The peak has the moments f exp(-l^2 / (2 s^2)), with f and s such that the remaining moments reach 0 with slope 0 at
+    l = `ORDERS`; another slope (delta-M) makes the radiance oscillate by up to 6 %.
     """
     chi, b = legendre_moments(water.phase, ORDERS + 1), water.scattering_per_m
     peak = np.zeros(ORDERS)

@@ -1,18 +1,15 @@
 """Image formation in water: light of the floor and backscatter of lamps and daylight.
 
-Radiance of a pixel that shows a floor of albedo rho at range r, for a camera and lamps on the same vehicle
-(Jaffe 1990, McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
+Radiance of a pixel that shows a floor of albedo rho at range r, for a camera and lamps on the same vehicle (Jaffe 1990,
+McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
 
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_day) * exp(-c r)  +  B(r)
     B(r) = sum_i integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds  +  B_day(r)
 
-with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
-of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`), psi_i the
-scattering angle at the distance s from the camera, p the phase function, a the absorption coefficient, b the scattering
-coefficient and c = a + b the attenuation (`water.Medium`). The model has no free scale factors. For lamps, these
-equations describe single scattering. With multiple scattering, light that is scattered on its way arrives too: that of
-the lamps as a softer beam (`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists
-of softened beams and is blurred (`backscatter`). Shadows and caustics are computed in other modules.
+with I_i the intensity of lamp i at the angle theta_i from its axis, d_i its distance, cos the cosine of incidence,
+psi_i the scattering angle at the distance s from the camera, E_day and B_day illuminance and backscatter of daylight
+(`daylight`), and a, b, c, p of `water.Medium`. With multiple scattering, scattered light arrives too: as a softer beam
+(`lamp_light`), a blur of the floor (`forward_scatter`) and blurred backscatter (`backscatter`).
 """
 
 from __future__ import annotations
@@ -70,12 +67,7 @@ class WaterSurface(NamedTuple):
 
 
 def calm_surface(world_from_camera: Array, reference_depth_m: float) -> WaterSurface:
-    """Returns the water surface above a camera without caustics, with columns and rows in metres east and north.
-
-    Args:
-        world_from_camera: (4, 4) pose of the camera.
-        reference_depth_m: depth below the surface of the plane z = 0 of the world.
-    """
+    """Returns the water surface above a camera without caustics, in metres east and north; see `WaterSurface`."""
     east, north, up = world_from_camera[:3]
     from_camera = np.array([east, north, -up])
     from_camera[2, 3] += reference_depth_m
@@ -184,10 +176,9 @@ class Optics:
             albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
-            floor: facets, shadows, material and objects; None = normals from the depth, no shadows, Lambertian, no
-                objects.
-            surface: the water surface; None = a calm surface, for a camera that points straight down at the planned
-                altitude, with east on its right.
+            floor: None = normals from the depth, no shadows, Lambertian, no objects.
+            surface: None = a calm surface above a camera that points straight down at the planned altitude, east on its
+                right.
         """
         out = np.empty(albedo.shape, np.float32)
         if self._forward is None:
@@ -218,11 +209,9 @@ class Optics:
     def floor_lx(
         self, depth: Depth, camera: int, floor: FloorView | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
-        """Returns the illuminance of the floor (H, W, 3) [lx].
+        """Returns the illuminance of the floor (H, W, 3) [lx]; the arguments are those of `radiance`.
 
-        It is NaN where there is no floor, and where the transmission to the camera is `LEAST_TRANSMISSION` or less. It
-        is computed from the light of a white Lambertian floor, divided by the transmission from floor to camera. The
-        arguments are those of `radiance`.
+        It is NaN without floor, and where the transmission to the camera is `LEAST_TRANSMISSION` or less.
         """
         matt = None if floor is None else floor._replace(material=None)
         white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)

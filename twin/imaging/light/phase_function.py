@@ -43,11 +43,9 @@ PETZOLD_INTEGRAL = 0.997385
 
 
 class PhaseTable(NamedTuple):
-    """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4).
+    """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4), narrow where it is steep.
 
-    The cells are narrow where the function is steep: with n = 4096, their width is 0.0017 deg at 0.1 deg and 0.017 deg
-    at 10 deg. The Monte Carlo reference evaluates and samples this piecewise constant function; `phase_at` interpolates
-    linearly between the centres of the cells.
+    The Monte Carlo reference evaluates and samples this piecewise constant function.
     """
 
     density_per_sr: Array  # (n,) mean of the phase function over each cell
@@ -87,12 +85,8 @@ class Scatterer(NamedTuple):
 
 
 def molecular(angle: Array) -> Array:
-    """Returns the phase function of pure sea water [1/sr].
-
-    It is 0.06225 (1 + 0.835 cos(angle)^2) (Morel 1974; Mobley 1994, eq. 3.30).
-
-    Args:
-        angle: scattering angles of any shape [rad].
+    """Returns the phase function of pure sea water [1/sr], 0.06225 (1 + 0.835 cos(angle)^2) (Morel 1974; Mobley 1994,
+    eq. 3.30).
     """
     return 3 / (4 * np.pi * (3 + 0.835)) * (1 + 0.835 * np.cos(angle) ** 2)
 
@@ -105,11 +99,7 @@ def molecular_scattering_per_m(wavelength_nm: Array) -> Array:
 def petzold(angle: Array) -> Array:
     """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`.
 
-    The function is normalised to 1 over the sphere. Below the first angle of the table, it is extrapolated with the
-    slope of the first interval.
-
-    Args:
-        angle: scattering angles of any shape [rad].
+    It is normalised over the sphere, and extrapolated below the first angle with the slope of the first interval.
     """
     log_angle, log_density = np.log(np.deg2rad([row[0] for row in PETZOLD])), np.log([row[1] for row in PETZOLD])
     wanted = np.log(np.maximum(angle, 1e-12))

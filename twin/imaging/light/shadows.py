@@ -1,14 +1,9 @@
 """Shadows cast by the floor in the light of lamps and sun; they are visible because the lamps are not at the cameras.
 
-A point of the floor is in the shadow of a lamp if the straight ray to the lamp passes below the floor. The floor is the
-rendered surface: triangles over a grid of heights. The height of a triangle above a ray is greatest where the ray
-crosses one of its edges, so only edge crossings are tested, and only in blocks and in cells that are high enough to
-reach the ray.
-
-Not every pixel needs a ray. A shadow is cast by a crest, and the facets behind a crest face away from the lamp: a
-shadow therefore begins at such facets and is connected to them. Their pixels are marked dark without a ray. From them,
-and from every eighth pixel along rows and columns that is found dark, the shadows are completed by region growing: a
-ray is cast for every neighbour of a dark pixel.
+A point is in the shadow of a lamp if the ray to it passes below the floor, triangles over a grid of heights. The gap is
+least where the ray crosses an edge, so only edge crossings are tested, in blocks and cells high enough to reach it.
+Pixels of facets that face away are dark without a ray; from them, and from a grid of tested pixels, the shadows are
+completed by region growing.
 """
 
 from __future__ import annotations
@@ -60,14 +55,12 @@ class Shadows:
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
-        """Returns masks (lamps, H, W) uint8: 0 where the floor occludes the lamp, else 1 (also without floor).
-
-        If the sun casts shadows, a mask of the sun follows those of the lamps.
+        """Returns masks (lamps, H, W) uint8, and one of the sun if it casts shadows: 0 where the floor occludes the
+        light.
 
         Args:
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
-            world_from_camera: (4, 4) pose of this camera.
-            camera: 0 left, 1 right.
+            world_from_camera: (4, 4) pose of this camera, 0 left or 1 right.
             label: (H, W) not 0 where the pixel shows an object above the floor; None: all show the floor.
         """
         lamps = geometry.transform(world_from_camera, self._lamps[camera])
@@ -101,9 +94,7 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
     """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W).
 
-    The mark is DARK where facets face away from the lamp, CLEAR without floor, else OPEN (rays decide, see
-    `_grow_shadows`). Pixels that show an object, i.e. whose `label` is not 0, are OPEN; without objects, `label` is
-    None.
+    The mark is DARK where facets face away from the lamp, CLEAR without floor, else OPEN, as on objects (`label`).
     """
     height, _, _, west, south, spacing = grid
     width, cols = depth.shape[1], height.shape[1]

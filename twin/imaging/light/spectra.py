@@ -1,23 +1,13 @@
 """Spectra of light and water, and their means over the bands R, G, B of the cameras.
 
-The sensitivity of a band, in electrons per photon relative to its largest value, is a Gaussian of the width of usual
-colour filters, cut at 400 and 700 nm as by filters for ultraviolet and infrared light; it is not the measured curve of
-one camera. A coefficient of a band is the mean over the wavelengths, weighted with the sensitivity times the photons of
-the light. Absorption in the red band changes so steeply with wavelength that the light of this band does not decay as
-one exponential. The effective coefficient over a path L is
+The sensitivity of a band is a Gaussian of the width of usual colour filters, cut at 400 and 700 nm. A coefficient of a
+band is the mean weighted with the sensitivity times the photons of the light; over a path L the effective one is
+-ln(sum w exp(-a L)) / L, with normalised weights w, which makes the light at the end of the path exact.
 
-    -ln(sum w exp(-a L)) / L,    w: normalised weights, a: coefficient at each wavelength,
-
-which makes the light at the end of the path exact; for L = 0 it is the mean.
-
-The tables are those of the package `jerlov`, interpolated linearly between their wavelengths (25 nm apart in the first
-source, 1 nm in the second). Solonenko & Mobley (2015) derived a and b from the diffuse attenuation that Jerlov
-measured, Williamson & Hollins (2022) measured a and b. The two sources differ: at 550 nm, b of the second is 2.3 (IB),
-0.49 (II), 0.29 (III), 1.2 (1C), 0.61 (3C) and 0.89 (5C) times b of the first.
-
-In the printed table of Solonenko & Mobley, the rows of 3C from 675 nm and of 5C from 600 nm are those of other
-wavelengths. There the absorption is interpolated: it lies between those of types 1C and 7C, in the same proportion as
-at the last wavelength with a value. This rule predicts the printed values of 3C from 600 to 650 nm within 0.5 %.
+The tables of water are those of the package `jerlov`, interpolated linearly. Solonenko & Mobley (2015) derived a and b
+from Jerlov's diffuse attenuation, Williamson & Hollins (2022) measured them; at 550 nm their b differ by factors of
+0.29 to 2.3. The printed rows of 3C from 675 nm and 5C from 600 nm of the former are those of other wavelengths; there
+the absorption lies between those of 1C and 7C as at the last wavelength with a value (within 0.5 % for 3C).
 """
 
 from __future__ import annotations
@@ -62,13 +52,7 @@ def band_weights(light: Array | None = None) -> Array:
 
 
 def effective_per_m(per_m: Array, weights: Array, path_m: float = 0.0) -> Array:
-    """Returns the effective coefficients (3,) of the bands over a path [1/m].
-
-    Args:
-        per_m: (n,) coefficient at `NM` [1/m].
-        weights: (3, n) from `band_weights`.
-        path_m: length of the path [m]; 0: mean coefficient.
-    """
+    """Returns the effective coefficients (3,) of the bands over a path [1/m]; for `path_m` = 0 their mean."""
     if not path_m:
         return weights @ per_m
     least = per_m.min()  # keeps the exponentials of long paths above 0
@@ -87,7 +71,6 @@ def jerlov_package() -> Any:
         raise TwinError("water.source", "the package jerlov is not installed", "pip install jerlov") from None
 
 
-Array = NDArray[np.float64]
 Light = Literal["led", "daylight"]
 
 #: Relative power of CIE illuminant LED-B5, a phosphor-converted blue LED of 6598 K, from 400 to 700 nm in steps of 5 nm
@@ -104,10 +87,7 @@ LED_B5 = (
 
 @cache
 def spectrum_of(light: Light) -> Array:
-    """Returns the relative power (n,) of a light at `bands.NM`, interpolated linearly between the tabulated values.
-
-    Args:
-        light: "led": CIE illuminant LED-B5; "daylight": CIE illuminant D65.
+    """Returns the relative power (n,) at `NM` of CIE illuminant LED-B5 ("led") or D65 ("daylight").
 
     Raises:
         TwinError: the package `jerlov`, which has the table of D65, is not installed.
@@ -117,8 +97,6 @@ def spectrum_of(light: Light) -> Array:
     spectrum.setflags(write=False)
     return spectrum
 
-
-Array = NDArray[np.float64]
 
 _CLEARER, _MURKIER = "1C", "7C"  # types between which missing absorption is interpolated
 _COMPARED_NM = 550.0  # wavelength at which the scattering of the sources is compared

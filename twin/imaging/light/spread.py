@@ -1,25 +1,18 @@
 """Multiple scattering of light near its straight path, as mixtures of Gaussians: the spread of a beam, and of an image.
 
-A lamp lights a point at the distance d. In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), the light
-that arrives is the beam convolved, in the angle at the lamp, with a kernel whose Hankel transform at the angular
-frequency k is
+In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), the light of a lamp at the distance d is the beam
+convolved, in the angle at the lamp, with a kernel of the Hankel transform
 
     exp(-a d - b d (1 - K(k))),
 
-with a and b the absorption and scattering coefficients of the water, and K the transform of the kernel of light
-scattered once, per b d. The kernel of an image is that of a beam with the path reversed. Here K is not approximated by
-small angles, but exact for light scattered once, also at wide angles: with t the scattering angle, and alpha and beta
-the angles at the point and at the lamp of the triangle lamp, scattering, point (alpha + beta = t), the volume element
-divided by both squared distances is d(alpha) d(beta) d(azimuth) / d, so that
+K being that of light scattered once, per b d; the kernel of an image is that of the reversed path. Here K is exact for
+single scattering at any angle: with the scattering angle t = alpha + beta, alpha at the point and beta at the lamp,
 
     k1(beta) = integral over t > beta of p(t) g(t - beta) exp(-a d (path / d - 1)),  per d(beta) d(azimuth),
 
-with path / d = (sin(alpha) + sin(beta)) / sin(t). g is the response of the point to light that arrives at the angle
-alpha from the straight path: the cosine for a floor, 1 for a particle in the water. The integral of the kernel is below
-1 for a floor, as light scattered by wide angles misses it or is absorbed on its longer path.
-
-For a camera that views a floor at the range r, a ray of the camera is scattered by the angle t at the distance u r and
-meets the floor at tan(beta) = (1 - u) tan(t); its weight is p(t) sin(t), reduced by absorption on the excess path.
+with path / d = (sin(alpha) + sin(beta)) / sin(t), and g(alpha) the cosine for a floor, 1 for a particle. For a camera
+at the range r, a ray scattered by t at u r meets the floor at tan(beta) = (1 - u) tan(t), with the weight p(t) sin(t)
+and absorption on the excess path.
 """
 
 from __future__ import annotations
@@ -59,13 +52,10 @@ class Absorbed(NamedTuple):
 
 @lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
 def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
-    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), as a mixture of Gaussians.
+    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), at distances (n,) [m].
 
-    Args:
-        distances_m: (n,) distances from the lamp.
-
-    Returns:
-        (n, m) weights of normalised Gaussians in the angle at the lamp, with the standard deviations `LAMP_SIGMA_RAD`.
+    The result is the weights (n, m) of normalised Gaussians of standard deviations `LAMP_SIGMA_RAD`, in the angle at
+    the lamp.
     """
     rings = _rings(np.pi)
     once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
@@ -74,26 +64,16 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
 
 @lru_cache(maxsize=64)
 def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
-    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), as a mixture of Gaussians.
+    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), at ranges (n,) [m].
 
-    Args:
-        ranges_m: (n,) ranges of the floor.
-        sigmas: (m,) standard deviations of the Gaussians, as tangents; 0 is light that is not blurred.
-
-    Returns:
-        (n, m) weights of normalised Gaussians.
+    The result is the weights (n, m) of normalised Gaussians of standard deviations `sigmas` (tangents; 0 is no blur).
     """
     once = np.array([_camera_rings(water, r) for r in ranges_m])
     return _mixtures(once, _rings(MOST_TAN), water.scattering_per_m * np.array(ranges_m), np.array(sigmas))
 
 
 def ring_shares(edges: Array, sigmas: Array) -> Array:
-    """Returns the share (n, m) of each normalised Gaussian that lies in each of n rings.
-
-    Args:
-        edges: (n + 1,) edges of the rings.
-        sigmas: (m,) standard deviations of the Gaussians.
-    """
+    """Returns the share (n, m) of m normalised Gaussians in each of n rings with edges (n + 1,)."""
     beyond = np.exp(-(edges[:, None] ** 2) / (2 * sigmas**2))
     return beyond[:-1] - beyond[1:]
 

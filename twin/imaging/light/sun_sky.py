@@ -1,9 +1,7 @@
 """Sun and sky above a level water surface: refracted direction of the sun, and radiance of the sky under water.
 
-A ray from the zenith angle t in air continues under water at the angle w with sin t = n sin w (Snell). The whole sky
-therefore appears within a cone around the zenith whose half angle is the critical angle of 48 deg (Snell's window). A
-sky of uniform radiance L appears in it with the radiance n^2 T(t) L, T being the Fresnel transmittance for unpolarised
-light (Mobley 1994, section 4.2; the n^2 law of radiance).
+A ray from the zenith angle t continues at w with sin t = n sin w (Snell), so the sky appears within 48 deg of the
+zenith. A uniform sky of radiance L has there n^2 T(t) L, T being the Fresnel transmittance (Mobley 1994, section 4.2).
 """
 
 from __future__ import annotations

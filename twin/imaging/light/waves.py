@@ -1,9 +1,8 @@
-"""Wind waves: the unified spectrum of Elfouhaily et al. (1997), from the longest gravity waves to capillary waves.
+"""Wind waves: the unified spectrum of Elfouhaily et al. (1997, J. Geophys. Res. 102, 15781), gravity to capillary
+waves.
 
-Elfouhaily, Chapron, Katsaros & Vandemark (1997, J. Geophys. Res. 102, 15781). The elevation of the surface has the
-spectrum S(k) = B(k) / k^3, with B the curvature spectrum; the slopes have the variance (mean square slope, mss)
-int k^2 S dk = int B / k dk. Waves with the wave number k are spread over directions phi from the wind with the density
-(1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed (inverse wave age 0.84).
+The elevation has the spectrum S(k) = B(k) / k^3, the slopes the variance int B / k dk. Waves are spread over directions
+phi from the wind with the density (1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed.
 """
 
 from __future__ import annotations
@@ -31,11 +30,8 @@ def angular_frequency(k: Array) -> Array:
 
 
 def curvature_spectrum(k: Array, wind_mps: float) -> Array:
-    """Returns the omnidirectional curvature spectrum B(k), without unit (Elfouhaily et al. 1997, eq. 30 to 41).
-
-    Args:
-        k: wave numbers, of any shape, above 0 [rad/m].
-        wind_mps: wind speed 10 m above the sea.
+    """Returns the omnidirectional curvature spectrum B(k) at wave numbers above 0 [rad/m] (Elfouhaily et al. 1997, eq.
+    30 to 41).
     """
     peak = GRAVITY_MPS2 * (INVERSE_WAVE_AGE / wind_mps) ** 2
     speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
@@ -50,12 +46,7 @@ def curvature_spectrum(k: Array, wind_mps: float) -> Array:
 
 
 def directionality(k: Array, wind_mps: float) -> Array:
-    """Returns Delta(k), the relative difference of the spectrum along and across the wind (Elfouhaily, eq. 57).
-
-    Args:
-        k: wave numbers, of any shape, above 0 [rad/m].
-        wind_mps: wind speed 10 m above the sea.
-    """
+    """Returns Delta(k), the relative difference of the spectrum along and across the wind (Elfouhaily, eq. 57)."""
     speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
     short = 0.13 * _friction_mps(wind_mps) / SLOWEST_MPS
     return np.tanh(np.log(2) / 4 + 4 * (speed / peak_mps) ** 2.5 + short * (SLOWEST_MPS / speed) ** 2.5)
@@ -64,11 +55,7 @@ def directionality(k: Array, wind_mps: float) -> Array:
 def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
     """Returns the variance of the slope per area of the wave number plane [m^2/rad^2]; 0 at k = 0.
 
-    The integral over the whole plane is the mean square slope. The density is the same for opposite directions.
-
-    Args:
-        kx, ky: components of the wave number along and across the wind, broadcast against each other [rad/m].
-        wind_mps: wind speed 10 m above the sea.
+    `kx`, `ky` are the wave numbers along and across the wind [rad/m]; the integral is the mean square slope.
     """
     k = np.hypot(kx, ky)
     k_or_1 = np.where(k > 0, k, 1.0)

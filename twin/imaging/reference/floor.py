@@ -13,11 +13,9 @@ TOLERANCE_M = 1e-4  # an intersection with the floor this close to the end of a 
 
 @kernel
 def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
-    """Returns the distance [m] at which the ray from (ox, oy, oz) intersects the floor; inf if it does not.
+    """Returns the distance [m] at which the ray from o in the unit direction d meets the floor; inf if it does not.
 
-    Args:
-        is_plane: whether the floor is the plane z = 0; if not, it is `field`.
-        dx, dy, dz: unit direction, z up.
+    The floor is the plane z = 0 if `is_plane`, else `field`.
     """
     if is_plane:
         return -oz / dz if dz < 0 else np.inf

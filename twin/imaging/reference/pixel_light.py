@@ -245,10 +245,7 @@ class KernelScene(NamedTuple):
 def pixel_light(
     scene: ReferenceScene, ray: PixelRay, effort: Effort, bin_edges_px: Sequence[float] = BIN_EDGES_PX
 ) -> PixelLight:
-    """Returns the light that reaches a pixel, in components.
-
-    Args:
-        bin_edges_px: lower edges of the bins of blurred light, from 0, see `PixelLight`; the last bin is open.
+    """Returns the light that reaches a pixel, in components; `bin_edges_px` see `PixelLight`, the last bin is open.
 
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
@@ -259,11 +256,8 @@ def pixel_light(
 
 
 def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Effort) -> PlaneLight:
-    """Returns the illuminance of a plane that does not disturb the light, in components.
-
-    Args:
-        point_m: (3,) a point of the plane above the floor, in world axes [m].
-        normal: (3,) unit normal of the plane in world axes; light that arrives from the side of the normal counts.
+    """Returns the illuminance of a plane that does not disturb the light, on the side of its normal (3,), in
+    components.
 
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
@@ -279,14 +273,9 @@ Light = TypeVar("Light", PixelLight, PlaneLight)
 def refined(
     light_of: Callable[[Effort], Light], enough: Callable[[Light], bool], effort: Effort, most_walks: int
 ) -> Light:
-    """Repeats a computation until its standard errors are small enough or `most_walks` would be exceeded.
+    """Returns the light of as many rounds as `enough` asks for, at most `most_walks` in all; the first always runs.
 
-    Args:
-        effort: size of each round; the rounds differ by their seeds.
-        most_walks: largest number of walks of all rounds, as counted in `Effort`; the first round is always computed.
-
-    Returns:
-        The light with the batches of all rounds.
+    The rounds differ by their seeds; the result has the batches of all.
     """
     light, rounds = light_of(effort), 1
     while (rounds + 1) * effort.walks <= most_walks and not enough(light):
@@ -311,12 +300,7 @@ def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:
 
 
 def lamps_in_world(sources: LightSources, world_from_camera: Array, band: int) -> Array:
-    """Returns the lamps (n, 7) of a `ReferenceScene` from the lamps in the axes of a camera.
-
-    Args:
-        world_from_camera: (4, 4) pose of that camera.
-        band: 0 red, 1 green, 2 blue.
-    """
+    """Returns the lamps (n, 7) of a `ReferenceScene` for a band (0 red, 1 green, 2 blue), from those of a camera."""
     rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
     light_cd = sources.intensity_cd * sources.colour[:, band]
     return np.column_stack([sources.position_m @ rotation.T + origin, sources.axis @ rotation.T, light_cd])

@@ -1,10 +1,7 @@
 """Facets of the floor: the normals of the triangles of its height grid, for the shading of the pixels that show them.
 
-The depth of a pixel gives a point of the floor, which lies in one of the two triangles of a cell of the grid. The
-rendered floor consists of the same triangles (`twin.scenes.floor`), so the normal is that of the rendered facet.
-
-A normal n, which points up, is stored in 32 bits by the stereographic projection (nx, ny) / (1 + nz), whose components
-lie in [-1, 1] and take 16 bits each. The error of a normal is below 0.004 deg at any slope.
+The depth of a pixel gives a point in one of the two triangles of a cell, those that are rendered (`twin.scenes.floor`).
+A normal, which points up, is stored in 32 bits as (nx, ny) / (1 + nz), 16 bits each; its error is below 0.004 deg.
 """
 
 from __future__ import annotations

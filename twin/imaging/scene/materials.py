@@ -66,11 +66,10 @@ def material_of(terrain: TerrainConfig) -> Material | None:
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def reflectance(material, albedo, mu_i, mu_o, phase):
-    """Returns the bidirectional reflectance [1/sr].
+    """Returns the bidirectional reflectance [1/sr], in single precision.
 
-    Args:
-        albedo: albedo, 0 to 1; like the following arguments in single precision.
-        mu_i, mu_o: cosines of the angles of incidence and of view, above 0.
+    `mu_i`, `mu_o` are the cosines of incidence and of view, above 0, `phase` that of the phase angle, `albedo` is 0 to
+    1.
     """
     kind, a, b, specular, alpha_squared = material
     one, two, zero = np.float32(1), np.float32(2), np.float32(0)
@@ -97,16 +96,15 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
-    """Adds the light of one lamp that the floor reflects to the camera to `reflected`, for one row of W pixels.
+    """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected` (3,
+    W).
 
     Args:
-        lamp: properties of the lamp, of which the first three are its position in the axes of the camera [m].
+        lamp: its first three values are the position in the axes of the camera [m].
         albedo: (W, 3) uint8, 255 = white.
         here: (W,) depth [m].
-        focal: focal length [px].
         normal: (3, W) unit normals in the axes of the camera.
         arriving: (3, W) illuminance by the lamp, attenuated on the path from lamp to floor [lx].
-        reflected: (3, W) radiance at the floor, before attenuation on the path to the camera [cd/m2].
     """
     one, half, tiny = np.float32(1), np.float32(0.5), np.float32(1e-4)
     for u in range(here.size):

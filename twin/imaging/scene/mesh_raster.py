@@ -1,14 +1,9 @@
 """Rasterization of triangle meshes into images of depth, normals and labels, with a depth test, as in OpenGL.
 
-One kernel serves the cameras, the shadow maps of lamps and sun, and the view from above that gives the true heights.
-A pixel shows the triangle that the ray through the pixel centre meets first, and has the exact depth of the point where
-they meet. Within a triangle, 1 / depth is linear in column and row in a perspective view; in a parallel view, depth is
-linear.
-
-Triangles are about as large as a pixel, so most of the time would be lost to branches that the processor predicts
-wrongly. Each part of a mesh (`objects.parts`) therefore passes through loops that write lists, almost without
-branches: triangles that cover pixel centres, covered pixel centres, drawn pixels. Parts outside the image, and parts of
-closed meshes of which all triangles face away, are left out; this does not change the image.
+One kernel serves the cameras, the shadow maps, and the view from above that gives the true heights. A pixel shows the
+triangle that the ray through its centre meets first, with the exact depth; 1 / depth (in a parallel view, depth) is
+linear in the image. Triangles are about as large as a pixel, so each part of a mesh (`objects.parts`) passes through
+loops that write lists, almost without branches. Parts outside the image or facing away are left out.
 """
 
 from __future__ import annotations
@@ -166,12 +161,10 @@ def _draw(
 def _list_parts(parts, matrix, projection, window, closed, shown):
     """Writes the numbers of the parts that the image may show to `shown`; returns how many there are.
 
-    The other parts are nearer than the near plane, have no pixel centre of the `window` (first column, end, first row,
-    end) in the rectangle around their box, or belong to a closed mesh and all their triangles face away. A triangle
-    with the corner p and the unit normal m faces away from a camera at e if m (p - e) >= 0. With the centre c of the
-    part, w = c - e, the angle b between w and the axis of the cone of normals, and the angle a of this cone,
-    m (p - e) >= |w| cos(a + b) - behind_m (see `Parts`). In a parallel view, w is the direction of view, and m w >= 0
-    suffices.
+    The others are nearer than the near plane, outside the `window` (first column, end, first row, end), or of a closed
+    mesh and facing away. With the centre c of the part, w = c - e from a camera at e, the angle b between w and the
+    axis of the cone of normals, and the angle a of this cone, m (p - e) >= |w| cos(a + b) - behind_m (see `Parts`) for
+    the corner p and normal m of every triangle; in a parallel view, w is the direction of view.
     """
     centre, half, axis, cos_sin, behind = parts
     focal, cx, cy, near, perspective = projection
@@ -288,9 +281,9 @@ def _list_pixels(
 ):  # fmt: skip
     """Lists the pixel centres that the triangles `kept[k]` to `kept[n_kept - 1]` cover, from row `row` of the first on.
 
-    The rectangle around a triangle is divided into blocks of 2 x 2 pixels, of which most triangles need one. For each
-    block, the function writes its triangle, its first column and row, and the weights of the second and third corner
-    at its pixels. A hit is 4 times the number of a block plus that of a pixel in it.
+    For each block of 2 x 2 pixels it writes triangle, first column and row, and the weights of the second and third
+    corner. A hit is 4 times the number of a block plus that of a pixel in it. Returns the number of hits, and `k` and
+    `row` to go on from if the arrays are full.
     """
     u, v = place[0], place[1]
     n_blocks, n_hits = 0, 0

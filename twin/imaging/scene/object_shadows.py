@@ -1,10 +1,8 @@
 """Shadows that objects cast on the floor, on each other and on themselves, in the light of lamps and sun.
 
-For each light, the objects are drawn into a depth image as seen from the light (shadow map, Williams 1978), which spans
-the points that the camera sees and has about as many pixels as its image. A point is in the shadow where the map shows
-a nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the
-image. Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit
-unless the map shows a surface that is nearer to the light by more than a bias of some pixels.
+For each light, the objects are drawn into a depth image as seen from it (shadow map, Williams 1978), which spans the
+points that the camera sees, with pixels about as large. A point is in the shadow where the map shows an object nearer
+to the light by more than a bias of some pixels.
 """
 
 from __future__ import annotations
@@ -61,14 +59,11 @@ class ObjectShadows:
         world_from_camera: Array,
         moment: tuple[int, float],
     ) -> None:
-        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun, or faces away from it.
-
-        The last mask is that of the sun if it casts shadows.
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away from
+        it.
 
         Args:
-            lit: 0 where the floor occludes the light, else 1; modified in place.
             depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
-            world_from_camera: (4, 4) pose of this camera.
             moment: camera (0 left, 1 right), and time since the start of the survey [s].
         """
         camera, time_s = moment
@@ -166,9 +161,8 @@ def _looking(rotation: Array, position_m: Array) -> Array:
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
     """Sets `lit` (H, W) to 0 in the rows `first` to `end` - 1 where the map `nearest` shows an object that occludes.
 
-    A point is occluded if the depth in the map is less than that of the point minus a bias. On the floor, the bias is
-    one pixel of the map. On an object, it is BIAS_PX (1 + t) pixels, where t is the tangent of the angle of
-    incidence or, if smaller, STEEPEST. Surfaces of objects that face away from the light are not lit either.
+    The bias is one pixel of the map on the floor, and BIAS_PX (1 + t) pixels on an object, t being the tangent of the
+    angle of incidence up to STEEPEST. Surfaces of objects that face away are not lit.
     """
     height, width = depth.shape
     x = (np.arange(width) - 0.5 * (width - 1)) / focal
@@ -214,11 +208,8 @@ def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
 
 @kernel(error_model="numpy", forceinline=True)
 def _cosine(depth, x, y, normal, matrix, perspective):
-    """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light.
-
-    The normal has the axes of the camera.
-
-    The tangents `x`, `y` and the depth [m] of the point are those in the camera; see `_find_cells`.
+    """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light, in camera
+    axes.
     """
     z = np.float64(depth)
     x, y = x * z, y * z

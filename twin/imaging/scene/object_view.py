@@ -47,13 +47,11 @@ class Objects:
         self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
 
     def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> list[DrawnMesh]:
-        """Returns the meshes of the objects in view, in the order of the depth of their centres.
-
-        Labels are 1 + the index in `placed`.
+        """Returns the meshes of the objects in view by depth of their centres; labels are 1 + the index in `placed`.
 
         Args:
             camera_from_world: (4, 4) transform from world axes to those of the camera.
-            limits: (k, 4) planes of the view frustum in these axes: unit normal, which points inward, and offset [m].
+            limits: (k, 4) planes of the view frustum in these axes: inward unit normal and offset [m].
         """
         centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
@@ -98,12 +96,8 @@ class ObjectRenderer:
         self._limits = frustum(rig)
 
     def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
-        """Draws the objects into `albedo` (H, W, 3) and `depth` (H, W) in place; returns their normals and labels.
-
-        Args:
-            albedo: (H, W, 3) uint8 albedo of the floor.
-            depth: (H, W) float32 depth of the floor along the optical axis [m]; inf where there is no floor.
-            world_from_camera: (4, 4) pose of the camera.
+        """Draws the objects into `albedo` (H, W, 3) uint8 and `depth` (H, W) [m] in place; returns their normals and
+        labels.
         """
         view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
         uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)

@@ -140,11 +140,9 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the floor tiles that may be in view; all others lie outside a plane of the view frustum.
+    """Returns a mask (n,) of the floor tiles that may be in view, not outside a plane of the view frustum.
 
-    Args:
-        world_from_camera: (4, 4) pose of the camera.
-        half_tangents: (2,) tangents of half the horizontal and vertical field of view.
+    `half_tangents` (2,) are those of half the horizontal and vertical field of view.
     """
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T

@@ -1,12 +1,8 @@
 """Albedo of steep parts of the floor by triplanar mapping: textures projected horizontally, see `twin.terrains.walls`.
 
-The albedo depends only on the point of the floor. Its texture is filtered over the footprint of the pixel on the
-rendered facet: trilinearly between levels of resolution (Williams 1983), at several places along the major axis of the
-footprint, because walls are seen obliquely (anisotropic filter, McCormack et al. 1999, Feline).
-
-The steep pixels of a row pass through short loops, most of them without branches, so that the compiler vectorizes them.
-A colour is one integer with a lane of 21 bits for each band; the weights of all samples of a pixel are integers that
-add up to WHOLE, so a weighted sum of colours takes one multiplication for each texel and never leaves its lane.
+The texture is filtered over the footprint of the pixel on the facet: trilinearly between levels (Williams 1983), at
+several places along the major axis (McCormack et al. 1999, Feline). The steep pixels of a row pass through short loops
+without branches. A colour is one integer with a lane of 21 bits per band; the weights of all samples add up to WHOLE.
 """
 
 from __future__ import annotations
@@ -86,13 +82,11 @@ def _levels(texture: Image) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
 def paint_walls(
     surface: WallSurface, albedo: Image, depth: NDArray[np.float32], world_from_camera: Array, focal_px: float
 ) -> None:
-    """Blends the texture of the walls into an image of the floor, in place.
+    """Blends the texture of the walls into an image of the floor from a centred pinhole camera, in place.
 
     Args:
         albedo: (H, W, 3) uint8 albedo with the texture projected from above.
         depth: (H, W) depth of the floor along the optical axis [m]; inf where there is no floor.
-        world_from_camera: (4, 4) pose of the camera; x right, y down, z forward.
-        focal_px: focal length; the optical axis is at the centre of the image.
     """
     pose = np.array(world_from_camera[:3]) / surface.texel_m  # east, north and down from the highest point [texels]
     pose[:2, 3] -= surface.corner_m / surface.texel_m
@@ -109,12 +103,8 @@ def paint_walls(
 def paint_walls_from_above(
     surface: WallSurface, albedo: Image, x_m: NDArray[np.floating], y_m: NDArray[np.floating], step_m: float
 ) -> None:
-    """Blends the texture of the walls into a parallel view of the floor from above, in place.
-
-    Args:
-        albedo: (rows, cols, 3) uint8 albedo with the texture projected from above.
-        x_m: (cols,) x of the samples.
-        y_m: (rows,) y of the samples.
+    """Blends the texture of the walls into a parallel view of the floor from above with samples at (x_m, y_m), in
+    place.
     """
     spacing_m = float(surface.spacing) * surface.texel_m
     columns, rows = (x_m - surface.corner_m[0]) / spacing_m, (y_m - surface.corner_m[1]) / spacing_m
@@ -284,9 +274,9 @@ def _blend(surface, albedo, work, steep, n, total, used):
 def _footprints(across, down, work, n):
     """Fills the rows _MAJOR_ALONG to _LEVEL of `work`: the filter of the pixels.
 
-    With J the (2, 2) displacement in the texture to the next pixel along both axes, the footprint is an ellipse, and
-    its squared axes are the eigenvalues of J J^T. There are as many samples along the major axis as it is longer than
-    the minor axis, MOST_SAMPLES at most, and the texels of the level are as large as the distance between the samples.
+    With J the (2, 2) displacement in the texture to the next pixels, the squared axes of the footprint are the
+    eigenvalues of J J^T. There are as many samples along the major axis as it is longer than the minor, at most
+    MOST_SAMPLES.
     """
     zero, one, half, most = np.float32(0), np.float32(1), np.float32(0.5), np.float32(MOST_SAMPLES)
     size = work[_LEVEL]
