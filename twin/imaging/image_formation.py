@@ -124,7 +124,7 @@ class ImageFormation:
     def add_snow(
         self, light: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None = None
     ) -> None:
-        """Draws marine snow, if enabled, into `light` (H, W, 3) in place, as streaks along the `motion` of the camera."""
+        """Draws marine snow, if enabled, into `light` (H, W, 3) in place, as streaks along the camera's `motion`."""
         if self._snow is not None:
             self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion)
 

@@ -97,10 +97,7 @@ class MarineSnow:
         )
         diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
         return VisibleParticles(
-            pixel,
-            points,
-            self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])),
-            diameter_m,
+            pixel, points, self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])), diameter_m
         )
 
     def draw(
@@ -112,9 +109,7 @@ class MarineSnow:
         time_s: float,
         motion: ExposureMotion | None = None,
     ) -> None:
-        """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance `light` (H, W, 3), in
-        place.
-        """
+        """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance (H, W, 3) `light`."""
         rig, defocus = self._rig, self._defocus
         farthest_m = float(depth.max())
         still = motion is None

@@ -109,8 +109,7 @@ class StereoCamera:
         self._n_captures = 0
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
-        """Returns the image of the left camera and, if `stereo`, of the right one; each call advances the time by one
-        frame.
+        """Returns the image of the left camera and, if `stereo`, of the right one; advances the time by one frame.
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
@@ -137,9 +136,7 @@ class StereoCamera:
         return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
 
     def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
-        """Returns both images (H, W, 3) at the time of the last capture, with the noise of the next; has no effect on
-        that.
-        """
+        """Returns both images (H, W, 3) at the time of the last capture, with the noise of the next."""
         kept = self._sensor, self._rngs, self._n_captures
         self._sensor, self._rngs = copy.deepcopy(kept[:2])
         self._n_captures = max(self._n_captures - 1, 0)

@@ -81,9 +81,7 @@ class LensPsf:
         self._scales = _magnification(lens, rig) if any(lens.lateral_colour) else None
 
     def out_of_focus(self, light: Radiance, depth: Depth) -> Radiance:
-        """Returns the radiance (H, W, 3) with defocus blur at depths (H, W) [m]; `light` itself if it is off or
-        negligible.
-        """
+        """Returns the radiance (H, W, 3) with defocus blur at depths (H, W) [m]; `light` itself if negligible."""
         if self._defocus is None:
             return light
         extremes = np.array([depth.min(), depth.max()], np.float64)
@@ -103,10 +101,10 @@ class LensPsf:
         if self._taps is None and self._scales is None:
             return light
         rows, width, taps = *light.shape[:2], self._taps
-        flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
         if taps is None:
-            in_row_bands(lambda first, end: _split_rows(flat, bands, first, end), rows)
+            bands = np.ascontiguousarray(light.swapaxes(1, 2))
         else:
+            flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
             in_row_bands(lambda first, end: _convolve(flat, *taps, bands, first, end), rows)
         out = np.empty((rows, 3 * width), np.float32)
         if self._scales is None:
@@ -207,13 +205,6 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
         [-0.5 * t * (1 - t) ** 2, 1 - t**2 * (2.5 - 1.5 * t), 1 - (1 - t) ** 2 * (1 + 1.5 * t), -0.5 * (1 - t) * t**2]
     )
     return whole.astype(np.int64) - 1 - np.arange(n), np.ascontiguousarray(np.moveaxis(cubic, 0, 2), np.float32)
-
-
-@kernel
-def _split_rows(light, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
-    for v in range(first, end):
-        _split_row(light[v], out[v, 0], out[v, 1], out[v, 2])
 
 
 @kernel

@@ -21,7 +21,7 @@ from twin.kernels import kernel
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-INTERSECTION_STEPS = 4  # maximum; each multiplies the error by p / z (see `intersect`) times the slope of the floor
+INTERSECTION_STEPS = 4  # maximum; each multiplies the error by the parallax times the slope of the floor
 INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
 
 
@@ -34,27 +34,6 @@ class RowMotion(NamedTuple):
     principal_px: tuple[float, float]  # (2,) column and row of its principal point
 
 
-def intersect(
-    depth: Depth, positions: Positions, parallax_px_m: Positions | None, motion: RowMotion | None = None
-) -> Positions:
-    """Returns the image positions (h, w, 2) [px] where the rays of pixels intersect the floor.
-
-    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
-    vanishing point, with f the focal length [px] and z the depth of the floor at that position. The map of 1 / z, which
-    is linear for a plane, is interpolated bilinearly.
-
-    Args:
-        depth: (H, W) depth [m]; inf where there is no floor.
-        positions: (h, w, 2) vanishing points of the rays [px].
-        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
-        motion: motion of a camera with a rolling shutter; None = all rows are exposed together.
-    """
-    out, near = np.empty_like(positions), np.reciprocal(depth)
-    rays = near, positions, parallax_px_m, _arguments(motion)
-    in_row_bands(lambda first, end: _intersect(*rays, out, first, end), len(positions))
-    return out
-
-
 def sample_rays(
     light: Radiance,
     depth: Depth,
@@ -64,8 +43,14 @@ def sample_rays(
 ) -> Radiance:
     """Returns the radiance (h, w, 3) where the rays of pixels intersect the floor.
 
+    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
+    vanishing point, z being the depth there; 1 / z, linear on a plane, is interpolated bilinearly.
+
     Args:
         light: (H, W, 3) radiance; beyond its border, the values of the nearest border pixel are repeated.
+        depth: (H, W) depth [m]; inf where there is no floor.
+        positions: (h, w, 2) vanishing points of the rays [px].
+        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
     """
     out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
     source = np.ascontiguousarray(light).reshape(len(light), -1)
@@ -79,16 +64,6 @@ def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[flo
     if motion is None:
         return None
     return np.ascontiguousarray(motion.twist, np.float64), motion.readout_s, motion.focal_px, motion.principal_px
-
-
-@kernel
-def _intersect(near, positions, parallax, motion, out, first, end):
-    """Writes the intersections of rows `first` to `end` - 1 to `out`; `near` is the inverse depth."""
-    rays, cells = np.empty((8, out.shape[1]), np.float32), np.empty(out.shape[1], np.int32)
-    for v in range(first, end):
-        _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
-        for u in range(out.shape[1]):
-            out[v, u, 0], out[v, u, 1] = rays[0, u], rays[1, u]
 
 
 @kernel

@@ -29,7 +29,9 @@ def sample(light: Radiance, positions: Positions) -> Radiance:
 
     Beyond the image border, the values of the nearest border pixel are repeated.
     """
-    return _sampled(np.ascontiguousarray(light).reshape(len(light), -1), positions)
+    source, out = np.ascontiguousarray(light).reshape(len(light), -1), np.empty((*positions.shape[:2], 3), np.float32)
+    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
+    return out
 
 
 def interpolate(image: Image, positions: Positions) -> Image:
@@ -38,12 +40,6 @@ def interpolate(image: Image, positions: Positions) -> Image:
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
     in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
     in_row_bands(lambda first, end: _fill_rounded_from(spline, positions, out, first, end), len(positions))
-    return out
-
-
-def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
-    out = np.empty((*positions.shape[:2], 3), np.float32)
-    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
     return out
 
 

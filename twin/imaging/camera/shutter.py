@@ -43,8 +43,7 @@ class ExposureMotion(NamedTuple):
 
 
 def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMotion) -> Radiance:
-    """Returns the radiance (H, W, 3) recorded by a moving camera: rolling shutter (unless `motion.rolls_later`) and
-    blur.
+    """Returns the radiance (H, W, 3) recorded by a moving camera: shutter (unless `motion.rolls_later`) and blur.
 
     `light` is the radiance at mid-exposure in the rendered pinhole image, `depth` (H, W) that of the floor [m].
     """

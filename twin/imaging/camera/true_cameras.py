@@ -133,9 +133,7 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixels (n, 2) in the rectified frame or beyond of points (n, 3) [m] in the rendered camera; NaN
-        if none.
-        """
+        """Returns the pixels (n, 2) in the frame or beyond of points (n, 3) [m] in the rendered camera; NaN if none."""
         rig = self.rendered_rig
         if self.sampling is None:
             return rig.project(points_m)

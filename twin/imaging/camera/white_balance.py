@@ -36,7 +36,7 @@ class WhiteBalance:
         self._fixed = self.of_white_light if self.is_of_white_light else self._preset(scenario)
 
     def factors(self, mean: Array, share: float) -> Array:
-        """Returns the factors (3,) of this frame; its `mean` radiance (3,) affects those of later frames (grey world)."""
+        """Returns the factors (3,) of this frame; its `mean` radiance (3,) affects later frames (grey world)."""
         if self._mode != "grey_world":
             return self._fixed
         measured = np.log(_limited(np.maximum(self._electrons * mean, 1e-12 * self._electrons)))

@@ -79,9 +79,7 @@ def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
 
 
 def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
-    """Returns rows and columns of the grid of the backscatter: a finer one for narrow beams, each (m, 2) angle [deg]
-    and share.
-    """
+    """Returns rows and columns of the grid of the backscatter: finer for narrow beams (m, 2), angle [deg] and share."""
     half_deg = [float(beam[beam[:, 1] >= beam[0, 1] / 2, 0].max()) for beam in beams]
     return NARROW_GRID if min(half_deg, default=90.0) < NARROW_DEG else GRID
 

@@ -34,8 +34,7 @@ class FloorDaylight(NamedTuple):
 
     The light on a floor at depth z with the unit normal n is, for each band,
 
-        E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0) + (n, 1) rest_lx (n, 1)' exp(d k1 + clip(d, *fitted_m)^2
-        k2)
+        beam_lx exp(-beam_per_m z) max(n . to_sun, 0) + (n, 1) rest_lx (n, 1)' exp(d k1 + clip(d, *fitted_m)^2 k2)
 
     with d = z - reference_depth_m and (k1, k2) = rest_per_m. A negative quadratic form counts as 0.
     """

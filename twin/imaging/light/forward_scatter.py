@@ -158,8 +158,7 @@ def level_sigma_px(level: int) -> float:
 
 @lru_cache(maxsize=64)
 def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
-    """Returns the weights (levels + 1, 3, nodes) of the pyramid levels in the kernel of the blur, at the ranges
-    `NODES_M`.
+    """Returns the weights (levels + 1, 3, nodes) of the pyramid levels in the kernel of the blur at `NODES_M`.
 
     Level 0 is light scattered by less than a pixel.
     """

@@ -66,8 +66,7 @@ class LampLight:
         return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
 
     def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
-        """Returns the light (..., n, 3) scattered into a ray to the camera, per metre, without its loss on the way
-        [cd/m3].
+        """Returns the light (..., n, 3) scattered into a ray to the camera, before its loss on the way [cd/m3].
 
         Args:
             points: (..., n, 3) points of the ray in the axes of the camera [m].

@@ -98,7 +98,7 @@ class LightField:
         return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
-        """Returns the downwelling and the upwelling radiance without the beam at a depth, (modes, nodes) each [cd/m2]."""
+        """Returns the downwelling and the upwelling radiance without the beam, (modes, nodes) each [cd/m2]."""
         down, up = zip(*(self._at(mode, np.array([floor_m]), depth_m) for mode in self._modes), strict=True)
         return np.array(down)[:, 0], np.array(up)[:, 0]
 
@@ -134,10 +134,9 @@ class LightField:
         return _fitted_form(np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt), light)
 
     def veil(self, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns the upwelling radiance above black floors at depths `floor_m`: azimuth series (modes, views, floors)
-        [cd/m2].
+        """Returns the upwelling radiance above black floors: azimuth series (modes, views, floors) [cd/m2].
 
-        `cosine` (views,) is that of the angle between line of sight and straight down, above 0.
+        `cosine` (views,) is that of the angle between line of sight and straight down, above 0; `floor_m` are depths.
         """
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 

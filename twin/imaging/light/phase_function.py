@@ -65,12 +65,6 @@ class PhaseTable(NamedTuple):
         angle = 2 * np.arcsin(np.linspace(0.0, 1.0, len(self.cumulative)) ** 2)
         return np.concatenate([np.cumsum((self.density_per_sr * np.diff(angle))[::-1])[::-1], [0.0]])
 
-    @property
-    def backscatter_fraction(self) -> float:
-        """Fraction of the scattered light that is scattered by more than 90 deg."""
-        boundary = 0.5**0.25 * (len(self.cumulative) - 1)
-        return 1 - float(np.interp(boundary, np.arange(len(self.cumulative)), self.cumulative))
-
 
 ParticleFunction = Literal["petzold", "fournier_forand", "henyey_greenstein"]
 
@@ -85,9 +79,7 @@ class Scatterer(NamedTuple):
 
 
 def molecular(angle: Array) -> Array:
-    """Returns the phase function of pure sea water [1/sr], 0.06225 (1 + 0.835 cos(angle)^2) (Morel 1974; Mobley 1994,
-    eq. 3.30).
-    """
+    """Returns the phase function of pure sea water [1/sr] (Morel 1974; Mobley 1994, eq. 3.30)."""
     return 3 / (4 * np.pi * (3 + 0.835)) * (1 + 0.835 * np.cos(angle) ** 2)
 
 

@@ -217,8 +217,7 @@ def _take_normals(objects, v, normal):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
-    """Computes range (W,) and unit normals (3, W), towards the camera, from the depth gradient of a floor without
-    facets.
+    """Computes range (W,) and unit normals (3, W), towards the camera, from the depth of a floor without facets.
 
     In each direction the smaller difference is used, so that a depth edge does not tilt the normals next to it.
     """
@@ -361,8 +360,7 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
-    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine (at least 0) to the sun, row 2 with the depth in
-    water [m].
+    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine (at least 0) to the sun, row 2 with the depth [m].
 
     Row 0 is the daylight relative to its mean (`_sample_caustics`). The normals of pixels without floor become 0.
     """

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.grid_triangles import rises
 from twin.core.records import StereoRig
 from twin.core.row_parallel import in_row_bands
 from twin.imaging.light.illumination import Daylight
@@ -55,8 +56,7 @@ class Shadows:
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
-        """Returns masks (lamps, H, W) uint8, and one of the sun if it casts shadows: 0 where the floor occludes the
-        light.
+        """Returns masks (lamps, H, W), and one of the sun if it casts shadows: 0 where the floor occludes the light.
 
         Args:
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
@@ -151,9 +151,7 @@ def _find_rises(height, cols, part_x, part_y, cells, to_east, to_north):
         m = k + np.uint32(cols)
         south_west, south_east = height[k], height[k + np.uint32(1)]
         north_west, north_east = height[m], height[m + np.uint32(1)]
-        is_south_east = part_x[u] >= part_y[u]
-        to_east[u] = south_east - south_west if is_south_east else north_east - north_west
-        to_north[u] = north_east - south_east if is_south_east else north_west - south_west
+        to_east[u], to_north[u] = rises(south_west, south_east, north_west, north_east, part_x[u], part_y[u])
 
 
 @kernel(error_model="numpy")

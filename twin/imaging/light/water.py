@@ -111,8 +111,7 @@ def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Arra
 
 
 def read_spectrum(file: Path) -> tuple[Array, Array]:
-    """Returns absorption and scattering (n,) [1/m] at `NM` from comma-separated rows of nm, a, b [1/m]; # starts a
-    comment.
+    """Returns absorption and scattering (n,) [1/m] at `NM` from comma-separated rows of nm, a, b; # is a comment.
 
     Raises:
         TwinError: the file cannot be read or is larger than `MAX_SPECTRUM_BYTES`, does not have 3 columns and 2 or more

@@ -30,9 +30,7 @@ def angular_frequency(k: Array) -> Array:
 
 
 def curvature_spectrum(k: Array, wind_mps: float) -> Array:
-    """Returns the omnidirectional curvature spectrum B(k) at wave numbers above 0 [rad/m] (Elfouhaily et al. 1997, eq.
-    30 to 41).
-    """
+    """Returns the omnidirectional curvature spectrum B(k) at wave numbers above 0 (Elfouhaily, eq. 30 to 41)."""
     peak = GRAVITY_MPS2 * (INVERSE_WAVE_AGE / wind_mps) ** 2
     speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
     ratio = np.sqrt(k / peak)

@@ -142,14 +142,6 @@ class PixelLight:
         return _estimate(self.blurred_by_bin.sum((1, 2)))
 
     @property
-    def blurred_straight_lamp(self) -> BatchMean:
-        """Light of lamps, sun and sky that was scattered between floor and camera, but not on its way to the floor.
-
-        It was reflected once, by the floor.
-        """
-        return _estimate(self.blurred_by_bin[:, 0].sum(1))
-
-    @property
     def veil(self) -> BatchMean:
         """Light that was scattered into the camera without reflection by the floor."""
         return _estimate(self.sums[:, VEIL_ONCE] + self.sums[:, VEIL_MORE])
@@ -256,8 +248,7 @@ def pixel_light(
 
 
 def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Effort) -> PlaneLight:
-    """Returns the illuminance of a plane that does not disturb the light, on the side of its normal (3,), in
-    components.
+    """Returns the illuminance of a plane that does not disturb the light, on the side of its normal (3,).
 
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.

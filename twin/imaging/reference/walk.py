@@ -55,8 +55,7 @@ def beam_at(beam, cosine):
 
 @kernel
 def response(scene, kind, normal, direction, ox, oy, oz):
-    """Returns the share of the light from the direction o that a vertex sends back along the path, per solid angle
-    [1/sr].
+    """Returns the share of the light from the direction o that a vertex sends back along the path [1/sr].
 
     `normal` is that of the floor, `direction` the unit direction in which the backward path arrived.
     """
@@ -350,8 +349,7 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
 
 @kernel
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
-    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], ordered as `sums` of `walk`: the mean over pairs of
-    walks.
+    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], ordered as `sums` of `walk`: the mean of pairs of walks.
 
     One walk of a pair starts at the floor, one in the water; unscattered light on the floor point takes none.
     """
@@ -389,9 +387,7 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
 
 @kernel
 def trace_plane(scene, point, normal, n_walks, rng):
-    """Returns the illuminance (3,) of a plane: direct light of the sun, of the sky, and scattered or reflected light
-    [lx].
-    """
+    """Returns the illuminance (3,) of a plane: direct light of the sun, of the sky, and all other light [lx]."""
     out, sums, no_view, edges = np.zeros(3), np.zeros(FIRST_BIN + 2), np.zeros((5, 3)), np.zeros(1)
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     guided = 0.0 if scene.plain else GUIDED_AT_FLOOR

@@ -96,8 +96,7 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
-    """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected` (3,
-    W).
+    """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected`.
 
     Args:
         lamp: its first three values are the position in the axes of the camera [m].

@@ -59,8 +59,7 @@ class ObjectShadows:
         world_from_camera: Array,
         moment: tuple[int, float],
     ) -> None:
-        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away from
-        it.
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away.
 
         Args:
             depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
@@ -208,9 +207,7 @@ def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
 
 @kernel(error_model="numpy", forceinline=True)
 def _cosine(depth, x, y, normal, matrix, perspective):
-    """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light, in camera
-    axes.
-    """
+    """Returns the cosine of the angle between the normal (3,) at a point and the light, in camera axes."""
     z = np.float64(depth)
     x, y = x * z, y * z
     nx, ny, nz = normal[0], normal[1], normal[2]

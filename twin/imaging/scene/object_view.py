@@ -96,9 +96,7 @@ class ObjectRenderer:
         self._limits = frustum(rig)
 
     def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
-        """Draws the objects into `albedo` (H, W, 3) uint8 and `depth` (H, W) [m] in place; returns their normals and
-        labels.
-        """
+        """Draws the objects into `albedo` (H, W, 3) uint8 and `depth` (H, W) [m] in place; returns their view."""
         view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
         uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)
         target = Target(depth, albedo, *view, uv)

@@ -44,7 +44,7 @@ def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) ->
 
 
 def largest_displacement_m(item: PlacedObject, current_mps: Array) -> float:
-    """Returns an upper bound of the distance by which `swayed` moves a vertex in the world [m]; 0 if it does not sway."""
+    """Returns an upper bound of the distance by which `swayed` moves a vertex [m]; 0 if it does not sway."""
     if not item.model.sways:
         return 0.0
     aside = _lean(float(np.hypot(*current_mps[:2]))) * (1 + OSCILLATION)  # deflection of the tip / height

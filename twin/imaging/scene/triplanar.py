@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.grid_triangles import rises
 from twin.core.records import Image
 from twin.core.row_parallel import in_row_bands
 from twin.kernels import kernel
@@ -103,9 +104,7 @@ def paint_walls(
 def paint_walls_from_above(
     surface: WallSurface, albedo: Image, x_m: NDArray[np.floating], y_m: NDArray[np.floating], step_m: float
 ) -> None:
-    """Blends the texture of the walls into a parallel view of the floor from above with samples at (x_m, y_m), in
-    place.
-    """
+    """Blends the texture of the walls into a parallel view of the floor from above, in place."""
     spacing_m = float(surface.spacing) * surface.texel_m
     columns, rows = (x_m - surface.corner_m[0]) / spacing_m, (y_m - surface.corner_m[1]) / spacing_m
     _paint_from_above(surface, albedo, columns, rows, np.float32(step_m / surface.texel_m))
@@ -203,9 +202,8 @@ def _place(surface, origin, work, steep, n):
         c, r, s, t = steep[1, i], steep[2, i], work[_COL, i], work[_ROW, i]
         south_west, south_east = height[r, c], height[r, c + 1]
         north_west, north_east = height[r + 1, c], height[r + 1, c + 1]
-        lower = s >= t
-        work[_EAST, i] = (south_east - south_west if lower else north_east - north_west) * per_cell
-        work[_NORTH, i] = (north_east - south_east if lower else north_west - south_west) * per_cell
+        east, north = rises(south_west, south_east, north_west, north_east, s, t)
+        work[_EAST, i], work[_NORTH, i] = east * per_cell, north * per_cell
         k = number[r, c]
         sw, se, nw, ne = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
         work[_X, i] = (
