@@ -126,10 +126,7 @@ class MarineSnow:
         in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
 
     def _reach_m(self, motion: ExposureMotion) -> float:
-        """Returns an upper limit of the distance that a particle moves relative to the camera [m].
-
-        The limit holds for the motion during half the exposure time plus half the read-out time.
-        """
+        """Returns an upper limit of the distance that a particle moves relative to the camera [m]."""
         speed_mps = np.linalg.norm(motion.twist[3:]) + np.linalg.norm(self._current_mps)
         speed_mps += np.linalg.norm(motion.twist[:3]) * BOX_M
         return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
@@ -214,10 +211,7 @@ def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
 
 @kernel(error_model="numpy", inline="always")
 def _image_velocity(x, y, z, focal, drift, twist):
-    """Returns the image velocity (columns, rows) [px/s] of a point (x, y, z), in the axes of the camera.
-
-    The point drifts at `drift` (3,) [m/s]; the camera moves with `twist` (6,), see `_trace_paths`.
-    """
+    """Returns the image velocity (columns, rows) [px/s] of a point (x, y, z), in the axes of the camera."""
     forward = drift[2] - twist[5] + x * twist[1] - y * twist[0]
     across = drift[0] - twist[3] + y * twist[2] - z * twist[1] - x / z * forward
     down = drift[1] - twist[4] + z * twist[0] - x * twist[2] - y / z * forward
@@ -248,10 +242,7 @@ def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_
 
 @kernel
 def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
-    """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened.
-
-    Its loop has neither branches nor reads of other arrays, so that the compiler can vectorize it.
-    """
+    """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened."""
     per_box, (px, py, pz), (lx, ly, lz) = 1 / BOX_M, (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
     pose = camera_from_world
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
@@ -280,11 +271,7 @@ def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, 
 
 @kernel
 def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
-    """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer.
-
-    A particle is a disc with an antialiased edge that moves along a straight path: `path` (n, 2) [px] is the vector
-    from the start to the end of each path, `centre` (n, 2) [px] its middle.
-    """
+    """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer."""
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5
@@ -319,10 +306,7 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
 @kernel(inline="always")
 def _swept(radius, du, dv, step_u, step_v, steps):
-    """Returns the mean coverage (0 to 1) of a pixel by a disc at `steps` evenly spaced positions, see `_rim`.
-
-    (du, dv) is the offset of the pixel from the middle position, (step_u, step_v) the step between positions [px].
-    """
+    """Returns the mean coverage (0 to 1) of a pixel by a disc at `steps` evenly spaced positions, see `_rim`."""
     total, first = 0.0, 0.5 * (1 - steps)
     for i in range(steps):
         total += _rim(radius, du - (first + i) * step_u, dv - (first + i) * step_v)
@@ -331,9 +315,5 @@ def _swept(radius, du, dv, step_u, step_v, steps):
 
 @kernel(inline="always")
 def _rim(radius, du, dv):
-    """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px].
-
-    The edge of the disc is antialiased: the coverage decreases from 1 to 0 between the distances `radius` - 1 and
-    `radius` [px].
-    """
+    """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px]."""
     return min(max(radius - np.sqrt(du * du + dv * dv), 0.0), 1.0)

@@ -142,11 +142,7 @@ def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.flo
 
 
 def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
-    """Returns the kernel (2 REACH_PX + 1, 2 REACH_PX + 1) of a band, the inverse Fourier transform of its MTF.
-
-    The light that falls outside is spread evenly over the kernel, so that its sum is 1: among the kernels of this size
-    with sum 1, this one has the smallest mean square error of the MTF.
-    """
+    """Returns the kernel (2 REACH_PX + 1, 2 REACH_PX + 1) of a band, the inverse Fourier transform of its MTF."""
     nu = np.fft.fftfreq(GRID)
     share = mtf(lens, sensor, band, np.hypot(nu, nu[:, None]))
     kernel = np.fft.fftshift(np.fft.ifft2(share).real)
@@ -231,11 +227,7 @@ def _join_row(red, green, blue, row):
 
 @kernel
 def _convolve(light, down, across, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
-
-    The bands are kept apart, so that the weights of a row are constant. The latest rows of the image are stored in
-    `lines`: row v in lines[v modulo their number].
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W)."""
     rows, _, width = out.shape
     n, terms = 2 * REACH_PX + 1, down.shape[1]
     lines, wide = np.empty((n, 3, width), np.float32), np.empty(width + 2 * REACH_PX, np.float32)
@@ -276,10 +268,7 @@ def _add_pairs(before, after, weight, earlier, later, other_weight, out):
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _add_across(wide, weights, out, is_first):
-    """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,).
-
-    If `is_first`, it replaces the values of `out`.
-    """
+    """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,)."""
     a, b, c, d, e = wide[0:], wide[1:], wide[2:], wide[3:], wide[4:]
     f, g, h, i = wide[5:], wide[6:], wide[7:], wide[8:]
     w0, w1, w2, w3, w4 = weights[0], weights[1], weights[2], weights[3], weights[4]
@@ -293,10 +282,7 @@ def _add_across(wide, weights, out, is_first):
 
 @kernel
 def _magnify(light, runs, across, lines, down, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
-
-    The other arguments are those of `_Magnification`.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W)."""
     rows, _, width = light.shape
     pad = max(-runs[:, 3].min(), runs[:, 3].max() + TAPS - 1, 0)
     wide, filled = np.empty((3, width + 2 * pad), np.float32), np.empty((3, width), np.float32)
@@ -374,10 +360,7 @@ def _defocus_row(above, here, below, diameter, out):
 
 @kernel
 def _gather(light, v, u, diameter, rows, width, out):
-    """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u).
-
-    Beyond the image border, the pixels of the border are repeated.
-    """
+    """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u)."""
     radius = np.float32(0.5) * diameter + np.float32(0.5)
     reach = int(radius)
     red = green = blue = total = np.float32(0.0)

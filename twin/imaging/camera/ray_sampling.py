@@ -133,10 +133,7 @@ def _move(pose, focal, cx, cy, rays):
 
 @kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_y, cells):
-    """Computes the square of four pixel centres that each ray falls in, and the position in the square.
-
-    `cells` is filled with the index of its top left pixel, `part_x` and `part_y` with the position, 0 to 1.
-    """
+    """Computes the square of four pixel centres that each ray falls in, and the position in the square."""
     zero, one, last_x, last_y = np.float32(0.0), np.float32(1.0), np.float32(cols - 2), np.float32(rows - 2)
     n_cols = np.int32(cols)
     for u in range(base_x.size):

@@ -146,10 +146,7 @@ def _mean(light):
 
 @kernel
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
-    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values.
-
-    64 random bits select four normally distributed noise values from the table `normal`.
-    """
+    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values."""
     n = light.shape[1]
     n_words = (n + 3) // 4
     full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)

@@ -77,10 +77,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 
 @kernel(inline="always")
 def _flow(x, y, near, scale, twist):
-    """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth.
-
-    The flow is in px/s if `scale` is the focal length f, and in px if `scale` is f times a duration.
-    """
+    """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth."""
     one = np.float32(1.0)
     du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
     dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]
@@ -89,10 +86,7 @@ def _flow(x, y, near, scale, twist):
 
 @kernel(error_model="numpy")
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
-    """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur.
-
-    Compiled kernel of `blur_by_motion`. `flat` (H W, 3) is the radiance at mid-exposure.
-    """
+    """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur."""
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
     x, weights = np.empty(width, np.float32), np.empty((4, width), np.float32)
@@ -191,10 +185,7 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter.
-
-    Compiled kernel of `apply_rolling_shutter`.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter."""
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
     right, low = np.float32(width - 1), np.float32(height - 1)

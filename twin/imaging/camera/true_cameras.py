@@ -193,11 +193,7 @@ def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
 
 
 def _believed_model(scenario: Scenario) -> CameraModel:
-    """Returns the camera model for the rectification.
-
-    If the refraction of the port was not calibrated (`port.calibrated_at_m` = 0), the model contains only its effect
-    on the focal length.
-    """
+    """Returns the camera model for the rectification."""
     rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
     lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)
     port = scenario.port
@@ -218,19 +214,13 @@ def right_rotation(calibration: CalibrationErrorConfig) -> Array:
 
 
 def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    """Returns whether the true and the believed cameras are the same pinhole camera without a port.
-
-    The baseline may differ.
-    """
+    """Returns whether the true and the believed cameras are the same pinhole camera without a port."""
     same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`.
-
-    Positions are relative to the frame's top left pixel, without the border of the raw image.
-    """
+    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`."""
     normalised = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
     points_m = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)
@@ -279,10 +269,7 @@ def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
 
 
 def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the margin (columns, rows) [px] that the rendered image needs on each side.
-
-    With this margin it covers the rays of all raw pixels for depths from `NEAREST_M` to infinity.
-    """
+    """Returns the margin (columns, rows) [px] that the rendered image needs on each side."""
     ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
     missing = np.max([_missing_px(end, rig) for end in ends], axis=0)
     margin = -(-missing // MARGIN_STEP_PX) * MARGIN_STEP_PX

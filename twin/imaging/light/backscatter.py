@@ -43,10 +43,7 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
 
 
 def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
-    """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3].
-
-    The daylight is assumed to travel along the optical axis, away from the camera.
-    """
+    """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3]."""
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
     light = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[..., 2:])
@@ -122,19 +119,13 @@ def _size(rig: StereoRig) -> tuple[float, float]:
 
 
 def _grid_px(n: int, size_px: float, margin: int) -> Array:
-    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` positions outside of each end [px].
-
-    The spacing of the outer positions grows outwards; the outermost ones are `size_px` away from the ends.
-    """
+    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` positions outside of each end [px]."""
     outside = size_px * (np.arange(1.0, margin + 1) / max(margin, 1)) ** 2
     return np.concatenate([-outside[::-1], np.linspace(0.0, size_px, n), size_px + outside])
 
 
 def _smoother(place_px: Array, sigma_px: float) -> Array:
-    """Returns the matrix (n, n + 2 MARGIN) of a Gaussian blur on a grid, for the n positions within the image.
-
-    Each row sums to 1; where the Gaussian is much narrower than the spacing, the position keeps its own value.
-    """
+    """Returns the matrix (n, n + 2 MARGIN) of a Gaussian blur on a grid, for the n positions within the image."""
     spacing = np.gradient(place_px)
     inner = place_px[MARGIN:-MARGIN]
     weights = np.exp(-((inner[:, None] - place_px) ** 2) / (2 * sigma_px**2)) * spacing

@@ -170,10 +170,7 @@ def _local_attenuation(field: LightField, depth_m: float) -> float:
 
 
 def _turn(source: SunSky) -> Array:
-    """Returns the rotation (4, 4) of (x, y, z, 1) from the axes of the sun to the axes east, north, up.
-
-    In the axes of the sun, x points horizontally towards the sun, y to the left of it, and z up.
-    """
+    """Returns the rotation (4, 4) of (x, y, z, 1) from the axes of the sun to the axes east, north, up."""
     east, north, _ = source.to_sun
     length = np.hypot(east, north)
     c, s = (east / length, north / length) if length > 0 else (1.0, 0.0)
@@ -247,10 +244,7 @@ def world_axes(from_camera):
 
 @kernel(error_model="numpy")
 def _turn_to_camera(axes, to_sun, rest_lx, sun, form):
-    """Fills `sun` (3,) with the direction to the sun, `form` (3, 10) with the quadratic form of `rest_lx`.
-
-    Both are in the axes of the camera, as in the argument `sky` of `shading.shade`.
-    """
+    """Fills `sun` (3,) with the direction to the sun, `form` (3, 10) with the quadratic form of `rest_lx`."""
     turn, half = np.eye(4), np.empty((4, 4))
     turn[:3, :3] = axes
     for i in range(3):

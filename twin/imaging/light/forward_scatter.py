@@ -222,10 +222,7 @@ def _tables(weights: Array, moved: Array) -> NDArray[np.float32]:
 
 
 def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int) -> list[Radiance]:
-    """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid.
-
-    Each element of the list has the shares (rows, cols) of the pixels of one level.
-    """
+    """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid."""
     v, u = ((np.arange(0.0, n, 2) - (n - 1) / 2) / rig.focal_px for n in (rig.height_px, rig.width_px))
     secants = [np.sqrt(1 + v[:, None] ** 2 + u**2)]
     for level in range(2, levels + 1):

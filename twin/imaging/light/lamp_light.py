@@ -108,10 +108,7 @@ def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array
 
 
 def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2).
-
-    S is relative to `LightSources.intensity_cd`; the axes are those of `floor_tables`.
-    """
+    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2)."""
     return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
 
 
@@ -136,11 +133,7 @@ def _path_m() -> Array:
 
 @lru_cache(maxsize=64)
 def _on_rings(beam: Beam) -> Array:
-    """Returns the means (SOFT_STEPS + 1, m) of a beam around each of n directions, weighted by each of m Gaussians.
-
-    The n = SOFT_STEPS + 1 directions are at even steps of sqrt(1 - cos(angle)) from the beam axis, 0 to 1; the standard
-    deviations of the Gaussians are `LAMP_SIGMA_RAD`.
-    """
+    """Returns the means (SOFT_STEPS + 1, m) of a beam around each of n directions, weighted by each of m Gaussians."""
     edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])
     cosine = 1 - np.linspace(0.0, 1.0, SOFT_STEPS + 1)[:, None, None] ** 2
     azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi

@@ -141,11 +141,7 @@ class LightField:
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 
     def _mode(self, m: int) -> _Mode:
-        """Returns the solutions for term m of the cosine series in azimuth, m from 0.
-
-        The size of the eigenvalue problem is halved by solving for sum and difference of downwelling and upwelling
-        radiance.
-        """
+        """Returns the solutions for term m of the cosine series in azimuth, m from 0."""
         c, b, chi = self._scaled
         mu, weight, order = self._cosine, self._weight, np.arange(m, ORDERS, dtype=np.float64)
         root = np.sqrt(2 * order + 1)[:, None]
@@ -170,11 +166,7 @@ class LightField:
         return _Mode(decay, down, up, z[: mu.size], z[mu.size :], sky, kernel)
 
     def _coefficients(self, mode: _Mode, floor_m: Array) -> Array:
-        """Returns the weights (floors, 2 n) of the decaying and growing eigenvectors, from the boundary conditions.
-
-        At the surface, the downwelling radiance is that of the sky. At each of the depths `floor_m`, the upwelling
-        radiance is 0.
-        """
+        """Returns the weights (floors, 2 n) of the decaying and growing eigenvectors, from the boundary conditions."""
         n, fade = mode.decay_per_m.size, np.exp(-mode.decay_per_m * floor_m[:, None])
         system = np.empty((floor_m.size, 2 * n, 2 * n))
         system[:, :n, :n], system[:, :n, n:] = mode.down, mode.up * fade[:, None]
@@ -224,10 +216,7 @@ class LightField:
         return (light + source * along / cosine).T
 
     def _exact_once(self, m: int, cosine: Array) -> Array:
-        """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0.
-
-        The light is given per metre of the line of sight [cd/m3].
-        """
+        """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0."""
         turns = 64
         azimuth = 2 * np.pi * (np.arange(turns) + 0.5) / turns
         mu0 = self._daylight.sun_cosine
@@ -257,10 +246,7 @@ def _without_peak(water: BandOptics) -> _Scaled:
 
 
 def _quadrature() -> tuple[Array, Array]:
-    """Returns cosines and weights of the quadrature nodes of one hemisphere.
-
-    They are Gauss-Legendre nodes, chosen separately outside and inside the cone in which the sky appears under water.
-    """
+    """Returns cosines and weights of the quadrature nodes of one hemisphere."""
     parts = []
     for n, low, high in ((NODES[0], 0.0, CRITICAL_COSINE), (NODES[1], CRITICAL_COSINE, 1.0)):
         x, w = np.polynomial.legendre.leggauss(n)
@@ -288,10 +274,7 @@ def _cosine_moment(order: int) -> float:
 
 
 def _fitted_form(x: Array, y: Array, z: Array, light: Array) -> Array:
-    """Returns the quadratic form (4, 4) of (x, y, z, 1) that best fits the illuminance (n,) of sloping floors.
-
-    x, y, z are the components (n,) of the unit normals of these floors. The form is symmetric in y, as is the light.
-    """
+    """Returns the quadratic form (4, 4) of (x, y, z, 1) that best fits the illuminance (n,) of sloping floors."""
     terms = np.stack([np.ones_like(z), z, x, z * z, x * z, x * x - y * y], 1)
     weight = np.where(z == 1, LEVEL_WEIGHT, 1.0)
     one, up, side, square, cross, across = np.linalg.lstsq(terms * weight[:, None], light * weight, rcond=None)[0]

@@ -258,11 +258,7 @@ class Optics:
     def _floor_and_backscatter(
         self, albedo: Image, depth: Depth, camera: int, floor: FloorView | None, surface: WaterSurface | None
     ) -> tuple[Radiance, Radiance]:
-        """Returns the light of the floor at the camera and the backscatter [cd/m2].
-
-        The path to the camera attenuates the light of the floor by absorption alone with multiple scattering, otherwise
-        by absorption and scattering.
-        """
+        """Returns the light of the floor at the camera and the backscatter [cd/m2]."""
         light, backscatter = np.empty(albedo.shape, np.float32), np.empty(albedo.shape, np.float32)
         self._run((albedo, depth), camera, floor, surface, _Output(light, backscatter))
         return light, backscatter

@@ -217,10 +217,7 @@ def _take_normals(objects, v, normal):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
-    """Computes range (W,) and unit normals (3, W), towards the camera, from the depth of a floor without facets.
-
-    In each direction the smaller difference is used, so that a depth edge does not tilt the normals next to it.
-    """
+    """Computes range (W,) and unit normals (3, W), towards the camera, from the depth of a floor without facets."""
     height, width = depth.shape
     one, half, beyond, far = np.float32(1.0), np.float32(0.5), np.float32(np.inf), np.float32(FAR_M)
     here, above, below = depth[v], depth[max(v - 1, 0)], depth[min(v + 1, height - 1)]
@@ -268,11 +265,7 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp.
-
-    `lamplight` (3, W) is the output of `_illuminate`; the light is attenuated on the path from lamp to floor with the
-    coefficients `per_m` (3,) [1/m].
-    """
+    """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp."""
     steps, last = np.float32(beam.size - 1), np.int32(beam.size - 2)
     cell, _, share, _ = lookup
     for u in range(light.shape[1]):
@@ -290,11 +283,7 @@ def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`.
-
-    `lamplight` (3, W) is the output of `_illuminate`. The unscattered light is included where `lit` (W,) is not 0, if
-    `direct`.
-    """
+    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`."""
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     _, n_rows, n_cols, _ = soft.shape
@@ -380,10 +369,7 @@ def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(sky, normal, range_m, daylight, light):
-    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera.
-
-    `daylight` (3, W) is that of `_face_sun`, with the sun's shadows in row 1.
-    """
+    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera."""
     beam, diffuse, change, fitted, loss = sky
     per_m, zero = np.float32(LOG2_E), np.float32(0.0)
     level, low, high = fitted[0], fitted[1], fitted[2]
@@ -440,11 +426,7 @@ def _interpolate_backscatter(table, range_m, lookup, backscatter):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, backscatter, out):
-    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus `backscatter`.
-
-    For a floor of another material, `light` is daylight and the scattered light of the lamps; `backscatter` includes
-    the unscattered light of the lamps that the floor reflects.
-    """
+    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus `backscatter`."""
     reflected = np.float32(1 / (255 * np.pi))
     white, filled = albedo.reshape(-1), out.reshape(-1)
     for u in range(out.shape[0]):

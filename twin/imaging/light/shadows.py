@@ -92,10 +92,7 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 
 @kernel(error_model="numpy")
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
-    """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W).
-
-    The mark is DARK where facets face away from the lamp, CLEAR without floor, else OPEN, as on objects (`label`).
-    """
+    """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W)."""
     height, _, _, west, south, spacing = grid
     width, cols = depth.shape[1], height.shape[1]
     points, parts, cells = np.empty((3, width)), np.empty((2, width)), np.empty(width, np.int32)
@@ -131,10 +128,7 @@ def _find_floor(here, y, focal, pose, there, east, north, up):
 
 @kernel(error_model="numpy")
 def _find_cells(at, start, spacing, n, part, cells, stride, is_first):
-    """Computes the grid cells of positions (w,) along an axis of n nodes, and the fractional positions in the cells.
-
-    The number of the cell, times `stride`, is added to `cells`, or replaces its values if `is_first`.
-    """
+    """Computes the grid cells of positions (w,) along an axis of n nodes, and the fractional positions in the cells."""
     per_m, last = 1 / spacing, n - 2.0
     for u in range(at.size):
         x = (at[u] - start) * per_m
@@ -166,11 +160,7 @@ def _face_lamp(lamp, spacing, east, north, up, to_east, to_north, there, out):
 
 @kernel(error_model="numpy")
 def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
-    """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing.
-
-    A ray is cast for each OPEN pixel of a grid with the spacing `STRIDE_PX`, and for each OPEN neighbour of a DARK
-    pixel. In the completed masks, 0 is dark and 1 is lit.
-    """
+    """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing."""
     height, width = depth.shape
     stack = np.empty(height * width, np.int32)
     for k in range(first, end):

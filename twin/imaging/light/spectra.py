@@ -140,10 +140,7 @@ def water_spectrum(water_type: str, source: WaterSourceName = "solonenko2015") -
 
 
 def _filled(values: Array, clearer: Array, murkier: Array) -> Array:
-    """Returns a spectrum (n,) with its missing end interpolated between those of two other types.
-
-    The end lies between the other spectra in the same proportion as the last value that is given.
-    """
+    """Returns a spectrum (n,) with its missing end interpolated between those of two other types."""
     missing = np.isnan(values)
     last = int(np.argmax(missing)) - 1
     proportion = (values[last] - clearer[last]) / (murkier[last] - clearer[last])

@@ -145,11 +145,7 @@ def _camera_geometry() -> tuple[Array, Array, Array]:
 
 
 def _camera_rings(water: Absorbed, range_m: float) -> Array:
-    """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r).
-
-    There is one value per ring of tan(beta), where beta is the angle at the camera between the point of the floor and
-    the pixel's ray. r is the range; a and b are absorption and scattering coefficient of the water.
-    """
+    """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r)."""
     ring, excess, solid = _camera_geometry()
     density = phase_at((water.scatterer,), np.cos(_middle(_rings(np.pi / 2 * 0.999))))[:, 0] * solid
     light = density / STEPS * np.exp(-water.absorption_per_m * range_m * excess)

@@ -61,10 +61,7 @@ def sky_radiance(cosine: Array) -> Array:
 
 
 def _transmitted(cosine: Array) -> Array:
-    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water.
-
-    It is 0 beyond the critical angle.
-    """
+    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water."""
     under = np.asarray(cosine, np.float64)
     above = np.sqrt(np.maximum(1 - SEA_WATER_INDEX**2 * (1 - under**2), 0.0))
     inside = (under > 0) & (above > 0)
@@ -75,11 +72,7 @@ def _transmitted(cosine: Array) -> Array:
 
 
 def _sky_moments() -> tuple[float, float]:
-    """Returns the illuminance by a sky, and the ratio of its scalar illuminance to this illuminance.
-
-    The radiance of the sky just below the surface equals the transmittance [cd/m2]; the illuminance is that of a
-    horizontal plane [lx].
-    """
+    """Returns the illuminance by a sky, and the ratio of its scalar illuminance to this illuminance."""
     # the nodes are those of the cosine in air, which removes the root at the edge of the cone
     x, w = np.polynomial.legendre.leggauss(64)
     above = (x + 1) / 2

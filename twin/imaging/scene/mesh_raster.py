@@ -98,10 +98,7 @@ def _draw(
     points, faces, colours, uv, parts, matrix, projection, depth, albedo, normal, label, places, number, closed, first,
     end,
 ):  # fmt: skip
-    """Compiled kernel of `draw_meshes`: draws the rows `first` to `end` - 1 of a mesh with the points (3, n).
-
-    The compiler removes the code for images that are None.
-    """
+    """Compiled kernel of `draw_meshes`: draws the rows `first` to `end` - 1 of a mesh with the points (3, n)."""
     n = faces.shape[0]
     shown = np.empty((n + PART_FACES - 1) // PART_FACES, np.int32)
     window = 0, depth.shape[1], first, end
@@ -220,10 +217,7 @@ def _inverse(matrix):
 
 @kernel(error_model="numpy")
 def _project(points, matrix, projection, point, place):
-    """Computes the points (3, n) in camera axes, and their `place` (3, n): column, row and 1 / depth or -depth.
-
-    Columns are NaN for points nearer than the near plane.
-    """
+    """Computes the points (3, n) in camera axes, and their `place` (3, n): column, row and 1 / depth or -depth."""
     focal, cx, cy, near, perspective = projection
     a, b, c = points
     n = a.size
@@ -265,10 +259,7 @@ def _list_triangles(faces, start, end, place, window, closed, kept):
 
 @kernel(error_model="numpy", forceinline=True)
 def _rectangle(ua, va, ub, vb, uc, vc, window):
-    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle.
-
-    Only pixels of the `window` count, see `_list_parts`. If there are none, a last value is less than the first one.
-    """
+    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle."""
     left, right, top, bottom = window
     u0, u1 = max(np.ceil(min(ua, ub, uc)), np.float64(left)), min(np.floor(max(ua, ub, uc)), np.float64(right - 1))
     v0, v1 = max(np.ceil(min(va, vb, vc)), np.float64(top)), min(np.floor(max(va, vb, vc)), np.float64(bottom - 1))
@@ -317,10 +308,7 @@ def _list_pixels(
 
 @kernel(error_model="numpy", forceinline=True)
 def _normal(point, i, j, k, perspective):
-    """Returns the unit normal of a triangle in camera axes, towards the camera.
-
-    i, j, k are the columns of its corners in `point` (3, n).
-    """
+    """Returns the unit normal of a triangle in camera axes, towards the camera."""
     x, y, z = point[0], point[1], point[2]
     px, py, pz, qx, qy, qz = x[j] - x[i], y[j] - y[i], z[j] - z[i], x[k] - x[i], y[k] - y[i], z[k] - z[i]
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx

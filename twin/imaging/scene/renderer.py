@@ -103,10 +103,7 @@ class Renderer:
             camera.up[:] = -world_from_camera[:3, 1]
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Shows only the tiles of the mask `visible` (n,).
-
-        The others lose their mesh, as MuJoCo renders geoms without a mesh in almost no time.
-        """
+        """Shows only the tiles of the mask `visible` (n,)."""
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible

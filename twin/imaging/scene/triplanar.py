@@ -191,10 +191,7 @@ def _find(surface, depth, y, view, origin, focal, work, steep):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _place(surface, origin, work, steep, n):
-    """Fills the rows _EAST and _NORTH of `work` with the slopes of the facets, _X and _Y with the signed weights.
-
-    The slopes are the increase of the depth below the highest point, divided by the distance.
-    """
+    """Fills the rows _EAST and _NORTH of `work` with the slopes of the facets, _X and _Y with the signed weights."""
     height, number, weights = surface.height, surface.number, surface.weights
     per_cell = np.float32(1) / surface.spacing
     one = np.float32(1)
@@ -313,10 +310,7 @@ def _filtered(texels, levels, weight, along, turned, work, i, total, used):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _sample(texels, levels, level, along, below, weight):
-    """Returns `weight` times the colour of a level at a point [finest texels], interpolated bilinearly.
-
-    The texels of the edges continue beyond the texture.
-    """
+    """Returns `weight` times the colour of a level at a point [finest texels], interpolated bilinearly."""
     first, rows, cols = levels[level, 0], levels[level, 1], levels[level, 2]
     zero, half, scale = np.float32(0), np.float32(0.5), np.float32(1) / np.float32(1 << level)
     col = min(max(along * scale - half, zero), np.float32(cols - 2))
