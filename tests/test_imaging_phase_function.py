@@ -16,7 +16,7 @@ from twin.imaging.light.phase_function import (
     tabulate,
 )
 from twin.imaging.light.water import scatterers
-from twin.imaging.reference.sampling import density_at, sample_angle, sample_cosine
+from twin.imaging.reference.directions import density_at, sample_angle, sample_cosine
 from twin.scenario.model import WaterConfig
 
 FORMULAS = {

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.row_parallel import in_row_bands
-from twin.imaging.camera.noise import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
+from twin.imaging.camera.random_numbers import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.kernels import kernel
 
 Raw = NDArray[np.uint16]

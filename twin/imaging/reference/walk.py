@@ -19,8 +19,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.imaging.reference.floor import LIFT_M, floor_distance, floor_normal, sees
-from twin.imaging.reference.sampling import (
+from twin.imaging.reference.directions import (
     density_at,
     guide_density,
     sample_angle,
@@ -29,6 +28,7 @@ from twin.imaging.reference.sampling import (
     turn,
     turn_by_cosine,
 )
+from twin.imaging.reference.floor_crossings import LIFT_M, floor_distance, floor_normal, sees
 from twin.kernels import kernel
 
 #: Indices of the sums to which `walk` adds light; the bins of the blurred light start at FIRST_BIN.
