@@ -13,8 +13,6 @@ are not corrected; the floor is taken to be Lambertian.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -38,15 +36,6 @@ STEPS = 2  # number of corrections of the blur
 _DARK = 1e-6  # pixels whose light of a white floor, relative to the brightest pixel, is below this get the albedo 0
 
 
-class EstimatedFloor(NamedTuple):
-    """Heights of the estimated floor, see `facets.Heights`."""
-
-    height_m: NDArray[np.float32]
-    spacing_m: float
-    west_m: float
-    south_m: float
-
-
 class Restoration:
     """Restoration of the images of the left camera of a survey.
 
@@ -56,9 +45,8 @@ class Restoration:
 
     def __init__(self, scenario: Scenario, illumination: Illumination, rig: StereoRig, elevation: ElevationMap):
         self._rig, self._optics = rig, Optics(rig, illumination, scenario.lamps)
-        floor = estimated_floor(elevation)
+        self._floor = floor = estimated_floor(elevation)
         self._facets = Facets(floor)
-        self._field = floor_rays.height_field(floor.height_m, *floor[1:])
         sources = self._optics.light_sources
         self._shadows = None
         if scenario.imaging.shadows:
@@ -119,7 +107,7 @@ class Restoration:
         rig = self._rig
         columns = max(2, rig.width_px // DEPTH_STEP_PX)
         pixels = floor_rays.ray_grid(rig, columns)
-        depth = floor_rays.cast_pixels(self._field, map_from_camera[None], rig, pixels)[0]
+        depth = floor_rays.cast_pixels(self._floor, map_from_camera[None], rig, pixels)[0]
         terms, per_m = np.column_stack([pixels, np.ones(len(pixels))]), 1 / depth
         known = per_m > 0
         if known.sum() < 3:  # too few rays meet the map to fit a plane; these colours are not used
@@ -130,18 +118,13 @@ class Restoration:
         return 1 / cv2.resize(coarse, (rig.width_px, rig.height_px), interpolation=cv2.INTER_LINEAR)
 
 
-def estimated_floor(elevation: ElevationMap) -> EstimatedFloor:
-    """Returns the heights of a map, with the height of the nearest cell in each hole; all NaN if the map is empty.
+def estimated_floor(elevation: ElevationMap) -> floor_rays.HeightField:
+    """Returns the heights of a map with at least one height; each hole has the height of the nearest cell.
 
-    The nodes are the centres of the cells. The heights are not smoothed: smoothing tilts the facets at every edge,
-    where the light depends on them most.
+    The heights are not smoothed: smoothing tilts the facets at every edge, where the light depends on them most.
     """
-    grid, height = elevation.grid, elevation.height_m.astype(np.float64)
-    if np.isfinite(height).any():
-        height, _ = fill_holes(height)
-    south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
-    upwards = np.ascontiguousarray(height[::-1], np.float32)
-    return EstimatedFloor(upwards, grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)
+    height, _ = fill_holes(elevation.height_m.astype(np.float64))
+    return floor_rays.map_height_field(height.astype(np.float32), elevation.grid)
 
 
 def linear_signal(scenario: Scenario) -> NDArray[np.float32]:

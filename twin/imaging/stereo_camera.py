@@ -122,8 +122,9 @@ class StereoCamera:
         with self._stopwatch("optics"):
             setting = self._sensor.setting
             metered = setting is not None
-            if setting is None:
-                setting = self._first_setting(views[0])
+            if setting is None:  # metered on the first left image at rest
+                light = self._image_formation.radiance(views[0].albedo, views[0].depth, 0, pose, views[0].objects)
+                setting = self._meter(self._sensor, light, views[0].depth)
             expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
             if stereo:
                 (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
@@ -183,11 +184,6 @@ class StereoCamera:
             albedo, depth = self._renderer.render(world_from_camera)
             objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
         return _View(pose, camera, albedo, depth, objects)
-
-    def _first_setting(self, view: _View) -> ExposureSetting:
-        """Returns the exposure of the first frame, metered on its left view at rest."""
-        light = self._image_formation.radiance(view.albedo, view.depth, 0, view.pose, view.objects)
-        return self._meter(self._sensor, light, view.depth)
 
     def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
         """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels."""

@@ -57,7 +57,8 @@ def floor_daylight(daylight: Daylight) -> FloorDaylight:
     source, water, east_north = daylight.source, daylight.water, _turn(daylight.source)
     beam, deep = daylight.surface_lx * source.beam_lx, daylight.reference_depth_m
     if not (deep and water.multiple and daylight.surface_lx.any()):
-        form = east_north @ _in_clear_water(source).slope_form(0.0, 1e-6) @ east_north.T
+        clear = _field(Absorbed(0.0, 0.0, Scatterer("petzold")), source, 1)
+        form = east_north @ clear.slope_form(0.0, 1e-6) @ east_north.T
         fade = -daylight.attenuation_per_m
         rest_lx = (daylight.surface_lx * np.exp(fade * deep))[:, None, None] * form
         rest_per_m = np.stack([fade, np.zeros(3)], 1)
@@ -177,11 +178,6 @@ def _turn(source: SunSky) -> Array:
     out = np.eye(4)
     out[:2, :2] = [[c, -s], [s, c]]
     return out
-
-
-def _in_clear_water(source: SunSky) -> LightField:
-    """Returns the light field in water without absorption and scattering."""
-    return _field(Absorbed(0.0, 0.0, Scatterer("petzold")), source, 1)
 
 
 @lru_cache(maxsize=64)

@@ -153,7 +153,8 @@ class Optics:
         self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.lamp_light[camera]))
         self._forward = ForwardScatter(rig, self._medium) if scatters else None
         # working memory of each camera, as both images may be computed at the same time
-        self._memory = cache(lambda camera: _working_memory(rig))
+        light_shape, half_shape = (rig.height_px, rig.width_px, 3), ((rig.height_px + 1) // 2, (rig.width_px + 1) // 2)
+        self._memory = cache(lambda camera: (np.empty(light_shape, np.float32), np.empty(half_shape, np.float32)))
         self._lamp_loss_per_m = self._medium.attenuation_per_m.astype(np.float32)
         loss_per_m = np.stack([self._medium.camera_loss_per_m, daylight.camera_loss_per_m])
         self._sky = Sky(floor_daylight(daylight), loss_per_m)
@@ -299,12 +300,6 @@ class Optics:
 def _or(value: Value | None, substitute: Value) -> Value:
     """Returns the value; the substitute if the value is None."""
     return substitute if value is None else value
-
-
-def _working_memory(rig: StereoRig) -> tuple[Radiance, Place]:
-    """Returns arrays for the light of the floor (H, W, 3), and for the argument `place` of `ForwardScatter.add`."""
-    shape = rig.height_px, rig.width_px
-    return np.empty((*shape, 3), np.float32), np.empty(((shape[0] + 1) // 2, (shape[1] + 1) // 2), np.float32)
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:
