@@ -62,11 +62,7 @@ class Restoration:
         self._world_from_map = geometry.inverse(elevation.map_from_world)
 
     def __call__(self, image: Image, exposure: Exposure | None, map_from_camera: Array) -> Radiance:
-        """Returns the albedo (H, W, 3) float32 of the floor in an image, 255 = white.
-
-        Args:
-            image: (H, W, 3) uint8 left image.
-            map_from_camera: (4, 4) pose of the camera in the axes of the estimated map.
+        """Returns the albedo (H, W, 3) float32 of the floor in a left image (H, W, 3) uint8, 255 = white.
 
         Raises:
             TwinError: the exposure is not known.

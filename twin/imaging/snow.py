@@ -52,11 +52,9 @@ class VisibleParticles(NamedTuple):
 
 
 class MarineSnow:
-    """Marine snow particles of one survey.
+    """Marine snow particles of one survey, which move with the current (3,).
 
-    Args:
-        current_mps: (3,) velocity of the particles in the world.
-        defocus: aperture and focus of the lens; None = an aperture of `APERTURE_M`, focused at infinity.
+    Without `defocus`, the lens has an aperture of `APERTURE_M` and is focused at infinity.
     """
 
     def __init__(

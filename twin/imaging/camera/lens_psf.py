@@ -68,11 +68,7 @@ def diffraction_mtf(cycles_per_px: Array, wavelength_nm: float, sensor: SensorCo
 
 
 class LensPsf:
-    """Point spread function of both lenses, which is applied to the light of a rendered image.
-
-    Args:
-        scenario: lens, port and sensor; without a sensor there is neither diffraction nor depth of field.
-    """
+    """Point spread function of both lenses; without a sensor there is neither diffraction nor depth of field."""
 
     def __init__(self, scenario: Scenario, rig: StereoRig):
         lens = scenario.lens

@@ -38,11 +38,7 @@ class Sensor(Protocol):
 
 
 def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
-    """Returns a scenario's sensor in its initial state: `PhotoSensor` with a section [sensor], else `PlainSensor`.
-
-    Args:
-        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
-    """
+    """Returns a scenario's sensor in its initial state; `raw_rig` see `PhotoSensor`."""
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
 

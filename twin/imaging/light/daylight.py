@@ -81,11 +81,7 @@ def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, 
 
 
 class DaylightVeil:
-    """Daylight that the water scatters into the lines of sight of a camera, with any order of scattering.
-
-    Args:
-        range_m: (n,) ranges at which the radiance is tabulated [m], increasing from 0; the last one may be infinite.
-    """
+    """Daylight scattered into the lines of sight of a camera, in any order, at ranges (n,) that increase from 0 [m]."""
 
     def __init__(self, daylight: Daylight, range_m: Array):
         self._depth_m, self._source, water = daylight.camera_depth_m, daylight.source, daylight.water
@@ -225,11 +221,7 @@ class Sky:
 
 @kernel(error_model="numpy")
 def world_axes(from_camera):
-    """Returns the unit vectors east, north and up in the axes of the camera, as columns (3, 3).
-
-    Args:
-        from_camera: (3, 4) that of `optics.WaterSurface`.
-    """
+    """Returns the unit vectors east, north and up in camera axes, as columns (3, 3); see `optics.WaterSurface`."""
     axes = np.empty((3, 3))
     for k in range(3):
         x, y, z = from_camera[k, 0], from_camera[k, 1], from_camera[k, 2]

@@ -123,20 +123,16 @@ class ForwardScatter:
         in_row_bands(lambda first, end: _add_upsampled(*finest, first, end), len(light))
 
     def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
-        """Returns all light (H, W, 3) of the floor that was scattered between floor and camera [cd/m2].
-
-        Args:
-            range_m: (H, W) distance of the floor from the camera; inf is valid.
+        """Returns all light (H, W, 3) of the floor scattered between floor and camera [cd/m2], see `add`; a range of
+        inf is valid.
         """
         light = (floor * self.core(range_m)).astype(np.float32)
         self.add(floor, np.ascontiguousarray(place_of(range_m)[::2, ::2]), around, light)
         return light
 
     def core(self, range_m: Array) -> Array:
-        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel.
-
-        Args:
-            range_m: (H, W) distance of the floor from the camera; inf is valid.
+        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel; a range of inf is
+        valid.
         """
         place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
         return np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)

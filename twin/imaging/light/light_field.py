@@ -79,10 +79,9 @@ def legendre_moments(phase: PhaseTable, orders: int) -> Array:
 
 
 class LightField:
-    """Radiance of daylight in water over a black floor, for 1 lx just below the surface.
+    """Radiance of daylight in water over a black floor, for 1 lx just below the surface, in `modes` terms of azimuth.
 
-    Args:
-        modes: number of terms of the series in azimuth; one is used for a sun at the zenith or without a beam.
+    One term is used for a sun at the zenith or without a beam.
     """
 
     def __init__(self, water: BandOptics, daylight: SunSky, modes: int):
@@ -103,11 +102,7 @@ class LightField:
         return np.array(down)[:, 0], np.array(up)[:, 0]
 
     def illuminance(self, depth_m: float, floor_m: float) -> tuple[float, float]:
-        """Returns the illuminance of a horizontal plane by the beam and by all other light from above [lx].
-
-        Args:
-            depth_m: depth of the plane below the surface.
-        """
+        """Returns the illuminance of a horizontal plane at a depth by the beam and by all other light [lx]."""
         beam = self._daylight.beam_lx * self._daylight.sun_cosine * np.exp(-self.beam_per_m * depth_m)
         down, _ = self.scattered(depth_m, floor_m)
         return float(beam), float(2 * np.pi * (down[0] * self._weight * self._cosine).sum())

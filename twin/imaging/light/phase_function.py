@@ -114,9 +114,7 @@ def henyey_greenstein(mean_cosine: float) -> PhaseFunction:
 def fournier_forand(index: float, slope: float) -> PhaseFunction:
     """Returns the phase function of Fournier & Forand (1994), in the form of Mobley et al. (2002, Appl. Opt. 41, 1035).
 
-    Args:
-        index: refractive index of the particles relative to water, above 1.
-        slope: exponent of the hyperbolic (Junge) size distribution, above 3 and below 5.
+    `index` of the particles relative to water is above 1, `slope` of the size distribution from 3 to 5.
     """
     nu = (3 - slope) / 2
 

@@ -45,9 +45,8 @@ class _Grid(NamedTuple):
 class Shadows:
     """Shadow casting: determines which pixels each lamp and the sun illuminate.
 
-    Args:
-        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
-        to_sun: (3,) unit direction to the sun in the axes of the floor; None = no sun, or one that casts no shadow.
+    Lamps (lamps, 3) are in the axes of the left and right camera, `to_sun` (3,) in those of the floor; None = no
+    shadow.
     """
 
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None = None):

@@ -41,11 +41,7 @@ def sensitivity() -> Array:
 
 
 def band_weights(light: Array | None = None) -> Array:
-    """Returns the weights (3, n) of the wavelengths `NM` in the bands R, G, B; each row has the sum 1.
-
-    Args:
-        light: (n,) power of the light per wavelength at `NM`, of any scale; None: equal at all wavelengths.
-    """
+    """Returns the weights (3, n) of `NM` in the bands, each row of sum 1, for the power of a light (None: equal)."""
     photons = NM if light is None else NM * light
     weights = sensitivity() * photons
     return weights / weights.sum(1, keepdims=True)

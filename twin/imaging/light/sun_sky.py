@@ -41,10 +41,9 @@ class SunSky(NamedTuple):
 
 
 def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, float, float]:
-    """Returns the unit direction (east, north, up) to the sun as it appears under water.
+    """Returns the unit direction (east, north, up) to the sun under water, given its elevation and azimuth in air.
 
-    Args:
-        elevation_deg: elevation of the sun above the horizon, in air.
+    The azimuth is counter-clockwise from x (east).
     """
     sine = np.cos(np.deg2rad(elevation_deg)) / SEA_WATER_INDEX if elevation_deg < 90 else 0.0
     east, north = sine * np.cos(np.deg2rad(azimuth_deg)), sine * np.sin(np.deg2rad(azimuth_deg))
@@ -52,11 +51,7 @@ def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, f
 
 
 def sky_radiance(cosine: Array) -> Array:
-    """Returns the radiance [cd/m2] under water of a uniform sky that causes 1 lx just below the surface.
-
-    Args:
-        cosine: cosine of the zenith angle under water, of any shape; the sky is dark beyond the critical angle.
-    """
+    """Returns the radiance [cd/m2] under water of a uniform sky of 1 lx at a cosine of the zenith angle."""
     return _transmitted(cosine) / _SKY_LX
 
 

@@ -1,5 +1,4 @@
-"""Wind waves: the unified spectrum of Elfouhaily et al. (1997, J. Geophys. Res. 102, 15781), gravity to capillary
-waves.
+"""Wind waves from gravity to capillary waves: the spectrum of Elfouhaily et al. (1997, J. Geophys. Res. 102, 15781).
 
 The elevation has the spectrum S(k) = B(k) / k^3, the slopes the variance int B / k dk. Waves are spread over directions
 phi from the wind with the density (1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed.
@@ -21,11 +20,7 @@ _SHORTEST_RAD_PER_M = 2e4  # the spectrum of shorter waves is negligible
 
 
 def angular_frequency(k: Array) -> Array:
-    """Returns the angular frequency of gravity-capillary waves in deep water [rad/s]: omega^2 = g k (1 + (k / 370)^2).
-
-    Args:
-        k: wave numbers, of any shape [rad/m].
-    """
+    """Returns the angular frequency of waves in deep water [rad/s]: omega^2 = g k (1 + (k / 370)^2)."""
     return np.sqrt(GRAVITY_MPS2 * k * (1 + (k / SLOWEST_RAD_PER_M) ** 2))
 
 
@@ -62,11 +57,7 @@ def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
 
 
 def slope_variance(wind_mps: float, above_rad_per_m: float = 1e-3) -> tuple[float, float]:
-    """Returns the variances of the slope along and across the wind, due to waves above a given wave number.
-
-    Args:
-        wind_mps: wind speed 10 m above the sea.
-    """
+    """Returns the variances of the slope along and across the wind, due to waves above a given wave number."""
     k = np.geomspace(above_rad_per_m, max(_SHORTEST_RAD_PER_M, 2 * above_rad_per_m), 4000)
     per_k, quarter = curvature_spectrum(k, wind_mps) / k, directionality(k, wind_mps) / 4
     along, across = (float(np.trapezoid(per_k * share, k)) for share in (0.5 + quarter, 0.5 - quarter))

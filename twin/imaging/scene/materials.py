@@ -1,24 +1,16 @@
 """Reflection of light by the floor: Lambertian, Oren-Nayar or Hapke, and specular highlights.
 
-A material is given by its bidirectional reflectance f [1/sr]: radiance = f * illuminance. With i and o the unit
-vectors to the light and to the camera, mu_i and mu_o the cosines of incidence and of view, c = i . o the cosine of the
-phase angle g, and rho the albedo of the texture:
+A material has a bidirectional reflectance f [1/sr]: radiance = f * illuminance. With mu_i and mu_o the cosines of
+incidence and view, c that of the phase angle g, and rho the albedo of the texture:
 
 Lambertian: f = rho / pi.
-
 Oren & Nayar 1994 (qualitative model, their eq. 30), sigma the standard deviation of the slope angle of V-grooves:
     f = rho / pi * (A + B max(0, s) / max(mu_i, mu_o)),  s = c - mu_i mu_o,
     A = 1 - 0.5 sigma^2 / (sigma^2 + 0.33),  B = 0.45 sigma^2 / (sigma^2 + 0.09)
-where s / max(mu_i, mu_o) equals cos(azimuth difference) sin(alpha) tan(beta) of the paper.
-
-Hapke 1981 (isotropic scatterers; Hapke 1986 for the opposition effect B_g), a layer of grains without larger relief:
+Hapke 1981 (isotropic scatterers; Hapke 1986 for B_g), w from the diffusive reflectance rho = (1 - gamma) / (1 + gamma):
     f = w / (4 pi) / (mu_i + mu_o) * (1 + B_g + H(mu_i) H(mu_o) - 1),
     H(x) = (1 + 2x) / (1 + 2x gamma),  gamma = sqrt(1 - w),  B_g = B0 / (1 + tan(g/2) / h)
-The single-scattering albedo w follows from the albedo: rho is the diffusive reflectance (1 - gamma) / (1 + gamma).
-
-Specular highlights: the share F of the light that meets a microfacet is mirrored, the share 1 - F reflected as above.
-With the distribution D of the normals m of microfacets and the shadowing-masking function G of GGX (Walter et al. 2007,
-eqs. 20, 33 and 34; F does not depend on the angle, so that energy is conserved):
+Specular highlights of a share F (the rest is reflected as above), D and G of GGX (Walter et al. 2007, eqs. 20, 33, 34):
     f_s = F D(m) G(i) G(o) / (4 mu_i mu_o)
 
 Daylight, and lamp light that was scattered on its way to the floor, are reflected as by a Lambertian floor.

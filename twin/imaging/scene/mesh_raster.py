@@ -72,11 +72,7 @@ class DrawnMesh(NamedTuple):
 
 
 def draw_meshes(drawn: Sequence[DrawnMesh], projection: Projection, target: Target) -> None:
-    """Draws meshes into images, in the pixels where a mesh is nearer than what they show, in parallel bands of rows.
-
-    Args:
-        target: images to draw into, modified in place.
-    """
+    """Draws meshes in their order into images in place, where they are nearer than what these show."""
     draw = []
     for item in drawn:
         points = np.ascontiguousarray(item.mesh.vertices_m.T)

@@ -26,11 +26,7 @@ class TexturedSurface(NamedTuple):
 
 
 def paint_textures(target: Target, projection: Projection, surface: TexturedSurface) -> None:
-    """Draws the textures into `target.albedo` wherever `target.label` names a mesh with a texture.
-
-    Args:
-        target: images that `draw_meshes` has drawn into; none of them is None.
-    """
+    """Draws the textures into `target.albedo` after `draw_meshes`; none of the images of `target` is None."""
     _paint(*target, projection, *surface.textures, surface.of_label)
 
 

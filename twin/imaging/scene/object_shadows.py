@@ -40,11 +40,8 @@ class _LightView(NamedTuple):
 
 
 class ObjectShadows:
-    """Shadow casting by objects.
-
-    Args:
-        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
-        to_sun: (3,) unit direction to the sun in world axes; None: the sun casts no shadow.
+    """Shadow casting by objects; the lamps are in the axes of the left and right camera, `to_sun` in those of the
+    world.
     """
 
     def __init__(self, objects: Objects, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None):

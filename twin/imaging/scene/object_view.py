@@ -24,11 +24,9 @@ LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image 
 
 
 class Objects:
-    """Objects in the world, with the level of detail that a view needs.
+    """Objects in the world, with the level of detail that a view needs; plants sway in the current (3,).
 
-    Args:
-        current_mps: (3,) velocity of the current, in which plants sway.
-        floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: the floor is no mesh.
+    The tiles of a mesh floor are drawn like objects and numbered after them.
     """
 
     def __init__(
@@ -77,11 +75,7 @@ def draw_objects(
     objects: Objects, target: Target, camera_from_world: Array, limits: Array, projection: Projection,
     time_s: float = 0.0,
 ) -> None:  # fmt: skip
-    """Draws the objects in view into images, with their numbers + 1 as labels, and the textures of a mesh floor.
-
-    Args:
-        target: images to draw into; with textures, none of them is None.
-    """
+    """Draws the objects in view into images, labelled by their numbers + 1, and the textures of a mesh floor."""
     draw_meshes(objects.in_view(camera_from_world, limits, projection, time_s), projection, target)
     if objects.surface is not None:
         paint_textures(target, projection, objects.surface)

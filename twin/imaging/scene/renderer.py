@@ -59,11 +59,7 @@ class Renderer:
         self._shown = np.ones(len(self._tiles), dtype=bool)
 
     def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; inf = no floor.
-
-        Args:
-            world_from_camera: (4, 4) pose of the camera.
-        """
+        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; inf = no floor."""
         self._gl.make_current()
         self._set_pose(world_from_camera)
         self._show(visible_tiles(self._scene_model, world_from_camera, self._tan))

@@ -83,12 +83,7 @@ def _levels(texture: Image) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
 def paint_walls(
     surface: WallSurface, albedo: Image, depth: NDArray[np.float32], world_from_camera: Array, focal_px: float
 ) -> None:
-    """Blends the texture of the walls into an image of the floor from a centred pinhole camera, in place.
-
-    Args:
-        albedo: (H, W, 3) uint8 albedo with the texture projected from above.
-        depth: (H, W) depth of the floor along the optical axis [m]; inf where there is no floor.
-    """
+    """Blends the texture of the walls into the albedo (H, W, 3) of a centred pinhole camera, in place."""
     pose = np.array(world_from_camera[:3]) / surface.texel_m  # east, north and down from the highest point [texels]
     pose[:2, 3] -= surface.corner_m / surface.texel_m
     pose[2] = -pose[2]
