@@ -128,11 +128,6 @@ class ImageFormation:
         if self._snow is not None:
             self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion)
 
-    @property
-    def snows(self) -> bool:
-        """Whether marine snow is enabled."""
-        return self._snow is not None
-
     def components(
         self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None
     ) -> RadianceComponents:

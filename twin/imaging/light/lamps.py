@@ -92,6 +92,6 @@ def colour(temperature_k: float) -> Array:
 
 
 def _black_body(temperature_k: float) -> Array:
-    """Returns the power (n,) of a black body per wavelength at `bands.NM`, up to a factor (Planck 1901)."""
+    """Returns the power (n,) of a black body per wavelength at `NM`, up to a factor (Planck 1901)."""
     metres = NM * 1e-9
     return metres**-5 / np.expm1(_HC_PER_K / (metres * temperature_k))

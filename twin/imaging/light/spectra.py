@@ -99,11 +99,10 @@ _COMPARED_NM = 550.0  # wavelength at which the scattering of the sources is com
 
 
 class WaterSpectrum(NamedTuple):
-    """Optical properties of one water at the wavelengths `bands.NM`."""
+    """Optical properties of one water at the wavelengths `NM`."""
 
     absorption_per_m: Array  # (n,) absorption coefficient a [1/m]
     scattering_per_m: Array  # (n,) scattering coefficient b [1/m]
-    provenance: str  # citation, DOI, version of the package, and known doubts about these values
 
 
 @cache
@@ -119,20 +118,15 @@ def water_spectrum(water_type: str, source: WaterSourceName = "solonenko2015") -
         raise TwinError("water.jerlov", f"{water_type}: not in {source}", ", ".join(WATER_SOURCES[source].types))
     package = jerlov_package()
     water = package.water(water_type, source=source)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with warnings.catch_warnings():  # about values that the package flags, see above
+        warnings.simplefilter("ignore")
         nm, absorption, scattering = water.wavelengths, water.a(water.wavelengths), np.asarray(water.b(NM))
-    notes = [str(warning.message) for warning in caught]
     if not np.isfinite(absorption).all():
-        first_nm = nm[np.isnan(absorption)][0]
-        notes.append(f"a from {first_nm:g} nm is interpolated between types {_CLEARER} and {_MURKIER}.")
         absorption = _filled(absorption, *(package.water(name, source=source).a(nm) for name in (_CLEARER, _MURKIER)))
     absorption = np.interp(NM, nm, absorption)
     for values in (absorption, scattering):
         values.setflags(write=False)
-    known = package.SOURCES[source]
-    text = " ".join([f"{known.citation}, doi {known.doi}; package jerlov {package.__version__}.", *notes])
-    return WaterSpectrum(absorption, scattering, text)
+    return WaterSpectrum(absorption, scattering)
 
 
 def _filled(values: Array, clearer: Array, murkier: Array) -> Array:

@@ -105,7 +105,7 @@ def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Arra
     elif water.jerlov == "clear":
         return np.zeros(3), np.zeros(3)
     else:
-        absorption, scattering, _ = water_spectrum(water.jerlov, water.source)
+        absorption, scattering = water_spectrum(water.jerlov, water.source)
     weights = band_weights(spectrum_of(light))
     return effective_per_m(absorption, weights, path_m), effective_per_m(scattering, weights)
 
