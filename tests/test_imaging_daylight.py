@@ -7,17 +7,15 @@ import pytest
 
 from twin.core.records import StereoRig
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.light.bands import band_weights
 from twin.imaging.light.daylight import DaylightVeil, floor_daylight
 from twin.imaging.light.illumination import Illumination, daylight_at, illumination_of
 from twin.imaging.light.light_field import BandOptics, LightField
-from twin.imaging.light.light_spectra import spectrum_of
 from twin.imaging.light.optics import Optics, WaterSurface
 from twin.imaging.light.phase_function import henyey_greenstein, petzold, table_of, tabulate
 from twin.imaging.light.shadows import Shadows
+from twin.imaging.light.spectra import band_weights, spectrum_of, water_spectrum
 from twin.imaging.light.sun_sky import CRITICAL_COSINE, SunSky, direction_to_sun, sky_radiance
 from twin.imaging.light.water import downwelling_per_m, medium
-from twin.imaging.light.water_tables import water_spectrum
 from twin.imaging.reference.pixel_light import (
     BandWater,
     Effort,

@@ -8,13 +8,12 @@ from scipy.integrate import quad
 
 from twin.errors import TwinError
 from twin.imaging.light.backscatter import backscatter_per_m
-from twin.imaging.light.bands import CENTRE_NM, NM, WIDTH_NM, band_weights
 from twin.imaging.light.illumination import Illumination, daylight_at
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.lamps import LED_BEAM, beam_share, colour, light_sources_in_camera
-from twin.imaging.light.light_spectra import spectrum_of
 from twin.imaging.light.optics import FloorView, Optics, WaterSurface
 from twin.imaging.light.phase_function import henyey_greenstein
+from twin.imaging.light.spectra import CENTRE_NM, NM, WIDTH_NM, band_weights, spectrum_of
 from twin.imaging.light.water import (
     downwelling_per_m,
     medium,

@@ -11,8 +11,8 @@ from twin.imaging.camera.photo_sensor import PhotoSensor
 from twin.imaging.camera.photons import electrons_per_cd, photons_per_lux, vignetting
 from twin.imaging.camera.sensor import ExposureSetting
 from twin.imaging.image_formation import ImageFormation, StampedPose
-from twin.imaging.light.bands import NM, sensitivity
 from twin.imaging.light.illumination import illumination_of
+from twin.imaging.light.spectra import NM, sensitivity
 from twin.scenario.model import Scenario
 
 FLAT = types.SimpleNamespace(height_m=np.zeros((9, 9), np.float32), spacing_m=1.0, west_m=-4.0, south_m=-4.0)

@@ -7,11 +7,9 @@ from twin.imaging.camera.photo_sensor import PhotoSensor
 from twin.imaging.camera.photons import electrons_per_cd
 from twin.imaging.camera.tone import LOG_STOPS, linear_of, tone
 from twin.imaging.camera.white_balance import MOST, WhiteBalance
-from twin.imaging.light.bands import band_weights
 from twin.imaging.light.lamps import colour
-from twin.imaging.light.light_spectra import spectrum_of
+from twin.imaging.light.spectra import band_weights, spectrum_of, water_spectrum
 from twin.imaging.light.water import downwelling_per_m, medium
-from twin.imaging.light.water_tables import water_spectrum
 from twin.scenario.model import Scenario
 
 GREY = np.full((30, 40, 3), 20.0, np.float32)

@@ -8,12 +8,21 @@ import numpy as np
 import pytest
 
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.light import water_tables
-from twin.imaging.light.bands import CENTRE_NM, NM, WIDTH_NM, band_weights, effective_per_m, sensitivity
+from twin.imaging.light import spectra
 from twin.imaging.light.illumination import illumination_of
-from twin.imaging.light.light_spectra import LED_B5, spectrum_of
+from twin.imaging.light.spectra import (
+    CENTRE_NM,
+    LED_B5,
+    NM,
+    WIDTH_NM,
+    band_weights,
+    effective_per_m,
+    provenance_of,
+    sensitivity,
+    spectrum_of,
+    water_spectrum,
+)
 from twin.imaging.light.water import Medium, downwelling_per_m, medium
-from twin.imaging.light.water_tables import provenance_of, water_spectrum
 from twin.scenario.file import load_scenario
 from twin.scenario.model import WaterConfig
 from twin.scenario.water_sources import WATER_SOURCES
@@ -70,13 +79,12 @@ def test_missing_absorption_lies_between_neighbouring_types_and_near_the_other_s
     np.testing.assert_allclose((found - clearer) / (murkier - clearer), (last - below) / (above - below), rtol=1e-9)
     assert (found > jerlov.pure_water_absorption(NM[end])).all()
     np.testing.assert_allclose(found, water_spectrum(name, "williamson2022").absorption_per_m[end], rtol=0.16)
-    assert f"a from {first_nm:g} nm is interpolated between types 1C and 7C" in water_spectrum(name).provenance
 
 
 def test_the_rule_for_missing_absorption_predicts_the_printed_values_of_3c():
     nm = np.arange(575.0, 651.0, 25.0)
     printed, clearer, murkier = (jerlov.water(name, source="solonenko2015").a(nm) for name in ("3C", "1C", "7C"))
-    predicted = water_tables._filled(np.where(nm > 575.0, np.nan, printed), clearer, murkier)
+    predicted = spectra._filled(np.where(nm > 575.0, np.nan, printed), clearer, murkier)
     np.testing.assert_allclose(predicted, printed, rtol=0.005)
 
 
@@ -158,7 +166,6 @@ def test_the_led_has_the_chromaticity_that_the_cie_publishes():
 
 
 def test_the_source_is_named():
-    assert "10.1364/AO.54.005392" in water_spectrum("II").provenance and "flagged" in water_spectrum("I").provenance
     assert provenance_of(WaterConfig(jerlov="II", source="williamson2022")) == (
         "Jerlov II (Williamson & Hollins 2022), turbidity 1; b at 550 nm is 2 times as large in Solonenko & Mobley 2015"
     )
@@ -188,7 +195,7 @@ def test_a_type_that_the_source_does_not_have_is_rejected_when_the_scenario_is_l
 
 def test_the_tables_load_without_data_frames_and_colour_libraries():
     code = (
-        "import sys; from twin.imaging.light.water_tables import water_spectrum; water_spectrum('II'); "
+        "import sys; from twin.imaging.light.spectra import water_spectrum; water_spectrum('II'); "
         "sys.exit(bool({'pandas', 'colour', 'matplotlib'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0

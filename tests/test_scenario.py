@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.light.bands import NM
+from twin.imaging.light.spectra import NM
 from twin.imaging.light.water import read_spectrum
 from twin.scenario.file import dump_toml, load_scenario
 from twin.scenario.model import EstimateConfig, Scenario

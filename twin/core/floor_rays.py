@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
+from twin.core.grid_triangles import rises
 from twin.core.records import MapGrid, StereoRig
 from twin.kernels import kernel
 
@@ -145,10 +146,7 @@ def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
     for part in range(2):
         a, b = (start, middle) if part == 0 else (middle, end)
         t = (a + b) / 2
-        if u0 + t * u_rate >= v0 + t * v_rate:
-            du, dv = h01 - h00, h11 - h01
-        else:
-            du, dv = h11 - h10, h10 - h00
+        du, dv = rises(h00, h01, h10, h11, u0 + t * u_rate, v0 + t * v_rate)
         gap_a = z0 + a * z_rate - (h00 + (u0 + a * u_rate) * du + (v0 + a * v_rate) * dv)
         gap_b = z0 + b * z_rate - (h00 + (u0 + b * u_rate) * du + (v0 + b * v_rate) * dv)
         if gap_a <= 0:

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.kernels import kernel
+
 
 def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
     """Returns the triangles of a grid, counter-clockwise as seen from above, cell by cell.
@@ -33,3 +35,11 @@ def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
     cells = np.arange(valid.size).reshape(valid.shape)
     triangles = grid_triangles(cells[::-1])
     return triangles[valid.reshape(-1)[triangles].all(axis=1)]
+
+
+@kernel(inline="always")
+def rises(south_west, south_east, north_west, north_east, east_part, north_part):
+    """Returns the rise over a cell towards east and north of its triangle at a point, given as parts of the cell."""
+    lower = east_part >= north_part
+    east = south_east - south_west if lower else north_east - north_west
+    return east, north_east - south_east if lower else north_west - south_west

@@ -36,41 +36,28 @@ class RadianceComponents(NamedTuple):
     """Illuminance of the floor, and components of the light that reaches a camera; (H, W, 3) float32 each.
 
     All are given per colour band in photometric units.
-
-    Args:
-        floor_lx: illuminance of the floor by lamps and daylight [lx]; NaN where there is no floor, and where the water
-            transmits too little light from the floor to the camera to compute it.
-        direct: light from the floor that was not scattered on its path to the camera [cd/m2].
-        forward: light from the floor that was scattered on its path to the camera [cd/m2]; None unless the water
-            scatters and `imaging.scattering` is full.
-        backscatter: light of lamps and daylight that the water scatters into the camera [cd/m2].
-        snow: change of the radiance by marine snow [cd/m2], negative where particles are darker than the light that
-            they hide; None if marine snow is disabled.
-        total: sum of direct, forward, backscatter and snow [cd/m2].
     """
 
+    # illuminance of the floor by lamps and daylight [lx]; NaN where there is no floor, and where the water transmits
+    # too little light from the floor to the camera to compute it
     floor_lx: Radiance
-    direct: Radiance
+    direct: Radiance  # light from the floor that was not scattered on its path to the camera [cd/m2]
+    # light from the floor that was scattered on its path to the camera [cd/m2]; None unless the water scatters and
+    # `imaging.scattering` is full
     forward: Radiance | None
-    backscatter: Radiance
+    backscatter: Radiance  # light of lamps and daylight that the water scatters into the camera [cd/m2]
+    # change of the radiance by marine snow [cd/m2], negative where particles are darker than the light that they hide;
+    # None if marine snow is disabled
     snow: Radiance | None
-    total: Radiance
+    total: Radiance  # sum of direct, forward, backscatter and snow [cd/m2]
 
 
 class ImageFormation:
     """Model of the light that reaches each camera of the stereo camera, given albedo and depth of the floor.
 
     Args:
-        scenario: settings of lamps, material, wind, marine snow and current, and which effects are enabled.
-        illumination: optical properties of the water, and daylight.
-        floor: heights of the floor, which has facets and, with `imaging.shadows`, casts shadows; None = a smooth floor
-            whose normals follow from its depth, and no shadows, not even of objects.
-        snow_rng: random stream of the positions and diameters of the particles.
+        floor: heights with facets and, with `imaging.shadows`, shadows; None = a smooth floor without any shadows.
         rig: the rendered cameras; None = the believed rig.
-        objects: objects on the floor; None = none.
-
-    Raises:
-        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(
@@ -121,8 +108,7 @@ class ImageFormation:
             albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
             camera: 0 left, 1 right.
-            pose: pose of the left camera, and time since the start of the survey.
-            objects: the objects that were drawn into `albedo` and `depth`; None: the image shows the floor alone.
+            objects: those drawn into `albedo` and `depth`; None: the image shows the floor alone.
         """
         light = self.radiance_without_snow(albedo, depth, camera, pose, objects)
         self.add_snow(light, depth, camera, pose)
@@ -138,20 +124,9 @@ class ImageFormation:
     def add_snow(
         self, light: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None = None
     ) -> None:
-        """Draws marine snow, if enabled, into `light` (H, W, 3) in place.
-
-        Args:
-            light: (H, W, 3) light of floor and water.
-            depth, camera, pose: see `radiance`.
-            motion: motion of the camera during the exposure, which images particles as streaks; None = no motion.
-        """
+        """Draws marine snow, if enabled, into `light` (H, W, 3) in place, as streaks along the camera's `motion`."""
         if self._snow is not None:
             self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion)
-
-    @property
-    def snows(self) -> bool:
-        """Whether marine snow is enabled."""
-        return self._snow is not None
 
     def components(
         self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None

@@ -1,25 +1,17 @@
 """Restoration: the albedo of the floor from an image, without the effects of lamps, daylight and water.
 
-It inverts the model of `optics` with the believed calibration, lamps and water, and with the estimated floor. With rho
-the albedo, W the light of a white floor that absorption alone attenuates on its way to the camera, u = exp(-b r) the
-unscattered share (b the scattering coefficient, r the range), k the share that arrives without blur, F the scattered
-light of the floor (`forward_scatter`) and B the backscatter, the radiance of an image is
-
-    L = rho W u + F(rho W) + B.
-
-A floor of uniform albedo gives the first estimate rho = (L - B) / (W u + F(W)). Then the blurred light of this estimate
-is subtracted, and the rest is light without blur:
+It inverts the model of `optics` with the believed calibration, lamps and water, and the estimated floor. With rho the
+albedo, W the light of a white floor attenuated by absorption, u = exp(-b r), k the share without blur, F the scattered
+light of the floor and B the backscatter, L = rho W u + F(rho W) + B. The first estimate is that of a uniform albedo,
+rho = (L - B) / (W u + F(W)), corrected by
 
     rho <- (L - B - (F(rho W) - (k - u) rho W)) / (k W).
 
-The first estimate is right for all detail that is wider than the blur, so few steps suffice. With single scattering,
-rho = (L - B) / W, where scattering attenuates W too. Marine snow, caustics, shadows of objects, blur of the lens and of
-motion, and saturation are not corrected; the floor is taken to be Lambertian.
+With single scattering, rho = (L - B) / W. Snow, caustics, shadows of objects, blur of lens and motion, and saturation
+are not corrected; the floor is taken to be Lambertian.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -44,33 +36,17 @@ STEPS = 2  # number of corrections of the blur
 _DARK = 1e-6  # pixels whose light of a white floor, relative to the brightest pixel, is below this get the albedo 0
 
 
-class EstimatedFloor(NamedTuple):
-    """Heights of the estimated floor, see `facets.Heights`."""
-
-    height_m: NDArray[np.float32]
-    spacing_m: float
-    west_m: float
-    south_m: float
-
-
 class Restoration:
     """Restoration of the images of the left camera of a survey.
 
     Args:
-        scenario: believed lamps and sensor, and whether the floor casts shadows (`imaging.shadows`).
-        illumination: believed water and daylight.
-        rig: believed calibration.
         elevation: estimated map, with at least one height.
-
-    Raises:
-        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(self, scenario: Scenario, illumination: Illumination, rig: StereoRig, elevation: ElevationMap):
         self._rig, self._optics = rig, Optics(rig, illumination, scenario.lamps)
-        floor = estimated_floor(elevation)
+        self._floor = floor = estimated_floor(elevation)
         self._facets = Facets(floor)
-        self._field = floor_rays.height_field(floor.height_m, *floor[1:])
         sources = self._optics.light_sources
         self._shadows = None
         if scenario.imaging.shadows:
@@ -86,12 +62,7 @@ class Restoration:
         self._world_from_map = geometry.inverse(elevation.map_from_world)
 
     def __call__(self, image: Image, exposure: Exposure | None, map_from_camera: Array) -> Radiance:
-        """Returns the albedo (H, W, 3) float32 of the floor in an image, 255 = white.
-
-        Args:
-            image: (H, W, 3) uint8 left image.
-            exposure: exposure of the image (`Frame.exposure`).
-            map_from_camera: (4, 4) pose of the camera in the axes of the estimated map.
+        """Returns the albedo (H, W, 3) float32 of the floor in a left image (H, W, 3) uint8, 255 = white.
 
         Raises:
             TwinError: the exposure is not known.
@@ -132,7 +103,7 @@ class Restoration:
         rig = self._rig
         columns = max(2, rig.width_px // DEPTH_STEP_PX)
         pixels = floor_rays.ray_grid(rig, columns)
-        depth = floor_rays.cast_pixels(self._field, map_from_camera[None], rig, pixels)[0]
+        depth = floor_rays.cast_pixels(self._floor, map_from_camera[None], rig, pixels)[0]
         terms, per_m = np.column_stack([pixels, np.ones(len(pixels))]), 1 / depth
         known = per_m > 0
         if known.sum() < 3:  # too few rays meet the map to fit a plane; these colours are not used
@@ -143,18 +114,13 @@ class Restoration:
         return 1 / cv2.resize(coarse, (rig.width_px, rig.height_px), interpolation=cv2.INTER_LINEAR)
 
 
-def estimated_floor(elevation: ElevationMap) -> EstimatedFloor:
-    """Returns the heights of a map, with the height of the nearest cell in each hole; all NaN if the map is empty.
+def estimated_floor(elevation: ElevationMap) -> floor_rays.HeightField:
+    """Returns the heights of a map with at least one height; each hole has the height of the nearest cell.
 
-    The nodes are the centres of the cells. The heights are not smoothed: smoothing tilts the facets at every edge,
-    where the light depends on them most.
+    The heights are not smoothed: smoothing tilts the facets at every edge, where the light depends on them most.
     """
-    grid, height = elevation.grid, elevation.height_m.astype(np.float64)
-    if np.isfinite(height).any():
-        height, _ = fill_holes(height)
-    south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
-    upwards = np.ascontiguousarray(height[::-1], np.float32)
-    return EstimatedFloor(upwards, grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)
+    height, _ = fill_holes(elevation.height_m.astype(np.float64))
+    return floor_rays.map_height_field(height.astype(np.float32), elevation.grid)
 
 
 def linear_signal(scenario: Scenario) -> NDArray[np.float32]:

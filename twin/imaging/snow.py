@@ -1,18 +1,11 @@
 """Marine snow: small particles that drift with the current through the light of lamps and sun.
 
-The particles fill a periodic box around the left camera: when the vehicle moves, a particle that leaves the box on one
-side re-enters on the opposite side. Both cameras and consecutive frames therefore show the same particles. A particle
-of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, f the focal length. Its image is
-blurred by one pixel due to the lens, and by the circle of confusion A f |1/z - 1/s| of a lens with an aperture of
-diameter A, focused at depth s. During the exposure the particle moves through the image; its light is spread evenly
-along this path, whose length is its velocity in the image times the exposure time. A rolling shutter images it where it
-is when its row is read. If the rolling shutter is applied to the whole image after the particles are drawn, it
-displaces them like the floor behind them; they are therefore drawn displaced by the difference between their own
-displacement and the floor's.
-
-The particles have one diameter or a size distribution: Junge (1963) found that the number of particles per interval of
-diameter falls as a power of the diameter, n(D) ~ D^-j. The cumulative distribution between the limits a and b is
-(a^(1-j) - D^(1-j)) / (a^(1-j) - b^(1-j)).
+The particles fill a periodic box around the left camera, so both cameras and consecutive frames show the same ones. A
+particle of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, blurred by one pixel and
+by the circle of confusion A f |1/z - 1/s|, and spread evenly along its path during the exposure. A rolling shutter
+images it where it is when its row is read; if the whole image is displaced later, it is drawn displaced by the
+difference from the floor behind it. Diameters follow a power law n(D) ~ D^-j between a and b (Junge 1963), with the
+cumulative distribution (a^(1-j) - D^(1-j)) / (a^(1-j) - b^(1-j)).
 """
 
 from __future__ import annotations
@@ -45,19 +38,12 @@ BLOCK = 512  # number of particles whose positions are computed at a time
 
 
 class VisibleParticles(NamedTuple):
-    """Particles in view of a camera.
+    """Particles in view of a camera."""
 
-    Args:
-        pixel: (n, 2) column and row [px].
-        points_m: (n, 3) positions in the axes of the camera.
-        radiance: (n, 3) radiance per colour band [cd/m2].
-        diameter_m: (n,) diameters.
-    """
-
-    pixel: Array
-    points_m: Array
-    radiance: Array
-    diameter_m: Array
+    pixel: Array  # (n, 2) column and row [px]
+    points_m: Array  # (n, 3) positions in the axes of the camera
+    radiance: Array  # (n, 3) radiance per colour band [cd/m2]
+    diameter_m: Array  # (n,) diameters
 
     @property
     def depth_m(self) -> Array:
@@ -66,16 +52,9 @@ class VisibleParticles(NamedTuple):
 
 
 class MarineSnow:
-    """Marine snow particles of one survey.
+    """Marine snow particles of one survey, which move with the current (3,).
 
-    Args:
-        snow: density, sizes and albedo of the particles.
-        current_mps: (3,) velocity of the particles in the world.
-        rig: the rendered cameras.
-        water: optical properties of the water.
-        lamp_light: light of the lamps, and daylight, in the axes of the left and of the right camera.
-        rng: random stream of the particle positions and diameters.
-        defocus: aperture and focus of the lens; None = an aperture of `APERTURE_M`, focused at infinity.
+    Without `defocus`, the lens has an aperture of `APERTURE_M` and is focused at infinity.
     """
 
     def __init__(
@@ -104,15 +83,7 @@ class MarineSnow:
     def visible_particles(
         self, world_from_left: Array, camera: int, time_s: float, reach_m: float = 0.0, farthest_m: float = np.inf
     ) -> VisibleParticles:
-        """Returns the particles in view of a camera (0 left, 1 right) with their radiance.
-
-        Args:
-            world_from_left: (4, 4) pose of the left camera.
-            camera: 0 left, 1 right.
-            time_s: time since the start of the survey.
-            reach_m: distance outside the view up to which particles are included, as they may move into the view.
-            farthest_m: largest depth of a particle.
-        """
+        """Returns the particles in view of a camera (0 left, 1 right) with their radiance."""
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
         low = world_from_left[:3, 3] - BOX_M / 2
@@ -124,10 +95,7 @@ class MarineSnow:
         )
         diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
         return VisibleParticles(
-            pixel,
-            points,
-            self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])),
-            diameter_m,
+            pixel, points, self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])), diameter_m
         )
 
     def draw(
@@ -139,16 +107,7 @@ class MarineSnow:
         time_s: float,
         motion: ExposureMotion | None = None,
     ) -> None:
-        """Draws the particles in front of the floor into the radiance `light` (H, W, 3) of a camera, in place.
-
-        Args:
-            light: (H, W, 3) radiance.
-            depth: (H, W) depth of the floor [m].
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            camera: 0 left, 1 right.
-            time_s: time since the start of the survey.
-            motion: motion of the camera during the exposure; None = no motion.
-        """
+        """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance (H, W, 3) `light`."""
         rig, defocus = self._rig, self._defocus
         farthest_m = float(depth.max())
         still = motion is None
@@ -165,10 +124,7 @@ class MarineSnow:
         in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
 
     def _reach_m(self, motion: ExposureMotion) -> float:
-        """Returns an upper limit of the distance that a particle moves relative to the camera [m].
-
-        The limit holds for the motion during half the exposure time plus half the read-out time.
-        """
+        """Returns an upper limit of the distance that a particle moves relative to the camera [m]."""
         speed_mps = np.linalg.norm(motion.twist[3:]) + np.linalg.norm(self._current_mps)
         speed_mps += np.linalg.norm(motion.twist[:3]) * BOX_M
         return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
@@ -190,9 +146,7 @@ class MarineSnow:
     def _radiance(self, points: Array, lamps: LampLight, height_m: float) -> Array:
         """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
 
-        Light that is scattered between a particle and the camera is lost. At the camera, daylight has the illuminance
-        that belongs to the camera's height `height_m` above the reference plane z = 0; it decreases along the optical
-        axis.
+        Light scattered between particle and camera is lost; daylight decreases along the optical axis.
         """
         day, loss_per_m = lamps.sources.daylight, self._water.attenuation_per_m
         below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
@@ -208,13 +162,7 @@ class MarineSnow:
 
 
 def diameters(snow: SnowConfig, n: int, rng: np.random.Generator) -> Array:
-    """Returns the diameters of n particles [m]: (n,) of the Junge distribution, or (1,) if all are equal.
-
-    Args:
-        snow: exponent and limits of the distribution.
-        n: number of particles.
-        rng: random stream, of which n numbers are drawn if the diameters differ.
-    """
+    """Returns the diameters of n particles [m]: (n,) of the Junge distribution, or (1,) if all are equal."""
     if snow.junge_exponent is None:
         return np.array([snow.diameter_m])
     power = 1 - snow.junge_exponent
@@ -230,14 +178,7 @@ def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float
 
 @kernel(error_model="numpy")
 def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
-    """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`.
-
-    Args:
-        points: (n, 3) positions of the particles in the axes of the camera [m].
-        day_per_m, loss_per_m: (3,) attenuation of daylight with depth, and of light on the path [1/m].
-        below_m: depth of the camera relative to the planned depth [m].
-        fading, path_loss: (n, 3) arrays to fill.
-    """
+    """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`."""
     for k in range(points.shape[0]):
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         range_m = np.sqrt(x * x + y * y + z * z)
@@ -249,19 +190,8 @@ def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
 def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
     """Fills `centre` (n, 2) with the middle of each particle's path, and `path` (n, 2) with the vector along it [px].
 
-    A rolling shutter reads the row v at t = readout (v / (n_rows - 1) - 1/2) after mid-exposure. A particle with row
-    v_0 at mid-exposure and image velocity v' is then in row v = v_0 + v' t; both equations are solved for t, with the
-    divisor 1 - v' readout / (n_rows - 1) limited to 0.1 or more.
-
-    Args:
-        points: (n, 3) positions in the axes of the camera [m].
-        pixel: (n, 2) positions in the image at mid-exposure [px].
-        depth: (H, W) depth of the floor [m].
-        lens: focal length, and column and row of the principal point [px].
-        drift: (3,) velocity of the particles, in the axes of the camera [m/s].
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        moves: exposure time and read-out time [s], and whether the rolling shutter is applied to the image later. If
-            so, the displacement of the floor behind a particle by the rolling shutter is subtracted.
+    A rolling shutter reads the row v = v_0 + v' t at t = readout (v / (n_rows - 1) - 1/2), with the divisor 1 - v'
+    readout / (n_rows - 1) limited to 0.1 or more.
     """
     (focal, cx, cy), (exposure_s, readout_s, rolls_later) = lens, moves
     row_s, bottom, right, still = readout_s / (depth.shape[0] - 1), depth.shape[0] - 1, depth.shape[1] - 1, np.zeros(3)
@@ -279,10 +209,7 @@ def _trace_paths(points, pixel, depth, lens, drift, twist, moves, centre, path):
 
 @kernel(error_model="numpy", inline="always")
 def _image_velocity(x, y, z, focal, drift, twist):
-    """Returns the image velocity (columns, rows) [px/s] of a point (x, y, z), in the axes of the camera.
-
-    The point drifts at `drift` (3,) [m/s]; the camera moves with `twist` (6,), see `_trace_paths`.
-    """
+    """Returns the image velocity (columns, rows) [px/s] of a point (x, y, z), in the axes of the camera."""
     forward = drift[2] - twist[5] + x * twist[1] - y * twist[0]
     across = drift[0] - twist[3] + y * twist[2] - z * twist[1] - x / z * forward
     down = drift[1] - twist[4] + z * twist[0] - x * twist[2] - y / z * forward
@@ -291,12 +218,10 @@ def _image_velocity(x, y, z, focal, drift, twist):
 
 @kernel
 def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_px, reach_px_m, farthest_m):
-    """Returns the indices (n,) of the particles in view, their positions in the axes of the camera, and their pixels.
+    """Returns indices (n,), positions (n, 3) in camera axes [m] and pixels (n, 2) of the particles in view.
 
-    The positions are (n, 3), the pixels (n, 2). A particle is in view if its depth is between NEAREST_M and
-    `farthest_m`, and its projection is less than `margin_px` + `reach_px_m` / depth outside the image. With `start`
-    (m, 3) the positions in the box at time 0, `low` (3,) the lower corner of the present box and `shift` (3,) the drift
-    minus `low`, the positions in the world are `low` + mod(`start` + `shift`, BOX_M) [m].
+    In view are depths between NEAREST_M and `farthest_m` and projections up to `margin_px` + `reach_px_m` / depth
+    outside the image. Positions in the world are `low` + mod(`start` + `shift`, BOX_M) [m].
     """
     found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
     pixel, focal, (cx, cy) = np.empty((len(start), 2)), focals[0], (middle[0], middle[1])
@@ -315,10 +240,7 @@ def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_
 
 @kernel
 def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
-    """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened.
-
-    Its loop has neither branches nor reads of other arrays, so that the compiler can vectorize it.
-    """
+    """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened."""
     per_box, (px, py, pz), (lx, ly, lz) = 1 / BOX_M, (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
     pose = camera_from_world
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
@@ -347,17 +269,7 @@ def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, 
 
 @kernel
 def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
-    """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer.
-
-    A particle is a disc with an antialiased edge that moves along a straight path: `path` (n, 2) [px] is the vector
-    from the start to the end of each path, `centre` (n, 2) [px] its middle.
-
-    Args:
-        z: (n,) depths [m].
-        radiance: (n, 3) radiance of the particles [cd/m2].
-        width: (n,) diameters of the discs, including blur [px].
-        cover: (n,) areas that the particles cover without blur [px^2].
-    """
+    """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer."""
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5
@@ -392,10 +304,7 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
 
 @kernel(inline="always")
 def _swept(radius, du, dv, step_u, step_v, steps):
-    """Returns the mean coverage (0 to 1) of a pixel by a disc at `steps` evenly spaced positions, see `_rim`.
-
-    (du, dv) is the offset of the pixel from the middle position, (step_u, step_v) the step between positions [px].
-    """
+    """Returns the mean coverage (0 to 1) of a pixel by a disc at `steps` evenly spaced positions, see `_rim`."""
     total, first = 0.0, 0.5 * (1 - steps)
     for i in range(steps):
         total += _rim(radius, du - (first + i) * step_u, dv - (first + i) * step_v)
@@ -404,9 +313,5 @@ def _swept(radius, du, dv, step_u, step_v, steps):
 
 @kernel(inline="always")
 def _rim(radius, du, dv):
-    """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px].
-
-    The edge of the disc is antialiased: the coverage decreases from 1 to 0 between the distances `radius` - 1 and
-    `radius` [px].
-    """
+    """Returns the coverage (0 to 1) of a pixel by a disc whose centre is (du, dv) away [px]."""
     return min(max(radius - np.sqrt(du * du + dv * dv), 0.0), 1.0)

@@ -47,28 +47,18 @@ class StereoCapture(NamedTuple):
 
 
 class DecomposedImage(NamedTuple):
-    """A left image without noise, with the intermediate results of its computation.
+    """A left image without noise, with the intermediate results of its computation."""
 
-    Args:
-        albedo: (H, W, 3) uint8 albedo of floor and objects, 255 = white.
-        depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
-        components: direct signal, backscatter and other components of the radiance.
-        setting: exposure, metered on this image.
-        noise_free: (H, W, 3) image without noise.
-        raw: digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a
-            Bayer filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor.
-        linear: whether the image is proportional to the radiance: linear tone curve, white balance for white light.
-        objects: normals and labels (H, W) of the objects in the image; None without objects.
-    """
-
-    albedo: Image
-    depth: Depth
-    components: RadianceComponents
-    setting: ExposureSetting
-    noise_free: Image
+    albedo: Image  # (H, W, 3) uint8 albedo of floor and objects, 255 = white
+    depth: Depth  # (H, W) depth along the optical axis [m]; inf where there is no floor
+    components: RadianceComponents  # direct signal, backscatter and other components of the radiance
+    setting: ExposureSetting  # exposure, metered on this image
+    noise_free: Image  # (H, W, 3) image without noise
+    # digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a Bayer
+    # filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor
     raw: Raw | None
-    linear: bool
-    objects: ObjectView | None = None
+    linear: bool  # whether the image is proportional to the radiance: linear tone curve, white balance for white light
+    objects: ObjectView | None = None  # normals and labels (H, W) of the objects in the image; None without objects
 
     @property
     def gain(self) -> float:
@@ -93,16 +83,7 @@ class StereoCamera:
     """Stereo camera: both cameras share one auto-exposure; their noise is independent.
 
     Args:
-        renderer: renderer of albedo and depth of the floor.
-        image_formation: model of the radiance that reaches the cameras through the water.
-        scenario: settings of the cameras and the sensor.
-        left_rng, right_rng: random streams of the image noise.
-        stopwatch: timer of the stages "render" and "optics".
         true_cameras: geometry of the true cameras; None = as defined by the scenario.
-
-    Raises:
-        TwinError: `true_cameras` is None and the scenario's cameras are invalid, see `make_true_cameras`; or the water
-            is invalid, see `sensor_of`.
     """
 
     def __init__(
@@ -128,13 +109,10 @@ class StereoCamera:
         self._n_captures = 0
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
-        """Returns the image of the left camera and, if `stereo`, the simultaneous image of the right camera.
-
-        Each call advances the time by one frame.
+        """Returns the image of the left camera and, if `stereo`, of the right one; advances the time by one frame.
 
         Args:
             world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            stereo: whether the right camera is used too.
             twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
         """
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
@@ -144,8 +122,9 @@ class StereoCamera:
         with self._stopwatch("optics"):
             setting = self._sensor.setting
             metered = setting is not None
-            if setting is None:
-                setting = self._first_setting(views[0])
+            if setting is None:  # metered on the first left image at rest
+                light = self._image_formation.radiance(views[0].albedo, views[0].depth, 0, pose, views[0].objects)
+                setting = self._meter(self._sensor, light, views[0].depth)
             expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
             if stereo:
                 (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
@@ -158,14 +137,7 @@ class StereoCamera:
         return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
 
     def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
-        """Returns the left and the right image (H, W, 3) at the time of the last capture.
-
-        Has no effect on later captures. The noise is that of the next capture.
-
-        Args:
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
-        """
+        """Returns both images (H, W, 3) at the time of the last capture, with the noise of the next."""
         kept = self._sensor, self._rngs, self._n_captures
         self._sensor, self._rngs = copy.deepcopy(kept[:2])
         self._n_captures = max(self._n_captures - 1, 0)
@@ -183,11 +155,7 @@ class StereoCamera:
     def decompose(self, world_from_left: Array, twist_body: Array = AT_REST, time_s: float = 0.0) -> DecomposedImage:
         """Returns the left image at a pose and time with intermediate results; has no effect on later captures.
 
-        Args:
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s]; affects the
-                image and the digital numbers, not the components.
-            time_s: time since the start of the survey, at which snow, waves and swaying plants are drawn.
+        The motion affects the image and the digital numbers, not the components.
         """
         albedo, depth = self._renderer.render(world_from_left)
         pose = StampedPose(world_from_left, time_s)
@@ -217,19 +185,8 @@ class StereoCamera:
             objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
         return _View(pose, camera, albedo, depth, objects)
 
-    def _first_setting(self, view: _View) -> ExposureSetting:
-        """Returns the exposure of the first frame, metered on its left view at rest."""
-        light = self._image_formation.radiance(view.albedo, view.depth, 0, view.pose, view.objects)
-        return self._meter(self._sensor, light, view.depth)
-
     def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
-        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels.
-
-        Args:
-            view: rendered view of this camera.
-            twist_body: see `capture`.
-            setting: exposure of this frame.
-        """
+        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels."""
         pose, camera, albedo, depth, objects = view
         motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
         floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
@@ -243,12 +200,9 @@ class StereoCamera:
     def _through_lens(
         self, floor: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None
     ) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels, given the light of floor and water.
+        """Returns the radiance (h, w, 3) at the raw pixels from the light of floor and water, which may be modified.
 
-        The array `floor` may be modified.
-
-        Depth of field and motion blur depend on depth; marine snow, which has other depths and velocities, is drawn
-        with its own blur afterwards.
+        Marine snow, which has other depths and velocities, is drawn with its own blur afterwards.
         """
         light = self._psf.out_of_focus(floor, depth)
         if motion is not None:

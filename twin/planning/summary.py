@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from twin.controllers.forecast import Forecast, forecast
-from twin.imaging.light.water_tables import provenance_of
+from twin.imaging.light.spectra import provenance_of
 from twin.judge.require import judge_requirements
 from twin.judge.summary_statistics import finite_tree
 from twin.planning.cost import ComputingCost, computing_cost

@@ -1,7 +1,6 @@
 """Brown-Conrady lens distortion, with the parameters of OpenCV (Brown 1971, Close-range camera calibration).
 
-A ray in front of the lens with direction (X, Y, Z) has the normalised coordinates x = X / Z, y = Y / Z. With
-r^2 = x^2 + y^2, its distorted image coordinates, in units of the focal length, are
+With x = X / Z, y = Y / Z and r^2 = x^2 + y^2, the distorted coordinates in units of the focal length are
 
     x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
     y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y

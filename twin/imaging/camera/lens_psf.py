@@ -1,21 +1,13 @@
 """Point spread function of a lens: diffraction, aberrations, lateral colour and depth of field.
 
-The image of a point is described by the modulation transfer function (MTF), the contrast at a spatial frequency nu
-relative to that at frequency 0. A lens of f-number N without aberrations has, in light of wavelength l (Goodman,
-Introduction to Fourier Optics, section 6.3; Hopkins 1955), with x = nu l N,
+The modulation transfer function (MTF) of a lens of f-number N at the spatial frequency nu and the wavelength l is, with
+x = nu l N (Goodman, Introduction to Fourier Optics, section 6.3; Hopkins 1955),
 
     MTF = 2 / pi (arccos(x) - x sqrt(1 - x^2)),    0 for x > 1
 
-Aberrations are described by a Gaussian of standard deviation sigma in the image, MTF = exp(-2 pi^2 sigma^2 nu^2).
-Diffraction and aberrations may differ between the colour bands, as may the scale of the image (lateral colour).
-
-A point at depth z is imaged as a disc of the diameter (circle of confusion)
-
-    c = A f |1/z - 1/s|
-
-for a lens with an aperture of diameter A, focused at depth s, with f the focal length in water [px] (thin lens; the
-focal length is negligible compared with s). A pixel gets the mean light over the disc that belongs to its own depth, so
-the blur of a near object does not spread over the background.
+times exp(-2 pi^2 sigma^2 nu^2) for aberrations. A point at depth z is imaged as a disc of the diameter A f |1/z - 1/s|,
+with the aperture A, the depth s in focus and the focal length f in water [px] (thin lens). A pixel gets the mean light
+over the disc of its own depth.
 """
 
 from __future__ import annotations
@@ -28,7 +20,7 @@ from numpy.typing import NDArray
 from twin.core.records import StereoRig
 from twin.core.row_parallel import in_row_bands
 from twin.imaging.camera.port import pinhole
-from twin.imaging.light.bands import CENTRE_NM
+from twin.imaging.light.spectra import CENTRE_NM
 from twin.kernels import kernel
 from twin.scenario.model import LensConfig, Scenario, SensorConfig
 
@@ -60,10 +52,6 @@ def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
     """Returns aperture and focus of the lenses; None without a sensor, or if `lens.focus_m` is 0.
 
     The aperture is the focal length in air divided by the f-number.
-
-    Args:
-        scenario: lens, port and sensor.
-        rig: the rendered cameras, with the focal length in water.
     """
     lens, sensor = scenario.lens, scenario.sensor
     if sensor is None or not lens.focus_m:
@@ -73,25 +61,14 @@ def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
 
 
 def diffraction_mtf(cycles_per_px: Array, wavelength_nm: float, sensor: SensorConfig) -> Array:
-    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px].
-
-    Args:
-        cycles_per_px: spatial frequencies.
-        wavelength_nm: wavelength of the light in air.
-        sensor: f-number and size of the pixels.
-    """
+    """Returns the MTF of a lens without aberrations at spatial frequencies of any shape [cycles/px]."""
     s = np.abs(cycles_per_px) / sensor.pixel_um * wavelength_nm * 1e-3 * sensor.f_number
     s = np.minimum(s, 1.0)
     return 2 / np.pi * (np.arccos(s) - s * np.sqrt(1 - s**2))
 
 
 class LensPsf:
-    """Point spread function of both lenses, which is applied to the light of a rendered image.
-
-    Args:
-        scenario: lens, port and sensor; without a sensor there is neither diffraction nor depth of field.
-        rig: the rendered cameras.
-    """
+    """Point spread function of both lenses; without a sensor there is neither diffraction nor depth of field."""
 
     def __init__(self, scenario: Scenario, rig: StereoRig):
         lens = scenario.lens
@@ -100,12 +77,7 @@ class LensPsf:
         self._scales = _magnification(lens, rig) if any(lens.lateral_colour) else None
 
     def out_of_focus(self, light: Radiance, depth: Depth) -> Radiance:
-        """Returns the radiance (H, W, 3) with defocus blur; `light` itself if the blur is off or negligible.
-
-        Args:
-            light: (H, W, 3) radiance.
-            depth: (H, W) depth along the optical axis [m]; inf is valid.
-        """
+        """Returns the radiance (H, W, 3) with defocus blur at depths (H, W) [m]; `light` itself if negligible."""
         if self._defocus is None:
             return light
         extremes = np.array([depth.min(), depth.max()], np.float64)
@@ -125,10 +97,10 @@ class LensPsf:
         if self._taps is None and self._scales is None:
             return light
         rows, width, taps = *light.shape[:2], self._taps
-        flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
         if taps is None:
-            in_row_bands(lambda first, end: _split_rows(flat, bands, first, end), rows)
+            bands = np.ascontiguousarray(light.swapaxes(1, 2))
         else:
+            flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
             in_row_bands(lambda first, end: _convolve(flat, *taps, bands, first, end), rows)
         out = np.empty((rows, 3 * width), np.float32)
         if self._scales is None:
@@ -166,11 +138,7 @@ def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.flo
 
 
 def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
-    """Returns the kernel (2 REACH_PX + 1, 2 REACH_PX + 1) of a band, the inverse Fourier transform of its MTF.
-
-    The light that falls outside is spread evenly over the kernel, so that its sum is 1: among the kernels of this size
-    with sum 1, this one has the smallest mean square error of the MTF.
-    """
+    """Returns the kernel (2 REACH_PX + 1, 2 REACH_PX + 1) of a band, the inverse Fourier transform of its MTF."""
     nu = np.fft.fftfreq(GRID)
     share = mtf(lens, sensor, band, np.hypot(nu, nu[:, None]))
     kernel = np.fft.fftshift(np.fft.ifft2(share).real)
@@ -196,20 +164,14 @@ def _separable(kernel: Array) -> list[tuple[float, Array]]:
 
 
 class _Magnification(NamedTuple):
-    """Lateral colour: the images of the red and the blue band are magnified relative to the green one.
+    """Lateral colour: the images of the red and the blue band are magnified relative to the green one."""
 
-    Args:
-        runs: (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band,
-            first column, end column (exclusive), and this offset.
-        across: (3, TAPS, W) weights along the rows, for each band.
-        lines: (3, H) offset of the first tap of each row from the row.
-        down: (3, H, TAPS) weights along the columns.
-    """
-
+    # (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band, first
+    # column, end column (exclusive), and this offset
     runs: NDArray[np.int64]
-    across: NDArray[np.float32]
-    lines: NDArray[np.int64]
-    down: NDArray[np.float32]
+    across: NDArray[np.float32]  # (3, TAPS, W) weights along the rows, for each band
+    lines: NDArray[np.int64]  # (3, H) offset of the first tap of each row from the row
+    down: NDArray[np.float32]  # (3, H, TAPS) weights along the columns
 
 
 def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
@@ -227,17 +189,7 @@ def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
 
 
 def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Returns the taps of the magnification along an axis of n pixels, by cubic interpolation (Keys 1981).
-
-    Args:
-        n: number of pixels.
-        middle_px: position that the magnification does not move.
-        scales: (3,) magnification of the bands.
-
-    Returns:
-        For R, G, B, the offset (3, n) of the first tap of each pixel from this pixel [px], and the weights (3, n, TAPS)
-        of the TAPS consecutive pixels from there.
-    """
+    """Returns the taps of the magnification along an axis of n pixels, by cubic interpolation (Keys 1981)."""
     at = middle_px + (np.arange(n) - middle_px) / scales[:, None]
     whole = np.floor(at)
     t = at - whole
@@ -245,13 +197,6 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
         [-0.5 * t * (1 - t) ** 2, 1 - t**2 * (2.5 - 1.5 * t), 1 - (1 - t) ** 2 * (1 + 1.5 * t), -0.5 * (1 - t) * t**2]
     )
     return whole.astype(np.int64) - 1 - np.arange(n), np.ascontiguousarray(np.moveaxis(cubic, 0, 2), np.float32)
-
-
-@kernel
-def _split_rows(light, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3, W), which keeps the bands apart, from `light` (H, 3 W)."""
-    for v in range(first, end):
-        _split_row(light[v], out[v, 0], out[v, 1], out[v, 2])
 
 
 @kernel
@@ -278,14 +223,7 @@ def _join_row(red, green, blue, row):
 
 @kernel
 def _convolve(light, down, across, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W).
-
-    The bands are kept apart, so that the weights of a row are constant. The latest rows of the image are stored in
-    `lines`: row v in lines[v modulo their number].
-
-    Args:
-        down, across: weights of `_taps` along columns and rows.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W)."""
     rows, _, width = out.shape
     n, terms = 2 * REACH_PX + 1, down.shape[1]
     lines, wide = np.empty((n, 3, width), np.float32), np.empty(width + 2 * REACH_PX, np.float32)
@@ -326,10 +264,7 @@ def _add_pairs(before, after, weight, earlier, later, other_weight, out):
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _add_across(wide, weights, out, is_first):
-    """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,).
-
-    If `is_first`, it replaces the values of `out`.
-    """
+    """Adds the convolution of `wide` (n + 2 REACH_PX,) with the symmetric kernel of `weights` to `out` (n,)."""
     a, b, c, d, e = wide[0:], wide[1:], wide[2:], wide[3:], wide[4:]
     f, g, h, i = wide[5:], wide[6:], wide[7:], wide[8:]
     w0, w1, w2, w3, w4 = weights[0], weights[1], weights[2], weights[3], weights[4]
@@ -343,10 +278,7 @@ def _add_across(wide, weights, out, is_first):
 
 @kernel
 def _magnify(light, runs, across, lines, down, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W).
-
-    The other arguments are those of `_Magnification`.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W)."""
     rows, _, width = light.shape
     pad = max(-runs[:, 3].min(), runs[:, 3].max() + TAPS - 1, 0)
     wide, filled = np.empty((3, width + 2 * pad), np.float32), np.empty((3, width), np.float32)
@@ -385,14 +317,7 @@ def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
 
 @kernel
 def _defocus(light, near, scale, focus, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus.
-
-    Args:
-        near: (H, W) inverse depth [1/m].
-        scale: diameter of the aperture times the focal length [px m]; this times the absolute difference between the
-            inverse depth and `focus` is the diameter of the disc [px].
-        focus: inverse of the depth in focus [1/m].
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus."""
     rows, width = near.shape
     wide = np.empty(3 * width, np.float32)
     for v in range(first, end):
@@ -431,10 +356,7 @@ def _defocus_row(above, here, below, diameter, out):
 
 @kernel
 def _gather(light, v, u, diameter, rows, width, out):
-    """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u).
-
-    Beyond the image border, the pixels of the border are repeated.
-    """
+    """Writes to `out` (3,) the mean of `light` (H, 3 W) over a disc with an antialiased edge around pixel (v, u)."""
     radius = np.float32(0.5) * diameter + np.float32(0.5)
     reach = int(radius)
     red = green = blue = total = np.float32(0.0)

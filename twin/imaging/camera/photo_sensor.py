@@ -38,31 +38,15 @@ class Sensor(Protocol):
 
 
 def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
-    """Returns a scenario's sensor in its initial state: `PhotoSensor` with a section [sensor], else `PlainSensor`.
-
-    Args:
-        scenario: survey scenario.
-        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
-
-    Raises:
-        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
-    """
+    """Returns a scenario's sensor in its initial state; `raw_rig` see `PhotoSensor`."""
     return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
 
 class PhotoSensor:
     """Physical sensor of both cameras, with auto-exposure that increases first the exposure time, then the gain.
 
-    At the limits of exposure time and gain, images become dark or saturate. Auto-exposure meters the radiance, not
-    the image, so it does not oscillate if an image saturates.
-
-    Args:
-        scenario: survey scenario.
-        sensor: section [sensor] of the scenario.
-        raw_rig: rig with the size and focal length of the raw images; None = the rectified rig.
-
-    Raises:
-        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
+    Auto-exposure meters the radiance, not the image, so it does not oscillate if an image saturates. `raw_rig` has the
+    size and focal length of the raw images; None = the rectified rig.
     """
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
@@ -88,12 +72,9 @@ class PhotoSensor:
         return None if gain is None else self._setting(gain, self._white.next_factors)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns this frame's exposure, and meters `light` for the later frames.
+        """Returns this frame's exposure, and meters `light` (H, W, 3) at the raw pixels for the later frames.
 
         The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
-
-        Args:
-            light: (H, W, 3) radiance at the raw pixels.
         """
         mean = _weighted_mean(light, self._vignetting)
         white = self._white.factors(mean, self._exposure.share)
@@ -112,9 +93,7 @@ class PhotoSensor:
 
         Args:
             twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-            setting: exposure of this frame.
-            n_rows: number of rows of the rendered image, which may have a margin around the rows of the sensor; the
-                read-out time of the result is that of these rows.
+            n_rows: rows of the rendered image, margin included; the read-out time of the result is that of these rows.
         """
         row_ratio = (n_rows - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
         readout_s = row_ratio * self._sensor.readout_ms / 1000
@@ -136,13 +115,9 @@ class PhotoSensor:
         return read_out(light, self._vignetting, self._response(setting), self._sensor.bayer, rng)
 
     def develop(self, raw: Raw, white: tuple[float, float, float] | None = None) -> Image:
-        """Returns the 8-bit RGB image (H, W, 3) of a raw image.
+        """Returns the 8-bit RGB image (H, W, 3) of raw digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
 
-        The black level is subtracted, white balance and tone curve are applied, and a Bayer image is demosaiced.
-
-        Args:
-            raw: digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
-            white: factors of R, G, B; None = those of white light.
+        The black level is subtracted, white balance (None = that of white light) and tone curve are applied.
         """
         toned = np.empty(raw.shape, np.uint8)
         tones = self._tone_table(self._white.of_white_light if white is None else np.array(white))

@@ -1,23 +1,16 @@
 """Radiometry of lens and pixel: photons and electrons per unit of luminance, and vignetting.
 
-Light has three bands (`bands`). The radiance of a band is given as the luminance [cd/m2] of white light with this
-radiance in the band: a white floor under 1000 lx has 1000 / pi cd/m2 in every band. White is equal-energy light (CIE
-illuminant E). In each band, one lux of white light yields, per second and square metre,
+The radiance of a band is given as the luminance [cd/m2] of equal-energy white light (CIE illuminant E) with this
+radiance in the band. One lux of white light yields in a band, per second and square metre,
 
     photons = integral of S lambda / (h c Km Y) over wavelength,    Y = integral of V over wavelength
 
-with S the sensitivity of the band relative to its largest value, lambda the wavelength, h Planck's constant, c the
-speed of light, Km = 683 lm/W the luminous efficacy at 555 nm, and V the photopic luminous efficiency function (CIE
-1924; Y = 106.857 nm). If the luminous efficacy at the centre of each band were used instead, the light would consist of
-three spectral lines, and a white floor would appear violet.
-
-On the axis of a lens of f-number N, focused at infinity, the illuminance of the sensor is
+with S the sensitivity relative to its largest value, Km = 683 lm/W, and V the photopic luminous efficiency function
+(CIE 1924; Y = 106.857 nm). On the axis of a lens of f-number N, focused at infinity, the illuminance of the sensor is
 
     E = pi L / (4 n^2 N^2)
 
-with L the radiance in the water. The radiance decreases to L / n^2 as light passes from the water (index n) through
-the port into the air of the housing. Off the axis, the illuminance decreases as the fourth power of the cosine of the
-angle from the axis; other powers describe lenses with less or more vignetting.
+with L the radiance in water of index n. Off the axis it decreases as a power (four by default) of the cosine.
 """
 
 from __future__ import annotations
@@ -26,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
-from twin.imaging.light.bands import NM, sensitivity
+from twin.imaging.light.spectra import NM, sensitivity
 from twin.scenario.model import SensorConfig
 
 Array = NDArray[np.float64]

@@ -1,9 +1,7 @@
 """Pixel model: shot noise, full well, read noise, gain and quantization to digital numbers.
 
-The linear model of EMVA 1288: photons generate electrons with Poisson statistics, read-out adds normal noise, and the
-camera outputs a black level plus K (electrons + noise), with K the system gain, clipped to the largest digital number.
-Dark current, which is negligible for exposures of milliseconds in cold water, and non-uniformity of the pixels are not
-modelled.
+The linear model of EMVA 1288: Poisson-distributed electrons, normal read noise, and a black level plus K (electrons +
+noise), clipped to the largest digital number. Dark current and non-uniformity are not modelled.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.row_parallel import in_row_bands
-from twin.imaging.camera.noise import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
+from twin.imaging.camera.random_numbers import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.kernels import kernel
 
 Raw = NDArray[np.uint16]
@@ -24,23 +22,14 @@ MOST_ELECTRONS = 80  # largest number that `_poisson` returns; for means below 1
 
 
 class PixelResponse(NamedTuple):
-    """Response of the pixels in one exposure.
+    """Response of the pixels in one exposure."""
 
-    Args:
-        electrons_per_cd: (3,) expected number of electrons on the axis at 1 cd/m2, for R, G, B.
-        full_well_e: full-well capacity [e-].
-        read_noise_e: standard deviation of the read noise [e-].
-        dn_per_e: digital numbers per electron, K of EMVA 1288.
-        black_dn: black level, as a digital number.
-        top_dn: largest digital number.
-    """
-
-    electrons_per_cd: NDArray[np.float64]
-    full_well_e: float
-    read_noise_e: float
-    dn_per_e: float
-    black_dn: float
-    top_dn: float
+    electrons_per_cd: NDArray[np.float64]  # (3,) expected number of electrons on the axis at 1 cd/m2, for R, G, B
+    full_well_e: float  # full-well capacity [e-]
+    read_noise_e: float  # standard deviation of the read noise [e-]
+    dn_per_e: float  # digital numbers per electron, K of EMVA 1288
+    black_dn: float  # black level, as a digital number
+    top_dn: float  # largest digital number
 
 
 def read_out(
@@ -55,8 +44,6 @@ def read_out(
     Args:
         light: (H, W, 3) light per colour band in photometric units [cd/m2].
         vignetting: (H, W) illuminance relative to the axis.
-        response: response of the pixels.
-        bayer: whether each pixel records only one colour band.
         rng: random stream, of which one number is drawn per image; None = no noise.
     """
     height, width = vignetting.shape
@@ -70,14 +57,7 @@ def read_out(
 
 @kernel
 def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`.
-
-    Args:
-        response: (8,) float32 fields of `PixelResponse`, one after the other.
-        normal: table of `normal_numbers`.
-        seed: seed of the random numbers of this image.
-        noisy: whether to add noise.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`."""
     width, bands = out.shape[1:]
     n, few = width * bands, np.float32(FEW_ELECTRONS)
     expected, shot, read = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)
@@ -109,9 +89,8 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 def _normal_to_poisson(expected, shot):
     """Replaces standard normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
 
-    The counts are m + s z + (z^2 - 1) / 6, rounded, with m the mean: the first terms of the Cornish-Fisher expansion
-    (1938), which give the skewness. s^2 = m - 1/18 - 1/12 compensates for the variance of the quadratic term and of the
-    rounding.
+    The counts are round(m + s z + (z^2 - 1) / 6), the first terms of the Cornish-Fisher expansion (1938); s^2 = m -
+    1/18 - 1/12 compensates for the variance of the quadratic term and of the rounding.
     """
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(shot.size):

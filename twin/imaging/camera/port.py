@@ -1,14 +1,9 @@
 """Ports of a camera housing: refraction of rays at the inner and outer face of the glass (Snell's law).
 
-All quantities are in the axes of the camera with the entrance pupil of the lens as origin; the housing is filled with
-air of refractive index 1. A ray of direction (X, Y, Z) in air is described by its normalised coordinates X / Z, Y / Z.
-
-Near the axis of an untilted port the camera in water is again a pinhole (Gaussian optics): a ray at a small angle
-leaves the outer face at the distance h from the axis and the angle w to the axis, both proportional to its angle in
-air. The pinhole lies at a distance h / w from that face, on the side of the camera, and its focal length is that of
-the lens times the ratio of the angles in air and in water. For a flat pane at distance d, of thickness t and index g,
-in water of index n, the pinhole lies d (n - 1) + t (n / g - 1) behind the pupil, and its focal length is n times that
-of the lens. Treibitz et al. 2012 (doi 10.1109/TPAMI.2011.105) give the errors of this approximation off the axis.
+All quantities are in the axes of the camera with the entrance pupil as origin; the housing holds air. Near the axis the
+camera in water is again a pinhole (Gaussian optics): for a flat pane at distance d, of thickness t and index g, in
+water of index n, it lies d (n - 1) + t (n / g - 1) behind the pupil and has n times the focal length. Treibitz et al.
+2012 (doi 10.1109/TPAMI.2011.105) give the errors off the axis.
 """
 
 from __future__ import annotations
@@ -28,15 +23,10 @@ SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
 
 
 class Pinhole(NamedTuple):
-    """Pinhole camera in water that is equivalent, near the optical axis, to a camera behind a port.
+    """Pinhole camera in water that is equivalent, near the optical axis, to a camera behind a port."""
 
-    Args:
-        centre_m: position of the pinhole on the optical axis, positive in front of the entrance pupil.
-        focal_ratio: focal length of the pinhole camera divided by that of the lens in air.
-    """
-
-    centre_m: float
-    focal_ratio: float
+    centre_m: float  # position of the pinhole on the optical axis, positive in front of the entrance pupil
+    focal_ratio: float  # focal length of the pinhole camera divided by that of the lens in air
 
 
 def pinhole(port: PortConfig) -> Pinhole:
@@ -50,14 +40,10 @@ def pinhole(port: PortConfig) -> Pinhole:
 
 
 def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
-    """Returns the origin on the outer face [m] and the unit direction in water of rays, both (..., 3).
+    """Returns the origin on the outer face [m] and the unit direction in water, both (..., 3), of rays (..., 2) in air.
 
-    The direction is NaN where a ray misses the port or is totally reflected; the origin is NaN where a ray misses the
-    port. Without a port, rays start at the entrance pupil.
-
-    Args:
-        port: geometry and refractive indices.
-        normalised: (..., 2) normalised coordinates X / Z, Y / Z of the rays in air.
+    Both are NaN where a ray misses the port, the direction also at total reflection. Without a port, rays start at the
+    entrance pupil.
     """
     ray = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -106,10 +92,7 @@ def air_coordinates(port: PortConfig, points_m: Array) -> Array:
 def refract(ray: Array, normal: Array, ratio: float) -> Array:
     """Returns the refracted unit vectors (..., 3) by Snell's law; NaN where light is totally reflected.
 
-    Args:
-        ray: (..., 3) unit directions of incidence.
-        normal: (..., 3) unit normals in the direction of propagation.
-        ratio: refractive index before the face, divided by the index behind the face.
+    `ray` and `normal` (..., 3) are unit vectors in the direction of propagation, `ratio` is the index before / behind.
     """
     cosine = (ray * normal).sum(axis=-1, keepdims=True)
     with np.errstate(invalid="ignore"):

@@ -1,15 +1,9 @@
 """Sampling of a rendered image along the rays of the true pixels: lens, port and rolling shutter in one resampling.
 
-A pixel of the raw image has a ray o + s d in the axes of the rendered camera, with the origin o, the direction d and
-the parameter s. A rolling shutter exposes row v of h rows at
-
-    t = readout (v / (h - 1) - 1/2)
-
-after the middle of the read-out, when a camera with constant twist xi has moved by exp(xi t), so the ray in the axes of
-the camera at mid-exposure is turned and shifted by that pose. Relative to the principal point, the column where
-the ray meets the floor is f d_x / d_z + f (o_x - o_z d_x / d_z) / z, with z the depth of the floor there and f the
-focal length; the row is that with y in place of x. This equation is solved for the position by iteration, for a whole
-row at a time so that the compiler can vectorize it; it starts from the depths that the rays of the previous row meet.
+A pixel of the raw image has a ray o + s d in the axes of the rendered camera. A rolling shutter exposes row v of h at t
+= readout (v / (h - 1) - 1/2) after mid-exposure, when a camera with twist xi has moved by exp(xi t). The ray meets the
+floor of depth z at the column f d_x / d_z + f (o_x - o_z d_x / d_z) / z from the principal point; rows alike. This is
+solved by iteration for a whole row, from the depths that the rays of the previous row meet.
 """
 
 from __future__ import annotations
@@ -27,45 +21,17 @@ from twin.kernels import kernel
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
-INTERSECTION_STEPS = 4  # maximum; each multiplies the error by p / z (see `intersect`) times the slope of the floor
+INTERSECTION_STEPS = 4  # maximum; each multiplies the error by the parallax times the slope of the floor
 INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
 
 
 class RowMotion(NamedTuple):
-    """Motion of a camera while the rows of an image are exposed one after the other.
+    """Motion of a camera while the rows of an image are exposed one after the other."""
 
-    Args:
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        readout_s: time from the first sampled row of the raw image to the last.
-        focal_px: focal length of the rendered image.
-        principal_px: (2,) column and row of its principal point.
-    """
-
-    twist: Array
-    readout_s: float
-    focal_px: float
-    principal_px: tuple[float, float]
-
-
-def intersect(
-    depth: Depth, positions: Positions, parallax_px_m: Positions | None, motion: RowMotion | None = None
-) -> Positions:
-    """Returns the image positions (h, w, 2) [px] where the rays of pixels intersect the floor.
-
-    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
-    vanishing point, with f the focal length [px] and z the depth of the floor at that position. The map of 1 / z, which
-    is linear for a plane, is interpolated bilinearly.
-
-    Args:
-        depth: (H, W) depth [m]; inf where there is no floor.
-        positions: (h, w, 2) vanishing points of the rays [px].
-        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
-        motion: motion of a camera with a rolling shutter; None = all rows are exposed together.
-    """
-    out, near = np.empty_like(positions), np.reciprocal(depth)
-    rays = near, positions, parallax_px_m, _arguments(motion)
-    in_row_bands(lambda first, end: _intersect(*rays, out, first, end), len(positions))
-    return out
+    twist: Array  # (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s]
+    readout_s: float  # time from the first sampled row of the raw image to the last
+    focal_px: float  # focal length of the rendered image
+    principal_px: tuple[float, float]  # (2,) column and row of its principal point
 
 
 def sample_rays(
@@ -77,9 +43,14 @@ def sample_rays(
 ) -> Radiance:
     """Returns the radiance (h, w, 3) where the rays of pixels intersect the floor.
 
+    A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
+    vanishing point, z being the depth there; 1 / z, linear on a plane, is interpolated bilinearly.
+
     Args:
         light: (H, W, 3) radiance; beyond its border, the values of the nearest border pixel are repeated.
-        depth, positions, parallax_px_m, motion: see `intersect`.
+        depth: (H, W) depth [m]; inf where there is no floor.
+        positions: (h, w, 2) vanishing points of the rays [px].
+        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
     """
     out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
     source = np.ascontiguousarray(light).reshape(len(light), -1)
@@ -96,16 +67,6 @@ def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[flo
 
 
 @kernel
-def _intersect(near, positions, parallax, motion, out, first, end):
-    """Writes the intersections of rows `first` to `end` - 1 to `out`; `near` is the inverse depth."""
-    rays, cells = np.empty((8, out.shape[1]), np.float32), np.empty(out.shape[1], np.int32)
-    for v in range(first, end):
-        _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
-        for u in range(out.shape[1]):
-            out[v, u, 0], out[v, u, 1] = rays[0, u], rays[1, u]
-
-
-@kernel
 def _sample_rays(source, near, positions, parallax, motion, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W); `near` is the inverse depth."""
     n = out.shape[1]
@@ -119,9 +80,8 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
 
-    Rows 2 and 3 are filled with the vanishing points of the rays, rows 4 and 5 with their parallax, and row 6 with the
-    inverse depth of the floor. The iteration starts from the inverse depth of the previous row or, if `is_first`, from
-    that at the vanishing points. Row 7 is not used; `cells` (w,) int32 is working memory.
+    Rows 2 and 3 get the vanishing points, 4 and 5 the parallax, 6 the inverse depth, from which the next row starts
+    unless `is_first`.
     """
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]
@@ -173,10 +133,7 @@ def _move(pose, focal, cx, cy, rays):
 
 @kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_y, cells):
-    """Computes the square of four pixel centres that each ray falls in, and the position in the square.
-
-    `cells` is filled with the index of its top left pixel, `part_x` and `part_y` with the position, 0 to 1.
-    """
+    """Computes the square of four pixel centres that each ray falls in, and the position in the square."""
     zero, one, last_x, last_y = np.float32(0.0), np.float32(1.0), np.float32(cols - 2), np.float32(rows - 2)
     n_cols = np.int32(cols)
     for u in range(base_x.size):

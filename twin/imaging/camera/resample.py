@@ -1,9 +1,7 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps are not used, because they round positions to 1/32 px. For radiance, the B-spline is the point spread
-function of a pixel: it suppresses spatial frequencies above half a cycle per pixel, which would alias. Sensor images
-are interpolated: a prefilter makes the spline pass through the value of every pixel (Unser et al. 1993, doi
-10.1109/78.193221).
+OpenCV's warps round positions to 1/32 px. For radiance, the B-spline is the point spread function of a pixel; sensor
+images are interpolated after a prefilter (Unser et al. 1993, doi 10.1109/78.193221).
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from twin.core.interpolation import bspline_weights
 from twin.core.records import Image
 from twin.core.row_parallel import in_row_bands
-from twin.imaging.light.pixel_sum import sum_of_pixels
+from twin.imaging.light.vector_math import sum_of_pixels
 from twin.kernels import kernel
 
 Radiance = NDArray[np.float32]
@@ -31,7 +29,9 @@ def sample(light: Radiance, positions: Positions) -> Radiance:
 
     Beyond the image border, the values of the nearest border pixel are repeated.
     """
-    return _sampled(np.ascontiguousarray(light).reshape(len(light), -1), positions)
+    source, out = np.ascontiguousarray(light).reshape(len(light), -1), np.empty((*positions.shape[:2], 3), np.float32)
+    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
+    return out
 
 
 def interpolate(image: Image, positions: Positions) -> Image:
@@ -40,12 +40,6 @@ def interpolate(image: Image, positions: Positions) -> Image:
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
     in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
     in_row_bands(lambda first, end: _fill_rounded_from(spline, positions, out, first, end), len(positions))
-    return out
-
-
-def _sampled(source: NDArray[np.float32], positions: Positions) -> Radiance:
-    out = np.empty((*positions.shape[:2], 3), np.float32)
-    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
     return out
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from twin.core.records import Exposure, Image
 from twin.core.row_parallel import in_row_bands
-from twin.imaging.camera.noise import NORMAL_MASK, normal_numbers, random_bits, seed_of
+from twin.imaging.camera.random_numbers import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.kernels import kernel
 from twin.scenario.model import ImagingConfig, Scenario
@@ -29,18 +29,9 @@ DARK_CD_M2 = 1e-6  # lower limit of the metered radiance
 class AutoExposure:
     """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest band reaches `gray_level`.
 
-    The brightest band is used because water absorbs the colours unequally: if the mean of all bands were metered, the
-    least absorbed band would saturate. The gain of a frame is computed from the previous frames, as in a real
-    camera; the gain of the first frame is computed from that frame itself.
-
-    Args:
-        gray_level: target mean as a fraction of full scale.
-        frame_rate_hz: frames per second.
-        lag_s: time constant; 0 = each frame has the gain metered on the previous frame.
-        limits: smallest and largest gain [1 / (cd/m2)].
-
-    Attributes:
-        share: fraction by which log gain approaches its target per frame.
+    The mean of all bands would let the least absorbed one saturate. The gain follows from the previous frames, that of
+    the first frame from itself. `lag_s` is a time constant, 0 = no lag; `limits` are the smallest and largest gain [1 /
+    (cd/m2)]; `share` is the fraction by which log gain approaches its target per frame.
     """
 
     def __init__(
@@ -79,28 +70,19 @@ class AutoExposure:
 
 
 class ExposureSetting(NamedTuple):
-    """Exposure of one frame.
+    """Exposure of one frame."""
 
-    Args:
-        gain: linear image signal per unit of radiance on the optical axis, with the white balance for white light
-            [1 / (cd/m2)]; a signal of 1 saturates.
-        exposure_s: exposure time; 0 for the plain sensor.
-        analogue_gain: amplification before digitization.
-        white: (3,) factors that the white balance applies to R, G, B; None = those for white light.
-    """
-
+    # linear image signal per unit of radiance on the optical axis, with the white balance for white light [1 /
+    # (cd/m2)]; a signal of 1 saturates
     gain: float
-    exposure_s: float = 0.0
-    analogue_gain: float = 1.0
+    exposure_s: float = 0.0  # exposure time; 0 for the plain sensor
+    analogue_gain: float = 1.0  # amplification before digitization
+    # (3,) factors that the white balance applies to R, G, B; None = those for white light
     white: tuple[float, float, float] | None = None
 
 
 class PlainSensor:
-    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`.
-
-    Args:
-        scenario: survey scenario.
-    """
+    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`."""
 
     def __init__(self, scenario: Scenario):
         self._imaging = scenario.imaging
@@ -136,15 +118,9 @@ class PlainSensor:
 
 
 def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
-    """Returns the noisy 8-bit image (H, W, 3) of a radiance image.
+    """Returns the noisy 8-bit image (H, W, 3) of a radiance image [cd/m2].
 
-    With signals as fractions of full scale, the noise variance is noise_sd^2 + shot_noise^2 * signal.
-
-    Args:
-        radiance: (H, W, 3) light per colour band in photometric units [cd/m2].
-        gain: image signal per unit of radiance [1 / (cd/m2)]; a signal of 1 saturates.
-        imaging: standard deviations of read noise and of shot noise at full signal, as fractions of full scale.
-        rng: random stream of this camera, from which one number is drawn per image.
+    With signals as fractions of full scale, `gain` per cd/m2, the noise variance is noise_sd^2 + shot_noise^2 * signal.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)
@@ -170,10 +146,7 @@ def _mean(light):
 
 @kernel
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
-    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values.
-
-    64 random bits select four normally distributed noise values from the table `normal`.
-    """
+    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values."""
     n = light.shape[1]
     n_words = (n + 3) // 4
     full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)

@@ -1,24 +1,15 @@
 """Finite exposure time: motion blur, and the row delays of a rolling shutter.
 
-A point of the floor at depth Z moves through the image of a camera with angular velocity w and linear velocity v by
-(Longuet-Higgins & Prazdny 1980; x, y are image coordinates relative to the principal point, divided by the focal length
-f; in du/dt and dv/dt, u and v are column and row)
+A point at depth Z moves through the image by (Longuet-Higgins & Prazdny 1980; x, y are relative to the principal point
+and the focal length f)
 
     du/dt = f ((x v_z - v_x) / Z + x y w_x - (1 + x^2) w_y + y w_z)
     dv/dt = f ((y v_z - v_y) / Z + (1 + y^2) w_x - x y w_y - x w_z)
 
-Both effects are computed from the image at mid-exposure. With motion blur, the value of a pixel is the mean along a
-path: a line centred on the pixel, with the length and direction of the flow times the exposure time. With a rolling
-shutter, it is the value at the position of the pixel minus the flow times the delay of its row; where images are
-sampled for a lens or a port, the rolling shutter is part of that sampling (`ray_sampling`). The pose and
-the true depth of a frame refer to mid-exposure of the middle row.
-
-Limits: the flow of a pixel is constant during the exposure time T, so paths are straight (a rotation would bend them by
-less than f (|w| T)^2 / 8); vibration is not modelled. A path is computed with the depth at its own pixel: the blur of a
-near object does not spread over the background. Backscatter and the lamp pattern are blurred like the floor behind
-them; they move with the camera, but hardly vary over a few pixels. Marine snow has its own paths, see
-`twin.imaging.snow`. Total light is conserved only where the flow is uniform. Beyond the image border the last pixel is
-repeated.
+Motion blur is the mean along a line centred on the pixel, the flow times the exposure time; a rolling shutter takes the
+value at the pixel minus the flow times the delay of its row (or acts in `ray_sampling`). Pose and true depth refer to
+mid-exposure of the middle row. The flow is constant during the exposure, a path has the depth of its own pixel, and
+backscatter and lamp pattern are blurred like the floor behind them. Beyond the border the last pixel is repeated.
 """
 
 from __future__ import annotations
@@ -41,32 +32,20 @@ SHORT_PX = 2.8  # largest column and row extent of a path for the 3 x 3 kernel; 
 
 
 class ExposureMotion(NamedTuple):
-    """Motion of a camera during one exposure.
+    """Motion of a camera during one exposure."""
 
-    Args:
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        exposure_s: exposure time of each row; 0 = no motion blur.
-        readout_s: time from the first row of the rendered image to the last; 0 = global shutter.
-        rolls_later: whether the rolling shutter is applied where the raw image is sampled from the rendered one
-            (`true_cameras.TrueCameras.sample`), so that the image is resampled only once.
-    """
-
-    twist: Array
-    exposure_s: float
-    readout_s: float
+    twist: Array  # (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s]
+    exposure_s: float  # exposure time of each row; 0 = no motion blur
+    readout_s: float  # time from the first row of the rendered image to the last; 0 = global shutter
+    # whether the rolling shutter is applied where the raw image is sampled from the rendered one
+    # (`true_cameras.TrueCameras.sample`), so that the image is resampled only once
     rolls_later: bool = False
 
 
 def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMotion) -> Radiance:
-    """Returns the radiance (H, W, 3) recorded by a moving camera, with rolling shutter and motion blur.
+    """Returns the radiance (H, W, 3) recorded by a moving camera: shutter (unless `motion.rolls_later`) and blur.
 
-    The rolling shutter is left out if `motion.rolls_later`.
-
-    Args:
-        light: (H, W, 3) radiance at mid-exposure, in the rendered pinhole image.
-        depth: (H, W) depth along the optical axis in the same image [m].
-        focal_px: focal length of that image.
-        motion: velocity of the camera, exposure time and read-out time.
+    `light` is the radiance at mid-exposure in the rendered pinhole image, `depth` (H, W) that of the floor [m].
     """
     if motion.readout_s and not motion.rolls_later:
         light = apply_rolling_shutter(light, depth, focal_px, motion.twist, motion.readout_s)
@@ -78,12 +57,8 @@ def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMo
 def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
     """Returns the radiance (H, W, 3) with motion blur.
 
-    Args:
-        light: (H, W, 3) radiance at mid-exposure.
-        depth: (H, W) depth along the optical axis [m]; points at inf move by rotation alone.
-        focal_px: focal length.
-        twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        exposure_s: exposure time of each row.
+    `twist` (6,) is the [angular, linear] velocity of the camera in its own axes [rad/s, m/s]; points at inf move by
+    rotation alone.
     """
     out, motion = np.empty_like(light), twist.astype(np.float32)
     flat, focal, open_s = light.reshape(-1, 3), np.float32(focal_px), np.float32(exposure_s)
@@ -92,12 +67,7 @@ def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array,
 
 
 def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
-    """Returns the radiance (H, W, 3) that a camera with a rolling shutter records.
-
-    Args:
-        light, depth, focal_px, twist: see `blur_by_motion`.
-        readout_s: time from the first row of the image to the last.
-    """
+    """Returns the radiance (H, W, 3) that a camera with a rolling shutter records."""
     out, motion = np.empty_like(light), twist.astype(np.float32)
     focal, whole_s = np.float32(focal_px), np.float32(readout_s)
     scene = light, depth, focal, motion, whole_s, out
@@ -107,10 +77,7 @@ def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist:
 
 @kernel(inline="always")
 def _flow(x, y, near, scale, twist):
-    """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth.
-
-    The flow is in px/s if `scale` is the focal length f, and in px if `scale` is f times a duration.
-    """
+    """Returns the optical flow (du, dv) at normalised coordinates x, y, with `near` = 1 / depth."""
     one = np.float32(1.0)
     du = (x * twist[5] - twist[3]) * near + x * y * twist[0] - (one + x * x) * twist[1] + y * twist[2]
     dv = (y * twist[5] - twist[4]) * near + (one + y * y) * twist[0] - x * y * twist[1] - x * twist[2]
@@ -119,10 +86,7 @@ def _flow(x, y, near, scale, twist):
 
 @kernel(error_model="numpy")
 def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
-    """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur.
-
-    Compiled kernel of `blur_by_motion`. `flat` (H W, 3) is the radiance at mid-exposure.
-    """
+    """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur."""
     height, width = depth.shape
     values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
     x, weights = np.empty(width, np.float32), np.empty((4, width), np.float32)
@@ -147,9 +111,8 @@ def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
 def _blur_weights(depth, x, y, scale, twist, weights):
     """Computes the weights (4, W) of `_blur_row`; returns whether all paths of the row are short (`SHORT_PX`).
 
-    The weights of the 3 x 3 kernel have the moments of a uniform distribution along a straight path (a, b) [px]:
-    variances a^2 / 12 and b^2 / 12, covariance a b / 12, fourth moment a^2 b^2 / 80. Each of the
-    four rows of `weights` is for two neighbours: in the row, in the column, on the falling diagonal, on the rising one.
+    The 3 x 3 kernel has the moments of a uniform path (a, b) [px]: a^2 / 12, b^2 / 12, a b / 12, a^2 b^2 / 80. The
+    weights are for the neighbours in the row, in the column, on the falling and on the rising diagonal.
     """
     half, quarter, one, n_long = np.float32(0.5), np.float32(0.25), np.float32(1.0), 0
     across, down, falling, rising = weights[0], weights[1], weights[2], weights[3]
@@ -191,10 +154,9 @@ def _blur_row(above, here, below, weights, out):
 def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, stride_b, out):
     """Writes to `out` the mean radiance over a straight path centred on pixel (a, b), from an odd number of samples.
 
-    The path extends by `length` along the first image axis and by `aside`, which is not longer, along the second [px].
-    The samples are one pixel apart along the first axis and are interpolated along the second, which does not change
-    the variance of their positions along the first. All samples have the same weight, except the two at the ends: their
-    weight gives this variance the value of a uniform distribution, length^2 / 12.
+    The path extends by `length` along the first axis and by `aside`, not longer, along the second [px]; samples are a
+    pixel apart along the first and interpolated along the second. The weight of the two ends gives the variance
+    length^2 / 12.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]
@@ -223,10 +185,7 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter.
-
-    Compiled kernel of `apply_rolling_shutter`.
-    """
+    """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter."""
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
     right, low = np.float32(width - 1), np.float32(height - 1)

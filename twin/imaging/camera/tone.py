@@ -1,11 +1,8 @@
 """Tone curves: the level of an image as a function of the linear signal, both as fractions of full scale.
 
-    linear    V = L
-    srgb      V = 12.92 L for L <= 0.0031308, else 1.055 L^(1/2.4) - 0.055    (IEC 61966-2-1)
-    log       V = log2(1 + (2^n - 1) L) / n with n = LOG_STOPS
-
-The logarithmic curve gives nearly equal steps of V to equal ratios of L where L is well above 2^-n of full scale, and
-is nearly linear well below it.
+linear    V = L
+srgb      V = 12.92 L for L <= 0.0031308, else 1.055 L^(1/2.4) - 0.055    (IEC 61966-2-1)
+log       V = log2(1 + (2^n - 1) L) / n with n = LOG_STOPS
 """
 
 from __future__ import annotations

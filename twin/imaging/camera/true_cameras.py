@@ -1,12 +1,8 @@
 """Geometry of the true cameras: maps rendered images to raw images, and raw images to rectified frames.
 
-The floor is rendered for two parallel pinhole cameras in water, with images larger than the frames where necessary.
-Each pixel of a raw image has its own ray through lens and port; the radiance of the pixel is sampled from the rendered
-image at the point where its ray intersects the rendered floor. The sensor model converts the sampled radiance to the
-raw image, which is rectified with the believed calibration to obtain the frame. If both true cameras equal the believed
-pinhole cameras, apart from the baseline, the rendered image is used unchanged.
-
-Raw images have the size of the frames plus a border that the rectification needs.
+The floor is rendered for two parallel pinhole cameras in water, with a margin where necessary. Each raw pixel has its
+own ray through lens and port and gets the radiance where this ray meets the rendered floor; the raw image is rectified
+with the believed calibration. If both true cameras equal the believed ones, the rendered image is used unchanged.
 """
 
 from __future__ import annotations
@@ -40,22 +36,14 @@ WIDEST_TANGENT = 5.0  # largest tangent of half the field of view
 
 
 class CameraModel(NamedTuple):
-    """Model of one camera, true or believed, in the axes of the believed camera.
+    """Model of one camera, true or believed, in the axes of the believed camera."""
 
-    Args:
-        focal_px: focal length of the lens: that of the equivalent pinhole camera divided by `pinhole.focal_ratio`.
-        principal_px: (2,) column and row of the principal point.
-        lens: distortion coefficients.
-        port: geometry and refractive indices of the port.
-        pinhole: pinhole camera in water that is equivalent to lens and port near the optical axis.
-        believed_from_camera: (3, 3) rotation from this camera to the believed camera, about the centre of `pinhole`.
-    """
-
-    focal_px: float
-    principal_px: Array
-    lens: Distortion
-    port: PortConfig
-    pinhole: Pinhole
+    focal_px: float  # focal length of the lens: that of the equivalent pinhole camera divided by `pinhole.focal_ratio`
+    principal_px: Array  # (2,) column and row of the principal point
+    lens: Distortion  # distortion coefficients
+    port: PortConfig  # geometry and refractive indices of the port
+    pinhole: Pinhole  # pinhole camera in water that is equivalent to lens and port near the optical axis
+    # (3, 3) rotation from this camera to the believed camera, about the centre of `pinhole`
     believed_from_camera: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
@@ -72,11 +60,9 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in the axes of the believed camera.
+        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in front of the believed camera, in its axes.
 
-        The points must lie in front of the camera; whether they lie inside the image is not checked. The result is NaN
-        for a point without a ray through the port, and for one that is too far off the optical axis for the distortion
-        model or more than arctan(`WIDEST_TANGENT`) off it.
+        They are NaN for a point without a ray through the port, or too far off the axis for the distortion model.
         """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
@@ -88,44 +74,31 @@ class CameraModel(NamedTuple):
 
 
 class SamplingMap(NamedTuple):
-    """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled.
+    """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled."""
 
-    Args:
-        positions: (h, w, 2) position for each raw pixel if its ray meets the floor at infinity [px].
-        parallax_px_m: (h, w, 2) parallax times depth [px m]: if the ray meets the floor at depth z, the position is
-            `positions` + `parallax_px_m` / z. None if it is zero for all pixels.
-    """
-
-    positions: Positions
+    positions: Positions  # (h, w, 2) position for each raw pixel if its ray meets the floor at infinity [px]
+    # (h, w, 2) parallax times depth [px m]: if the ray meets the floor at depth z, the position is `positions` +
+    # `parallax_px_m` / z. None if it is zero for all pixels.
     parallax_px_m: Positions | None
 
 
 @dataclass(frozen=True)
 class TrueCameras:
-    """Geometry of the true stereo camera: maps rendered images to raw images, and raw images to rectified frames.
+    """Geometry of the true stereo camera: maps rendered images to raw images, and raw images to rectified frames."""
 
-    Args:
-        rendered_rig: calibration used for rendering: the believed rig with the true baseline, and images enlarged by
-            the margin.
-        margin_px: (columns, rows) by which the rendered image extends beyond the frame on each side.
-        raw_rig: calibration of the raw images: their size, the focal length of the lens, the true baseline.
-        sampling: for the left and the right camera, position in the rendered image of each raw pixel; None if the
-            rendered images are used as raw images.
-        rectification: (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None if the raw
-            images are used as frames.
-        models: models of the true left and right camera.
-        believed: camera model that is used to rectify the images of both cameras.
-        rectified_depth_m: depth of the points for which the rectification is computed.
-    """
-
+    # calibration used for rendering: the believed rig with the true baseline, and images enlarged by the margin
     rendered_rig: StereoRig
-    margin_px: tuple[int, int]
-    raw_rig: StereoRig
+    margin_px: tuple[int, int]  # (columns, rows) by which the rendered image extends beyond the frame on each side
+    raw_rig: StereoRig  # calibration of the raw images: their size, the focal length of the lens, the true baseline
+    # for the left and the right camera, position in the rendered image of each raw pixel; None if the rendered images
+    # are used as raw images
     sampling: tuple[SamplingMap, SamplingMap] | None
+    # (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None if the raw images are used as
+    # frames
     rectification: Positions | None
-    models: tuple[CameraModel, CameraModel]
-    believed: CameraModel
-    rectified_depth_m: float
+    models: tuple[CameraModel, CameraModel]  # models of the true left and right camera
+    believed: CameraModel  # camera model that is used to rectify the images of both cameras
+    rectified_depth_m: float  # depth of the points for which the rectification is computed
 
     def sample(self, light: Radiance, depth: Depth, camera: int, motion: ExposureMotion | None = None) -> Radiance:
         """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right).
@@ -133,9 +106,7 @@ class TrueCameras:
         Args:
             light: (H, W, 3) radiance in the rendered image.
             depth: (H, W) depth in the rendered image [m].
-            camera: 0 left, 1 right.
-            motion: motion of the camera during the exposure; its rolling-shutter effect is applied if the rendered
-                images are resampled (`sampling` is not None). None: no motion.
+            motion: its rolling shutter is applied if `sampling` is not None. None: no motion.
         """
         if self.sampling is None:
             return light
@@ -146,13 +117,7 @@ class TrueCameras:
         return sample_rays(light, depth, positions, parallax, rows)
 
     def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, n_raw: int) -> RowMotion | None:
-        """Returns the motion during the read-out of the raw rows; None without rolling shutter.
-
-        Args:
-            motion: motion of the camera during the exposure.
-            n_rendered: rows of the rendered image.
-            n_raw: rows of the raw image.
-        """
+        """Returns the motion during the read-out of the raw rows; None without rolling shutter."""
         if motion is None or not motion.readout_s:
             return None
         rig, readout_s = self.rendered_rig, motion.readout_s * (n_raw - 1) / (n_rendered - 1)
@@ -168,14 +133,7 @@ class TrueCameras:
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
     def project(self, points_m: Array, camera: int = 0) -> Array:
-        """Returns the pixel coordinates (n, 2) of points in the rectified frame; NaN for points without an image.
-
-        Points outside the borders of the frame have pixel coordinates too.
-
-        Args:
-            points_m: (n, 3) points in the axes of the rendered camera [m].
-            camera: 0 left, 1 right.
-        """
+        """Returns the pixels (n, 2) in the frame or beyond of points (n, 3) [m] in the rendered camera; NaN if none."""
         rig = self.rendered_rig
         if self.sampling is None:
             return rig.project(points_m)
@@ -235,11 +193,7 @@ def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
 
 
 def _believed_model(scenario: Scenario) -> CameraModel:
-    """Returns the camera model for the rectification.
-
-    If the refraction of the port was not calibrated (`port.calibrated_at_m` = 0), the model contains only its effect
-    on the focal length.
-    """
+    """Returns the camera model for the rectification."""
     rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
     lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)
     port = scenario.port
@@ -260,22 +214,13 @@ def right_rotation(calibration: CalibrationErrorConfig) -> Array:
 
 
 def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    """Returns whether the true and the believed cameras are the same pinhole camera without a port.
-
-    The baseline may differ.
-    """
+    """Returns whether the true and the believed cameras are the same pinhole camera without a port."""
     same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
 
 def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`.
-
-    Positions are relative to the frame's top left pixel, without the border of the raw image.
-
-    Raises:
-        TwinError: the port transmits no rays to a part of the frame, or the distortion folds the image onto itself.
-    """
+    """Returns the raw-image position (H, W, 2) of each pixel of the frame [px], as the image of points at `depth_m`."""
     normalised = (_grid(rig) - [rig.cx_px, rig.cy_px]) / rig.focal_px
     points_m = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1) * depth_m
     positions = believed.pixels(points_m)
@@ -287,11 +232,7 @@ def _rectification(believed: CameraModel, rig: StereoRig, depth_m: float) -> Arr
 
 
 def _rendered_rays(camera: CameraModel, pixels: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin.
-
-    Raises:
-        TwinError: the port transmits no rays to a part of the image, or the distortion folds the image onto itself.
-    """
+    """Returns `positions` and `parallax_px_m` of `SamplingMap` for raw pixels and a rendered image without margin."""
     distorted = (pixels - camera.principal_px) / camera.focal_px
     if np.isnan(lenses.undistort(distorted, camera.lens)).any():
         raise TwinError("lens.k1", "the lens folds the image back within the sensor", "less distortion")
@@ -314,12 +255,7 @@ def _or_none(parallax: Array) -> Positions | None:
 
 
 def _grid(rig: StereoRig, border: Any = (0, 0)) -> Array:
-    """Returns column and row (h, w, 2) of all pixels of an image and its border, from the top left pixel of the image.
-
-    Args:
-        rig: size of the image.
-        border: (columns, rows) of the border on each side.
-    """
+    """Returns column and row (h, w, 2) of all pixels of an image and its border, from its top left pixel."""
     columns = np.arange(-border[0], rig.width_px + border[0])
     rows = np.arange(-border[1], rig.height_px + border[1])
     return np.stack(np.meshgrid(columns, rows), axis=-1).astype(np.float64)
@@ -333,13 +269,7 @@ def _missing_px(positions: Array, rig: StereoRig) -> NDArray[np.int64]:
 
 
 def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the margin (columns, rows) [px] that the rendered image needs on each side.
-
-    With this margin it covers the rays of all raw pixels for depths from `NEAREST_M` to infinity.
-
-    Raises:
-        TwinError: the field of view with the margin is too wide.
-    """
+    """Returns the margin (columns, rows) [px] that the rendered image needs on each side."""
     ends = [positions + parallax * per_m for positions, parallax in rays for per_m in (0.0, 1 / NEAREST_M)]
     missing = np.max([_missing_px(end, rig) for end in ends], axis=0)
     margin = -(-missing // MARGIN_STEP_PX) * MARGIN_STEP_PX

@@ -1,12 +1,9 @@
 """White balance: factors of R, G, B that make an expected or measured light appear grey.
 
-The factors of a preset are inversely proportional to the electrons that a white surface yields in the expected light:
-white light, a black body of a colour temperature, or white light after the path from the planned altitude to the floor
-and back, exp(-2 Kd altitude), with Kd the diffuse attenuation of the water. With "gains", the scenario gives the
-factors. Grey world makes the means of the three bands equal (Buchsbaum 1980, A spatial processor model for object
-colour perception); the factors of a frame are computed from the previous frames with the lag of the auto-exposure.
-Factors are at least 1, so that a saturated pixel is white, and at most `MOST` except those for white light, as
-amplified bands are noisy.
+The factors of a preset are inverse to the electrons of a white surface in white light, a black body, or white light
+after the path exp(-2 Kd altitude) to the floor and back. Grey world makes the means of the bands equal (Buchsbaum
+1980), with the lag of the auto-exposure. Factors are at least 1, so that a saturated pixel is white, and at most
+`MOST`.
 """
 
 from __future__ import annotations
@@ -25,18 +22,9 @@ MOST = 16.0  # largest factor
 
 
 class WhiteBalance:
-    """White balance of both cameras.
+    """White balance of both cameras, from electrons (3,) in a pixel at 1 cd/m2 on any scale.
 
-    Args:
-        scenario: survey scenario with a section [sensor].
-        electrons_per_cd: (3,) electrons in a pixel at 1 cd/m2, for R, G, B, on any scale.
-
-    Attributes:
-        is_of_white_light: whether the white balance is that for white light.
-        of_white_light: (3,) factors for white light.
-
-    Raises:
-        TwinError: `sensor.white_balance` is "water", and the water is invalid, see `water.medium`.
+    `of_white_light` (3,) are the factors for white light, `is_of_white_light` whether they are used.
     """
 
     def __init__(self, scenario: Scenario, electrons_per_cd: Array):
@@ -48,15 +36,7 @@ class WhiteBalance:
         self._fixed = self.of_white_light if self.is_of_white_light else self._preset(scenario)
 
     def factors(self, mean: Array, share: float) -> Array:
-        """Returns the factors (3,) of this frame.
-
-        With grey world, the factors are measured on the previous frames, or on this frame if it is the first one; this
-        frame affects the factors of later frames.
-
-        Args:
-            mean: (3,) mean radiance of this frame in photometric units.
-            share: fraction by which the logarithm of the factors approaches that of this frame.
-        """
+        """Returns the factors (3,) of this frame; its `mean` radiance (3,) affects later frames (grey world)."""
         if self._mode != "grey_world":
             return self._fixed
         measured = np.log(_limited(np.maximum(self._electrons * mean, 1e-12 * self._electrons)))
@@ -74,11 +54,7 @@ class WhiteBalance:
         return 1.0 if self.is_of_white_light else factors / self.of_white_light
 
     def _preset(self, scenario: Scenario) -> Array:
-        """Returns the constant factors (3,) of a scenario; with grey world, they are not used.
-
-        Raises:
-            TwinError: the water is invalid, see `water.medium`.
-        """
+        """Returns the constant factors (3,) of a scenario; with grey world, they are not used."""
         sensor = scenario.sensor
         assert sensor is not None
         if sensor.white_balance == "gains":

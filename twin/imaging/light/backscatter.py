@@ -1,9 +1,8 @@
 """Backscatter: light of lamps and daylight that the water scatters into the camera, between camera and floor.
 
-The light of a lamp, softened by scattering (`lamp_light`), is scattered into a ray of the camera with the coefficient
-b p(angle). On its way to the camera it is blurred like the light of the floor (`spread.camera_mixture`); the blur is
-computed on the coarse grid of the table, separately for each range. With single scattering, there is no blur, and the
-light of the lamps is attenuated by c = a + b.
+The light of a lamp (`lamp_light`), scattered with the coefficient b p(angle), is blurred on its way to the camera like
+the light of the floor (`spread.camera_mixture`), on the coarse grid of the table; with single scattering it is
+attenuated by a + b instead.
 """
 
 from __future__ import annotations
@@ -30,18 +29,10 @@ MARGIN = 6  # rows and columns of the grid outside each side of the image, whose
 
 
 def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Array) -> Array:
-    """Returns the backscatter per metre of range as it arrives at the camera, without its blur on the way.
+    """Returns the backscatter (..., n, 3) per metre of range at the camera, without its blur on the way [cd/m3].
 
-    With multiple scattering it is that of the lamps alone; see `daylight.DaylightVeil` for daylight.
-
-    Args:
-        lamps: light of the lamps in the axes of the camera, and daylight.
-        water: optical properties of the water.
-        ray: (..., 3) unit viewing direction in the axes of the camera.
-        range_m: (..., n) distances along the ray [m].
-
-    Returns:
-        (..., n, 3) radiance per metre of range, per colour band in photometric units [cd/m3].
+    With multiple scattering it is that of the lamps alone, see `daylight.DaylightVeil`. `ray` (..., 3) is the unit
+    viewing direction in the axes of the camera, `range_m` (..., n) the distances along it.
     """
     points = ray[..., None, :] * range_m[..., None]
     total = lamps.scattered_once_per_m(points, ray) * np.exp(-water.camera_loss_per_m * range_m[..., None])
@@ -52,14 +43,7 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
 
 
 def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
-    """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3].
-
-    The daylight is assumed to travel along the optical axis, away from the camera.
-
-    Args:
-        lamps, water, ray: see `backscatter_per_m`.
-        points: (..., n, 3) points on the rays in the axes of the camera [m].
-    """
+    """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3]."""
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
     light = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[..., 2:])
@@ -94,23 +78,13 @@ def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
 
 
 def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
-    """Returns the numbers of rows and columns of the pixel grid on which the backscatter of lamps is computed.
-
-    Args:
-        beams: for each lamp, (m, 2) angle from the beam axis [deg] and relative intensity; narrow beams need a finer
-            grid.
-    """
+    """Returns rows and columns of the grid of the backscatter: finer for narrow beams (m, 2), angle [deg] and share."""
     half_deg = [float(beam[beam[:, 1] >= beam[0, 1] / 2, 0].max()) for beam in beams]
     return NARROW_GRID if min(half_deg, default=90.0) < NARROW_DEG else GRID
 
 
 def grid_rays(rig: StereoRig, grid: tuple[int, int]) -> Array:
-    """Returns the unit directions (rows, cols, 3) of a pixel grid that spans the image, in the axes of the camera.
-
-    Args:
-        rig: the camera.
-        grid: rows and columns, see `grid_of`.
-    """
+    """Returns the unit directions (rows, cols, 3) of a pixel grid that spans the image, in the axes of the camera."""
     return _rays(rig, *(_grid_px(n, size, 0) for n, size in zip(grid, _size(rig), strict=True)))
 
 
@@ -128,15 +102,7 @@ def table_range_m() -> Array:
 
 
 def _spread(steps: Array, range_m: Array, grid_px: tuple[Array, Array], rig: StereoRig, water: Medium) -> Array:
-    """Returns the backscatter (rows, cols, ranges, 3) with the blur of the part that is scattered again on its way.
-
-    Args:
-        steps: (rows + 2 MARGIN, cols + 2 MARGIN, ranges, 3) backscatter of each step of range, with the margin.
-        range_m: (ranges,) range in the middle of each step [m].
-        grid_px: positions of the rows and of the columns of the grid, with the margin [px].
-        rig: the camera.
-        water: optical properties of the water.
-    """
+    """Returns the backscatter (rows, cols, ranges, 3) with the blur of the part that is scattered again on its way."""
     levels = int(np.log2(WIDEST_TAN * rig.focal_px))
     weights = level_weights(water.bands, rig.focal_px, levels, range_m)
     spacing_px = max(np.diff(grid_px[0])[MARGIN], np.diff(grid_px[1])[MARGIN])
@@ -155,19 +121,13 @@ def _size(rig: StereoRig) -> tuple[float, float]:
 
 
 def _grid_px(n: int, size_px: float, margin: int) -> Array:
-    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` positions outside of each end [px].
-
-    The spacing of the outer positions grows outwards; the outermost ones are `size_px` away from the ends.
-    """
+    """Returns n evenly spaced positions from 0 to `size_px`, and `margin` positions outside of each end [px]."""
     outside = size_px * (np.arange(1.0, margin + 1) / max(margin, 1)) ** 2
     return np.concatenate([-outside[::-1], np.linspace(0.0, size_px, n), size_px + outside])
 
 
 def _smoother(place_px: Array, sigma_px: float) -> Array:
-    """Returns the matrix (n, n + 2 MARGIN) of a Gaussian blur on a grid, for the n positions within the image.
-
-    Each row sums to 1; where the Gaussian is much narrower than the spacing, the position keeps its own value.
-    """
+    """Returns the matrix (n, n + 2 MARGIN) of a Gaussian blur on a grid, for the n positions within the image."""
     spacing = np.gradient(place_px)
     inner = place_px[MARGIN:-MARGIN]
     weights = np.exp(-((inner[:, None] - place_px) ** 2) / (2 * sigma_px**2)) * spacing

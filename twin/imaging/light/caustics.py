@@ -1,18 +1,9 @@
 """Caustics: bright moving lines on the floor where waves on the water surface focus the sunlight.
 
 The surface is a sum of waves with the spectrum of `waves`, periodic in a square tile. A vertical ray that meets the
-surface at a small slope s is deflected by the angle (1 - 1/n) s, with n the refractive index of water, and reaches a
-floor at depth D with a horizontal displacement of (1 - 1/n) s D. A ray that leaves the tile re-enters on the opposite
-side, so the mean of the pattern is 1. Three effects blur the pattern, so that its contrast decreases with depth:
-
-- waves that the cells do not resolve: they focus far above the floor, so the deflections that they cause are modelled
-  as normally distributed, with (1 - 1/n)^2 times the variance of their slopes;
-- the angular size of the sun;
-- scattering in the water, with its complete phase function (small-angle theory of Wells 1973, see
-  `scattering_blur`).
-
-Waves longer than the tile are left out, as they focus far below the floor. The side of the tile is `TILE_DEPTHS` times
-the depth, so a camera below the surface rarely sees the pattern repeated.
+surface at a small slope s is deflected by (1 - 1/n) s, n being the refractive index, and displaced by (1 - 1/n) s D at
+the depth D. The pattern is blurred by waves that the cells do not resolve (normally distributed deflections), by the
+disc of the sun, and by scattering (Wells 1973). Waves longer than the tile focus far below the floor and are left out.
 """
 
 from __future__ import annotations
@@ -45,17 +36,8 @@ _HEIGHTS, _ANGLES, _WAVE_NUMBERS = 24, 512, 80  # numbers of nodes of `scatterin
 class Caustics:
     """Caustics of one survey: a time-dependent pattern, computed on the reference plane.
 
-    The wind blows from west to east. The phases of the waves are random, their amplitudes are not: the slopes have the
-    variance of the spectrum at any time.
-
-    Args:
-        illumination: optical properties of the water, depth of the reference plane, and the fraction of the daylight
-            that the waves focus; the rest of the daylight is diffuse and uniform.
-        wind_mps: wind speed 10 m above the sea.
-        seed: seed of the scenario.
-
-    Attributes:
-        tile_m: side of the tile.
+    The wind blows from west to east. The phases of the waves are random, their amplitudes are not. `tile_m` is the side
+    of the tile.
     """
 
     def __init__(self, illumination: Illumination, wind_mps: float, seed: int):
@@ -130,13 +112,7 @@ class Caustics:
         return closed
 
     def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
-        """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves.
-
-        Args:
-            depth_m: depth of the plane below the surface.
-            water: optical properties of the water, of which those of the green band are used.
-            unresolved: variances of the slopes along and across the wind due to waves that the cells do not resolve.
-        """
+        """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves."""
         kx, ky = _wave_numbers(self.tile_m)
         along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
         rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
@@ -148,17 +124,10 @@ class Caustics:
 def scattering_blur(k: Array, depth_m: float, per_m: tuple[float, float], phase: PhaseTable) -> Array:
     """Returns the modulation transfer function of the irradiance at a depth below a narrow vertical beam.
 
-    Light that is scattered by the angle t at the height h above the plane meets the plane at the distance h tan(t)
-    from the beam, after a path that is longer by h (1 / cos(t) - 1), over which light is absorbed. With any number of
-    such scattering events (Wells 1973), the irradiance has the transform exp(b (F(k) - F(0))), where F(k) is the
-    integral over h from 0 to the depth and over all downward directions of p(t) exp(-a h (1 / cos(t) - 1))
-    J0(k h tan(t)).
-
-    Args:
-        k: wave numbers of the pattern, of any shape [rad/m].
-        depth_m: depth of the plane below the surface.
-        per_m: absorption coefficient a and scattering coefficient b of the water [1/m].
-        phase: phase function p of the water.
+    Light scattered by the angle t at the height h above the plane meets it at h tan(t) from the beam. With any number
+    of scattering events (Wells 1973), the transform is exp(b (F(k) - F(0))), F(k) being the integral over h from 0 to
+    the depth and over downward directions of p(t) exp(-a h (1 / cos(t) - 1)) J0(k h tan(t)), k the wave numbers [rad/m]
+    and `per_m` = (a, b).
     """
     absorption, scattering = per_m
     if scattering * depth_m == 0:
@@ -186,9 +155,6 @@ def _packed(transfer: Array) -> Array:
 
     OpenCV stores the real and the imaginary part of a coefficient in consecutive columns 2 k - 1 and 2 k, or in such
     rows in the first and the last column, whose coefficients are symmetric.
-
-    Args:
-        transfer: (CELLS, CELLS / 2 + 1) real and symmetric transfer function.
     """
     index = np.arange(CELLS)
     half = (index + 1) // 2
@@ -201,12 +167,6 @@ def _add_waves(east, north, cosine, sine, spectrum):
     """Adds waves to the spectrum of a complex image: real part slope towards east, imaginary part slope towards north.
 
     Both slopes are real: the coefficient of a wave number determines that of the opposite wave number.
-
-    Args:
-        east, north: (n, n / 2 + 1) complex amplitudes of the slopes at time 0.
-        cosine, sine: (n, n / 2 + 1) cosine and sine of the phase by which the waves have advanced.
-        spectrum: (n, n, 2) real and imaginary part of the spectrum, modified in place: that of the slopes towards east
-            plus i times that of the slopes towards north.
     """
     n, half = spectrum.shape[0], spectrum.shape[1] // 2
     for i in range(n):
@@ -225,13 +185,7 @@ def _add_waves(east, north, cosine, sine, spectrum):
 
 @kernel(error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Traces one vertical ray per cell through the surface; adds each to four cells of `light` with bilinear weights.
-
-    Args:
-        east, north: (n, n) slopes of the surface.
-        cells_per_slope: displacement of a ray on the floor, towards west and south, per unit of slope [cells].
-        light: (n, n) illuminance relative to its mean, initially 0; filled in place. n is a power of two.
-    """
+    """Traces one vertical ray per cell through the surface; adds it to four cells of `light`, bilinearly."""
     n, one = light.shape[0], np.float32(1.0)
     for i in range(n):
         for j in range(n):

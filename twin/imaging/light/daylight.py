@@ -1,8 +1,7 @@
 """Daylight on floors of any slope, and its backscatter in the lines of sight of a camera, from the light field.
 
-The tables are computed once per scenario, those of the backscatter at the planned depth of the cameras; `optics` uses
-them for every image. Light that the floor reflects and the water scatters back to the floor is neglected: 8 % of the
-light on a floor of albedo 0.5 in water of Jerlov type III.
+The tables are computed once per scenario, those of the backscatter at the planned depth. Light that floor and water
+send back to the floor is neglected: 8 % on a floor of albedo 0.5 in water of Jerlov type III.
 """
 
 from __future__ import annotations
@@ -33,47 +32,33 @@ LEAST_LX = 1e-12  # lower limit of the illuminance by all light but the beam, pe
 class FloorDaylight(NamedTuple):
     """Daylight on the floor in the bands R, G, B.
 
-    The light on a floor at depth z with the unit normal n is
+    The light on a floor at depth z with the unit normal n is, for each band,
 
-        E(z, n) = beam_lx exp(-beam_per_m z) max(n . to_sun, 0)
-                  + (n, 1) rest_lx (n, 1)' exp(d k1 + min(max(d, low), high)^2 k2),
+        beam_lx exp(-beam_per_m z) max(n . to_sun, 0) + (n, 1) rest_lx (n, 1)' exp(d k1 + clip(d, *fitted_m)^2 k2)
 
-    for each band, with d = z - reference_depth_m, (k1, k2) its row of `rest_per_m`, and (low, high) = fitted_m. A
-    negative quadratic form counts as 0.
-
-    Args:
-        to_sun: (3,) unit direction to the refracted sun, east, north, up.
-        beam_lx: (3,) illuminance by the beam just below the surface on a plane that faces the sun.
-        beam_per_m: (3,) attenuation of the beam with depth [1/m].
-        rest_lx: (3, 4, 4) illuminance by all other light at the reference depth, a quadratic form in (n, 1).
-        rest_per_m: (3, 2) coefficients of d [1/m] and of d squared [1/m2] in the logarithm of the other light.
-        reference_depth_m: depth below the surface at which `rest_lx` applies.
-        fitted_m: lowest and highest d of the fit.
+    with d = z - reference_depth_m and (k1, k2) = rest_per_m. A negative quadratic form counts as 0.
     """
 
-    to_sun: Array
-    beam_lx: Array
-    beam_per_m: Array
-    rest_lx: Array
-    rest_per_m: Array
-    reference_depth_m: float
-    fitted_m: tuple[float, float]
+    to_sun: Array  # (3,) unit direction to the refracted sun, east, north, up
+    beam_lx: Array  # (3,) illuminance by the beam just below the surface on a plane that faces the sun
+    beam_per_m: Array  # (3,) attenuation of the beam with depth [1/m]
+    rest_lx: Array  # (3, 4, 4) illuminance by all other light at the reference depth, a quadratic form in (n, 1)
+    rest_per_m: Array  # (3, 2) coefficients of d [1/m] and of d squared [1/m2] in the logarithm of the other light
+    reference_depth_m: float  # depth below the surface at which `rest_lx` applies
+    fitted_m: tuple[float, float]  # lowest and highest d of the fit
 
 
 def floor_daylight(daylight: Daylight) -> FloorDaylight:
     """Returns the daylight on the floor.
 
-    Without multiple scattering, beam and diffuse light keep their shares, and both decrease with depth at the rate of
-    the diffuse attenuation; without a surface they are constant. With multiple scattering, the beam is scattered into
-    diffuse light on its way.
-
-    Args:
-        daylight: sun, sky, depth and properties of the water.
+    Without multiple scattering, beam and diffuse light decrease at the rate of the diffuse attenuation; without a
+    surface they are constant. With it, the beam is scattered into diffuse light.
     """
     source, water, east_north = daylight.source, daylight.water, _turn(daylight.source)
     beam, deep = daylight.surface_lx * source.beam_lx, daylight.reference_depth_m
     if not (deep and water.multiple and daylight.surface_lx.any()):
-        form = east_north @ _in_clear_water(source).slope_form(0.0, 1e-6) @ east_north.T
+        clear = _field(Absorbed(0.0, 0.0, Scatterer("petzold")), source, 1)
+        form = east_north @ clear.slope_form(0.0, 1e-6) @ east_north.T
         fade = -daylight.attenuation_per_m
         rest_lx = (daylight.surface_lx * np.exp(fade * deep))[:, None, None] * form
         rest_per_m = np.stack([fade, np.zeros(3)], 1)
@@ -88,17 +73,7 @@ def floor_daylight(daylight: Daylight) -> FloorDaylight:
 
 
 def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, Array]:
-    """Returns the illuminance of the floor by all light except the beam of the sun, in one band.
-
-    Args:
-        field: light field of the band.
-        deep_m: depth at which the quadratic form applies.
-        depths_m: (n,) depths at which the change with depth is fitted.
-
-    Returns:
-        Quadratic form (4, 4) in (n, 1), with n the floor normal in the axes of the sun (see `_turn`), per lux at the
-        surface, and coefficients (2,) of its change with depth; see `FloorDaylight.rest_lx` and `rest_per_m`.
-    """
+    """Returns the illuminance of the floor by all light except the beam of the sun, in one band."""
     light = np.log([max(field.illuminance(z, z)[1], LEAST_LX) for z in depths_m])
     square, slope, level = np.polyfit(depths_m - deep_m, light, 2)
     form = field.slope_form(deep_m, deep_m)
@@ -106,12 +81,7 @@ def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, 
 
 
 class DaylightVeil:
-    """Daylight that the water scatters into the lines of sight of a camera, with any order of scattering.
-
-    Args:
-        daylight: sun, sky, water and depth of the cameras.
-        range_m: (n,) ranges at which the radiance is tabulated [m], increasing from 0; the last one may be infinite.
-    """
+    """Daylight scattered into the lines of sight of a camera, in any order, at ranges (n,) that increase from 0 [m]."""
 
     def __init__(self, daylight: Daylight, range_m: Array):
         self._depth_m, self._source, water = daylight.camera_depth_m, daylight.source, daylight.water
@@ -128,10 +98,8 @@ class DaylightVeil:
         """Returns the radiance (..., ranges, 3) [cd/m2] along lines of sight, in front of a black floor at each range.
 
         Args:
-            ray: (..., 3) unit directions of sight, east, north, up; those more than `LARGEST_VIEW_DEG` from straight
-                down get the radiance at that angle.
-            depth_m: depth of the camera below the surface; the radiance tabulated at the planned depth is scaled with
-                the attenuation of the illuminance there.
+            ray: (..., 3) unit directions, east, north, up; at most `LARGEST_VIEW_DEG` from straight down.
+            depth_m: depth of the camera; the tabulated radiance is scaled with the attenuation of the illuminance.
         """
         dark = np.zeros((*ray.shape[:-1], self._terms.shape[-1] // 4, 4), np.float32)
         return self.added_to(dark, ray, depth_m)[..., :3]
@@ -141,7 +109,6 @@ class DaylightVeil:
 
         Args:
             light: (..., ranges, 4) other light for R, G, B, and a zero [cd/m2].
-            ray, depth_m: see `radiance`.
         """
         out, size = np.empty_like(light), self._terms.shape[-1]
         fade = np.zeros(4, np.float32)
@@ -153,16 +120,7 @@ class DaylightVeil:
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _add_veil(terms, ray, towards_sun, fade, light, out):
-    """Fills `out` with the sum of `light` and the radiance of the veil, see `DaylightVeil.added_to`.
-
-    Args:
-        terms: (views, modes, k) azimuth series of the radiance; k is four times the number of ranges.
-        ray: (n, 3) unit directions of sight, east, north, up.
-        towards_sun: (2,) cosine and sine of the azimuth of the sun from east towards north.
-        fade: (4,) factors of the radiance for R, G, B, and a zero.
-        light: (n, k) other light.
-        out: (n, k) array to fill.
-    """
+    """Fills `out` with the sum of `light` and the radiance of the veil, see `DaylightVeil.added_to`."""
     views, modes, size = terms.shape
     per_rad = np.rad2deg(1.0) * (views - 1) / LARGEST_VIEW_DEG
     faded = np.empty(size, np.float32)
@@ -187,11 +145,7 @@ def _add_veil(terms, ray, towards_sun, fade, light, out):
 
 
 def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -> Array:
-    """Returns the radiance of the veil, per lux just below the surface, as an azimuth series [cd/m2 per lx].
-
-    Returns:
-        (modes, views, ranges, 3) terms of the series.
-    """
+    """Returns the radiance of the veil, per lux just below the surface, as an azimuth series [cd/m2 per lx]."""
     cosine = np.cos(np.deg2rad(np.linspace(0.0, LARGEST_VIEW_DEG, VIEW_STEPS)))
     share = np.linspace(0.0, 1.0, FLOOR_STEPS + 1)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -213,10 +167,7 @@ def _local_attenuation(field: LightField, depth_m: float) -> float:
 
 
 def _turn(source: SunSky) -> Array:
-    """Returns the rotation (4, 4) of (x, y, z, 1) from the axes of the sun to the axes east, north, up.
-
-    In the axes of the sun, x points horizontally towards the sun, y to the left of it, and z up.
-    """
+    """Returns the rotation (4, 4) of (x, y, z, 1) from the axes of the sun to the axes east, north, up."""
     east, north, _ = source.to_sun
     length = np.hypot(east, north)
     c, s = (east / length, north / length) if length > 0 else (1.0, 0.0)
@@ -225,13 +176,76 @@ def _turn(source: SunSky) -> Array:
     return out
 
 
-def _in_clear_water(source: SunSky) -> LightField:
-    """Returns the light field in water without absorption and scattering."""
-    return _field(Absorbed(0.0, 0.0, Scatterer("petzold")), source, 1)
-
-
 @lru_cache(maxsize=64)
 def _field(band: Absorbed, source: SunSky, modes: int) -> LightField:
     """Returns the light field of a band, with `modes` terms of its Fourier series in azimuth; the result is cached."""
     optics = BandOptics(band.absorption_per_m, band.scattering_per_m, table_of(band.scatterer))
     return LightField(optics, source, modes)
+
+
+_NO_CAUSTICS = np.zeros((0, 0), np.float32)
+#: Rows and columns of the terms of a quadratic form in (n, 1), in the order of the argument `sky` of `shading.shade`.
+_FIRST, _SECOND = np.array([[0, 1, 2, 0, 0, 1, 0, 1, 2, 3], [0, 1, 2, 1, 2, 2, 3, 3, 3, 3]])
+
+
+class Sky:
+    """Daylight on the floor, which `in_camera` returns in the axes of a camera.
+
+    Args:
+        loss_per_m: (2, 3) attenuation with range from the camera of the light of lamps and of daylight [1/m].
+    """
+
+    def __init__(self, daylight: FloorDaylight, loss_per_m: Array):
+        self._to_sun, self._rest_lx = daylight.to_sun, daylight.rest_lx
+        self._beam = np.stack([daylight.beam_lx, daylight.beam_per_m], 1).astype(np.float32)
+        self._change = np.ascontiguousarray(daylight.rest_per_m, np.float32)
+        self._fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m], np.float32)
+        self._loss_per_m = np.ascontiguousarray(loss_per_m, np.float32)
+
+    def in_camera(
+        self, from_camera: Array, caustics: NDArray[np.float32] | None, day_loss_per_m: Array | None = None
+    ) -> tuple:
+        """Returns the argument `sky` of `shading.shade`.
+
+        Args:
+            day_loss_per_m: (3,) attenuation of daylight with range from the camera [1/m]; None = that of `loss_per_m`.
+        """
+        to_sun, form = np.empty(3, np.float32), np.empty((len(self._rest_lx), len(_FIRST)), np.float32)
+        _turn_to_camera(world_axes(from_camera), self._to_sun, self._rest_lx, to_sun, form)
+        loss = self._loss_per_m
+        if day_loss_per_m is not None:
+            loss = np.stack([loss[0], day_loss_per_m.astype(np.float32)])
+        lines = _NO_CAUSTICS if caustics is None else caustics
+        return to_sun, self._beam, form, self._change, self._fitted, loss, lines, from_camera.astype(np.float32)
+
+
+@kernel(error_model="numpy")
+def world_axes(from_camera):
+    """Returns the unit vectors east, north and up in camera axes, as columns (3, 3); see `optics.WaterSurface`."""
+    axes = np.empty((3, 3))
+    for k in range(3):
+        x, y, z = from_camera[k, 0], from_camera[k, 1], from_camera[k, 2]
+        length = np.sqrt(x * x + y * y + z * z) * (-1 if k == 2 else 1)
+        axes[0, k], axes[1, k], axes[2, k] = x / length, y / length, z / length
+    return axes
+
+
+@kernel(error_model="numpy")
+def _turn_to_camera(axes, to_sun, rest_lx, sun, form):
+    """Fills `sun` (3,) with the direction to the sun, `form` (3, 10) with the quadratic form of `rest_lx`."""
+    turn, half = np.eye(4), np.empty((4, 4))
+    turn[:3, :3] = axes
+    for i in range(3):
+        sun[i] = axes[i, 0] * to_sun[0] + axes[i, 1] * to_sun[1] + axes[i, 2] * to_sun[2]
+    for band in range(rest_lx.shape[0]):
+        for i in range(4):
+            for j in range(4):
+                half[i, j] = 0.0
+                for k in range(4):
+                    half[i, j] += turn[i, k] * rest_lx[band, k, j]
+        for term in range(_FIRST.size):
+            i, j = _FIRST[term], _SECOND[term]
+            total = 0.0
+            for k in range(4):
+                total += half[i, k] * turn[j, k]
+            form[band, term] = total if i == j else 2 * total

@@ -1,14 +1,10 @@
 """Forward scatter: light of the floor, scattered on its way to the camera, arrives blurred.
 
-Of the light that is not absorbed, the fraction exp(-b r) arrives unscattered; the scattered light is blurred by a
-kernel with a sharp core and a long tail (`spread.camera_mixture`). The kernel is a mixture of Gaussians, the levels of
-an image pyramid: each level is about twice as wide as the one before, and its weight depends on band and range. The
-weights of a pixel are those of its own range: its ray receives light from the floor around it. The kernel is a function
-of angle. At the angle theta from the optical axis, a small angle covers more pixels by the factor k = 1 /
-cos(theta)^1.5, the geometric mean of 1 / cos^2 (radially) and 1 / cos (tangentially); therefore a fraction log2(k) of
-the light of each level moves to the next, wider level, except for the widest levels (`WIDENED_TAN`). Much of the tail
-lies outside the image. There the floor is taken to be the plane that fits the depth of the image, with the mean albedo
-of the image; the coarse levels of the pyramid cover it. The fine levels are mirrored at the borders of the image.
+The fraction exp(-b r) arrives unscattered; the rest is blurred by a kernel with a sharp core and a long tail
+(`spread.camera_mixture`), a mixture of the levels of an image pyramid with weights by band and range of the pixel. Off
+the axis a small angle covers k = 1 / cos(theta)^1.5 more pixels, so a fraction log2(k) of the light of each level moves
+to the next, except for the widest (`WIDENED_TAN`). Outside the image, the floor is the plane that fits the depth, with
+the mean albedo of the image.
 """
 
 from __future__ import annotations
@@ -22,9 +18,9 @@ from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
 from twin.core.row_parallel import in_row_bands
-from twin.imaging.light.pixel_sum import sum_of_entries
 from twin.imaging.light.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.light.spread import NODES_M, Absorbed, camera_mixture, over_path
+from twin.imaging.light.vector_math import sum_of_entries
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 
@@ -45,34 +41,23 @@ PLANE_STEP_PX = 8  # spacing of the pixels to whose depth the plane is fitted
 
 
 class Surroundings(NamedTuple):
-    """Coarse grid that covers the image and the floor around it.
+    """Coarse grid that covers the image and the floor around it."""
 
-    Args:
-        level: level of the image pyramid with the same pixel size as this grid.
-        pad: number of grid pixels before the first one of the image, in both directions.
-        shape: rows and columns of the grid.
-        focal_px: focal length in pixels of the grid; the optical axis is in its centre, within a quarter of a pixel.
-    """
-
-    level: int
-    pad: int
-    shape: tuple[int, int]
+    level: int  # level of the image pyramid with the same pixel size as this grid
+    pad: int  # number of grid pixels before the first one of the image, in both directions
+    shape: tuple[int, int]  # rows and columns of the grid
+    # focal length in pixels of the grid; the optical axis is in its centre, within a quarter of a pixel
     focal_px: float
 
 
 class ForwardScatter:
     """Blur of the light of the floor by scattering on its way to the camera.
 
-    Args:
-        rig: the rendered cameras.
-        water: optical properties of the water.
-
     Attributes:
         range_per_depth: range divided by depth of the pixels of the surroundings.
         surroundings: grid on which `add` expects the light of the floor around the image.
-        kept: (SHARE_STEPS + 1, 4) share of the light of the floor, attenuated by absorption alone, that arrives without
-            blur: the unscattered light and the core of the kernel, narrower than a pixel; for R, G, B and a zero, at
-            even steps of r / (r + RANGE_SCALE_M).
+        kept: (SHARE_STEPS + 1, 4) share of the light that arrives without blur (unscattered, or scattered by less than
+            a pixel), for R, G, B and a zero, at even steps of r / (r + RANGE_SCALE_M).
     """
 
     def __init__(self, rig: StereoRig, water: Medium):
@@ -96,12 +81,9 @@ class ForwardScatter:
         self._widening = _widening(rig, self.surroundings, self.range_per_depth, levels)
 
     def plane(self, depth: Depth) -> tuple[Depth, Place]:
-        """Returns the plane fitted to the floor in an image, on the grid `surroundings`.
+        """Returns depth [m] and fractional row of `kept` of the plane fitted to the floor, on the grid `surroundings`.
 
-        In an image of a plane, 1 / depth is linear in column and row.
-
-        Returns:
-            Depth (rows, cols) [m], inf beyond `FAR_M`, and the fractional row index (rows, cols) into `kept`.
+        In an image of a plane, 1 / depth is linear in column and row. Depths beyond `FAR_M` are inf.
         """
         shape = self.surroundings.shape
         plane, place = np.empty(shape, np.float32), np.empty(shape, np.float32)
@@ -109,16 +91,12 @@ class ForwardScatter:
         return plane, place
 
     def add(self, floor: Radiance, place: Place, around: tuple[Radiance, Place], light: Radiance) -> None:
-        """Adds the blurred light of the floor to `light` in place.
-
-        The core of the kernel is left out: `kept` includes it in the share that arrives without blur.
+        """Adds the blurred light of the floor, without the core of the kernel (see `kept`), to `light` in place.
 
         Args:
             floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
-            place: fractional row index into `kept` for every second pixel in both directions, see `place_of`.
-            around: light and fractional row index into `kept` of the surroundings; their pixels inside the image are
-                overwritten.
-            light: (H, W, 3) image to which the light is added.
+            place: fractional row of `kept` for every second pixel in both directions, see `place_of`.
+            around: light and fractional row of the surroundings; their pixels inside the image are overwritten.
         """
         grid = self.surroundings
         images: list[Radiance] = [np.asarray(cv2.pyrDown(floor), np.float32)]
@@ -145,21 +123,16 @@ class ForwardScatter:
         in_row_bands(lambda first, end: _add_upsampled(*finest, first, end), len(light))
 
     def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
-        """Returns all light (H, W, 3) of the floor that was scattered between floor and camera [cd/m2].
-
-        Args:
-            floor, around: see `add`.
-            range_m: (H, W) distance of the floor from the camera; inf is valid.
+        """Returns all light (H, W, 3) of the floor scattered between floor and camera [cd/m2], see `add`; a range of
+        inf is valid.
         """
         light = (floor * self.core(range_m)).astype(np.float32)
         self.add(floor, np.ascontiguousarray(place_of(range_m)[::2, ::2]), around, light)
         return light
 
     def core(self, range_m: Array) -> Array:
-        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel.
-
-        Args:
-            range_m: (H, W) distance of the floor from the camera; inf is valid.
+        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel; a range of inf is
+        valid.
         """
         place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
         return np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)
@@ -181,32 +154,16 @@ def level_sigma_px(level: int) -> float:
 
 @lru_cache(maxsize=64)
 def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
-    """Returns the weights of the pyramid levels in the kernel of the blur, at the ranges `NODES_M`.
+    """Returns the weights (levels + 1, 3, nodes) of the pyramid levels in the kernel of the blur at `NODES_M`.
 
-    Args:
-        bands: water in the bands R, G, B.
-        focal_px: focal length [px].
-        levels: number of levels of the pyramid.
-
-    Returns:
-        (levels + 1, 3, nodes) weights of the levels of the kernel of scattered light; level 0 is light scattered by
-        less than a pixel.
+    Level 0 is light scattered by less than a pixel.
     """
     sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))
     return np.array([camera_mixture(band, NODES_M, sigmas).T for band in bands]).swapaxes(0, 1)
 
 
 def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, range_m: Array) -> Array:
-    """Returns the weights (levels + 1, n, 3) of the levels of the kernel of scattered light.
-
-    Level 0 is light scattered by less than a pixel; unscattered light is not included.
-
-    Args:
-        bands: water in the bands R, G, B.
-        focal_px: focal length [px].
-        levels: number of levels of the pyramid.
-        range_m: (n,) ranges [m].
-    """
+    """Returns the weights (levels + 1, n, 3) of the levels of the kernel of scattered light at ranges (n,) [m]."""
     nodes = level_weights_of(bands, focal_px, levels)
     rows = [
         over_path(nodes[:, k], band.scattering_per_m, range_m) if band.scattering_per_m else nodes[:, k, :1] * range_m
@@ -246,10 +203,6 @@ def _moved(weights: Array, focal_px: float) -> Array:
 
     Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths; the last level
     does not count as narrow.
-
-    Args:
-        weights: (levels, n, 3) weights of the levels from 1.
-        focal_px: focal length.
     """
     leaves = np.array([level_sigma_px(k + 1) <= WIDENED_TAN * focal_px for k in range(len(weights))])
     leaves[-1] = False
@@ -265,16 +218,7 @@ def _tables(weights: Array, moved: Array) -> NDArray[np.float32]:
 
 
 def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int) -> list[Radiance]:
-    """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid.
-
-    Each element of the list has the shares (rows, cols) of the pixels of one level.
-
-    Args:
-        rig: the camera.
-        grid: grid of the surroundings, which the coarse levels cover.
-        per_depth: range divided by depth, 1 / cos(theta), on that grid.
-        levels: number of levels.
-    """
+    """Returns the share of the light of narrow levels that moves to the next level, for each level of the pyramid."""
     v, u = ((np.arange(0.0, n, 2) - (n - 1) / 2) / rig.focal_px for n in (rig.height_px, rig.width_px))
     secants = [np.sqrt(1 + v[:, None] ** 2 + u**2)]
     for level in range(2, levels + 1):
@@ -286,15 +230,7 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
 
 @kernel(error_model="numpy")
 def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
-    """Fills `plane` and `place` with the results of `ForwardScatter.plane`.
-
-    Args:
-        depth: (H, W) depth of the floor [m], of which every `PLANE_STEP_PX`-th pixel in both directions is used.
-        fit: (3, n) map from 1 / depth of those pixels to the coefficients of 1 / depth of the plane.
-        terms: (rows cols, 3) factors of the coefficients for each pixel of the grid.
-        range_per_depth: (rows, cols) range divided by depth of each pixel of the grid.
-        plane, place: (rows, cols) arrays to fill.
-    """
+    """Fills `plane` and `place` with the results of `ForwardScatter.plane`."""
     one, two, three, k = 0.0, 0.0, 0.0, 0
     for v in range(0, depth.shape[0], PLANE_STEP_PX):
         for u in range(0, depth.shape[1], PLANE_STEP_PX):
@@ -314,16 +250,7 @@ def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _weigh(image, place, table, widening, wider):
-    """Multiplies one level by its weights and adds the wider levels, in place.
-
-    Args:
-        image: (rows, cols, 3) light of the floor at this level.
-        place: (rows, cols) fractional row of `table` for each pixel.
-        table: (n, 8) weights of this level for R, G, B and a zero, then their change if all light of each narrow level
-            moves to the next one, and a zero.
-        widening: (rows, cols) share of the light that moves, for each pixel.
-        wider: (rows, cols, 3) weighted light of the wider levels.
-    """
+    """Multiplies one level by its weights and adds the wider levels, in place."""
     last, one = np.int32(table.shape[0] - 2), np.float32(1.0)
     flat, cols = table.reshape(-1), place.shape[1]
     cell, part = np.empty(cols, np.int32), np.empty(cols, np.float32)
@@ -348,11 +275,6 @@ def _add_upsampled(small, light, first, end):
 
     Along each axis, the filter of the even pixels is (1, 6, 1) / 8 and that of the odd pixels (1, 1) / 2. Rows before
     the first one are mirrored, and the last row is repeated. The same holds for columns.
-
-    Args:
-        small: (rows, 3 cols) image with rows = ceil(H / 2) and cols = ceil(W / 2).
-        light: (H, 3 W) image to which the upsampled image is added in place.
-        first, end: range of rows.
     """
     last, width = small.shape[0] - 1, light.shape[1] // 3
     cols = small.shape[1] // 3

@@ -16,29 +16,17 @@ Array = NDArray[np.float64]
 
 
 class Daylight(NamedTuple):
-    """Daylight in the bands R, G, B.
+    """Daylight in the bands R, G, B."""
 
-    Args:
-        surface_lx: (3,) illuminance just below the water surface, or on the floor if there is no surface.
-        illuminance_lx: (3,) illuminance on a horizontal plane at the planned altitude.
-        attenuation_per_m: (3,) diffuse attenuation with depth, Kd [1/m]; 0 where there is no surface.
-        reference_depth_m: depth of the reference plane z = 0 below the surface; 0 where there is no surface.
-        camera_depth_m: depth of the cameras below the surface at the planned altitude; 0 where there is no surface.
-        focused_share: fraction of the daylight that the surface waves focus into caustics.
-        source: direction to the sun under water, and share of the sky in the illuminance.
-        water: optical properties of the water, for daylight on the path from the surface and for its backscatter.
-        camera_loss_per_m: (3,) attenuation coefficient of daylight on the way from the floor to the camera [1/m].
-    """
-
-    surface_lx: Array
-    illuminance_lx: Array
-    attenuation_per_m: Array
-    reference_depth_m: float
-    camera_depth_m: float
-    focused_share: float
-    source: SunSky
-    water: Medium
-    camera_loss_per_m: Array
+    surface_lx: Array  # (3,) illuminance just below the water surface, or on the floor if there is no surface
+    illuminance_lx: Array  # (3,) illuminance on a horizontal plane at the planned altitude
+    attenuation_per_m: Array  # (3,) diffuse attenuation with depth, Kd [1/m]; 0 where there is no surface
+    reference_depth_m: float  # depth of the reference plane z = 0 below the surface; 0 where there is no surface
+    camera_depth_m: float  # depth of the cameras below the surface at the planned altitude; 0 where there is no surface
+    focused_share: float  # fraction of the daylight that the surface waves focus into caustics
+    source: SunSky  # direction to the sun under water, and share of the sky in the illuminance
+    water: Medium  # optical properties of the water, for daylight on the path from the surface and for its backscatter
+    camera_loss_per_m: Array  # (3,) attenuation coefficient of daylight on the way from the floor to the camera [1/m]
 
 
 class Illumination(NamedTuple):
@@ -51,11 +39,9 @@ class Illumination(NamedTuple):
 def illumination_of(scenario: Scenario) -> Illumination:
     """Returns the optical properties of a scenario's water, and the daylight in the water.
 
-    The absorption of a band is the effective one (`bands`) for the spectrum of the light and the length of its path.
-    For lamps, and for the blur of all light on the path to the camera, the path is twice the planned altitude: to the
-    floor and back. For daylight it is the slant path from the surface to the reference plane (the planned altitude
-    where there is no surface). The loss of daylight between floor and camera is chosen so that the transmission of a
-    band is exact for the whole path from the surface to the floor and up to the camera.
+    The absorption of a band is the effective one (`spectra`) for the light and its path: twice the planned altitude for
+    lamps and for the blur, the slant path from the surface to the reference plane for daylight. The loss of daylight
+    between floor and camera makes the transmission of the whole path exact.
 
     Raises:
         TwinError: the water is invalid (see `medium`), the planned altitude is not below the surface, or caustics are
@@ -76,9 +62,6 @@ def water_to_floor_and_back(scenario: Scenario) -> Medium:
     """Returns the optical properties of the water on a path from the planned altitude to the floor and back.
 
     The light is that of LED lamps; without lamps of an intensity above 0, it is daylight.
-
-    Raises:
-        TwinError: the water is invalid, see `medium`.
     """
     light = "led" if any(lamp.intensity_cd for lamp in scenario.lamps) else "daylight"
     return medium(scenario.water, scenario.imaging.scattering, path_m=2 * scenario.plan.altitude_m, light=light)
@@ -95,9 +78,6 @@ def daylight_at(
     """Returns the daylight for cameras at `altitude_m` above the reference plane, attenuated by the water above them.
 
     Args:
-        sun: sun, sky and depth.
-        water: optical properties of the water on the path from the surface.
-        altitude_m: planned altitude.
         absorption_from_floor_per_m: (3,) absorption coefficient between floor and camera; None: that of `water`.
 
     Raises:

@@ -4,10 +4,9 @@ A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular 
 
     (I(theta) exp(-c d) + S(theta, d)) / d^2,
 
-with c the attenuation. S is exp(-a d), with a the absorption, times the beam convolved with the kernel of
-`spread.lamp_mixture`: the scattered light is not lost, but makes the beam wider and its edge softer. In water without
-scattering, or with single scattering, S is 0. Light that the floor reflects and the water scatters back to it is
-neglected, and so are the shadows of the floor in scattered light.
+with c the attenuation and S = exp(-a d) times the beam convolved with the kernel of `spread.lamp_mixture`; S is 0 with
+single scattering. Light that floor and water send back to the floor is neglected, and so are shadows in scattered
+light.
 """
 
 from __future__ import annotations
@@ -38,10 +37,6 @@ class LampLight:
     """Light of the lamps on particles in the water, at points in the axes of one camera.
 
     See `floor_tables` for their light on the floor.
-
-    Args:
-        sources: lamps in the axes of the camera.
-        water: optical properties of the water.
     """
 
     def __init__(self, sources: LightSources, water: Medium):
@@ -53,12 +48,8 @@ class LampLight:
     def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
         """Returns the light (..., 3) of a lamp on particles for R, G, B [lx], and unit directions (..., 3) from it.
 
-        The light is the illuminance of a plane that faces the lamp, except that scattered light counts equally from all
-        directions. Distances below `LAMP_RADIUS_M` count as `LAMP_RADIUS_M`; there the directions are shorter than 1.
-
-        Args:
-            lamp: number of the lamp.
-            points: (..., 3) points in the axes of the camera [m].
+        It is the illuminance of a plane that faces the lamp; scattered light counts equally from all directions. Below
+        the distance `LAMP_RADIUS_M` the light is that at this distance, and the directions are shorter than 1.
         """
         sources, position, axis = self.sources, self.sources.position_m[lamp], self.sources.axis[lamp]
         strength = sources.intensity_cd[lamp] * sources.colour[lamp]
@@ -75,9 +66,7 @@ class LampLight:
         return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
 
     def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
-        """Returns the light (..., n, 3) that the water scatters into a ray to the camera, per metre of the ray [cd/m3].
-
-        Its loss on the way from these points to the camera is not included.
+        """Returns the light (..., n, 3) scattered into a ray to the camera, before its loss on the way [cd/m3].
 
         Args:
             points: (..., n, 3) points of the ray in the axes of the camera [m].
@@ -94,13 +83,8 @@ class LampLight:
 def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32] | None:
     """Returns the light of each lamp on a floor (lamps, 2, n, m, 4), relative to `LightSources.intensity_cd`.
 
-    Axes: lamp; scattered light S, which the floor is assumed not to block, then all light, I exp(-c d) + S; even steps
-    of sqrt(1 - cos(angle)) and of d / (d + RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. The result is None in water
-    without multiple scattering, and without lamps.
-
-    Args:
-        sources: lamps in the axes of a camera.
-        water: optical properties of the water.
+    Axes: lamp; scattered light S, then all light, I exp(-c d) + S; even steps of sqrt(1 - cos(angle)) and of d / (d +
+    RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. None in water without multiple scattering, and without lamps.
     """
     if not (water.scatters_repeatedly and len(sources.beam)):
         return None
@@ -113,16 +97,7 @@ def with_a_zero(table: Array) -> NDArray[np.float32]:
 
 
 def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array]:
-    """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`.
-
-    Args:
-        beam: (m, 2) beam table of the lamp.
-        water: optical properties of the water.
-        receiver: floor or particle that the light meets, which determines S.
-
-    Returns:
-        (ANGLE_STEPS + 1, PATH_STEPS + 1, 3) each, with the axes of `floor_tables`.
-    """
+    """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`."""
     at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
     low = np.minimum(at.astype(int), SOFT_STEPS - 1)
     coarse = _softened(beam, water, receiver)
@@ -133,10 +108,7 @@ def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array
 
 
 def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2).
-
-    S is relative to `LightSources.intensity_cd`; the axes are those of `floor_tables`.
-    """
+    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2)."""
     return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
 
 
@@ -161,11 +133,7 @@ def _path_m() -> Array:
 
 @lru_cache(maxsize=64)
 def _on_rings(beam: Beam) -> Array:
-    """Returns the means (SOFT_STEPS + 1, m) of a beam around each of n directions, weighted by each of m Gaussians.
-
-    The n = SOFT_STEPS + 1 directions are at even steps of sqrt(1 - cos(angle)) from the beam axis, 0 to 1; the standard
-    deviations of the Gaussians are `LAMP_SIGMA_RAD`.
-    """
+    """Returns the means (SOFT_STEPS + 1, m) of a beam around each of n directions, weighted by each of m Gaussians."""
     edges = np.concatenate([[0.0], np.geomspace(1e-3, np.pi, RINGS)])
     cosine = 1 - np.linspace(0.0, 1.0, SOFT_STEPS + 1)[:, None, None] ** 2
     azimuth = (np.arange(AZIMUTHS) + 0.5) / AZIMUTHS * np.pi
@@ -177,13 +145,7 @@ def _on_rings(beam: Beam) -> Array:
 
 @kernel(error_model="numpy", fastmath={"arcp", "contract"})
 def _from_table(points, position, axis, strength, table, lux, from_lamp):
-    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`.
-
-    Args:
-        position, axis: (3,) position [m] and unit beam axis of the lamp.
-        strength: (3,) intensity for R, G, B, to which `table` is relative [cd].
-        table: (n, m, 3) all light of the lamp, see `_light`.
-    """
+    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`."""
     rows, cols = table.shape[0] - 1, table.shape[1] - 1
     for k in range(points.shape[0]):
         x, y, z = points[k, 0] - position[0], points[k, 1] - position[1], points[k, 2] - position[2]

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.errors import TwinError
-from twin.imaging.light.bands import NM, band_weights
 from twin.imaging.light.illumination import Daylight
+from twin.imaging.light.spectra import NM, band_weights
 from twin.scenario.model import LampConfig
 
 Array = NDArray[np.float64]
@@ -29,23 +29,15 @@ _HC_PER_K = 0.014387769  # h c / k, second radiation constant [m K]
 
 
 class LightSources(NamedTuple):
-    """Light sources of one camera: the lamps in the axes of the camera, and the daylight.
+    """Light sources of one camera: the lamps in the axes of the camera, and the daylight."""
 
-    Args:
-        position_m: (n, 3) positions of the lamps [m].
-        axis: (n, 3) unit vectors of the beam axes of the lamps.
-        intensity_cd: (n,) luminous intensity of each lamp on its beam axis.
-        colour: (n, 3) factors of the intensity for R, G, B.
-        beam: for each lamp, (m, 2) angle from the beam axis [deg] and intensity relative to `intensity_cd`.
-        daylight: daylight in the water.
-    """
-
-    position_m: Array
-    axis: Array
-    intensity_cd: Array
-    colour: Array
+    position_m: Array  # (n, 3) positions of the lamps [m]
+    axis: Array  # (n, 3) unit vectors of the beam axes of the lamps
+    intensity_cd: Array  # (n,) luminous intensity of each lamp on its beam axis
+    colour: Array  # (n, 3) factors of the intensity for R, G, B
+    # for each lamp, (m, 2) angle from the beam axis [deg] and intensity relative to `intensity_cd`
     beam: tuple[Array, ...]
-    daylight: Daylight
+    daylight: Daylight  # daylight in the water
 
 
 def light_sources_in_camera(
@@ -54,9 +46,6 @@ def light_sources_in_camera(
     """Returns the lamps, which are fixed to the body, in the axes of a camera, with the daylight.
 
     Args:
-        rig: the cameras, with their pose in the axes of the body.
-        lamps: lamps in the axes of the body.
-        daylight: daylight, which is returned unchanged.
         camera: 0 left, 1 right.
 
     Raises:
@@ -90,30 +79,19 @@ def _beam(number: int, lamp: LampConfig) -> Array:
 
 
 def beam_share(cos_angle: Array, table: Array) -> Array:
-    """Returns the relative intensity of a lamp by its beam table.
-
-    It is 0 beyond the last angle of the table, and behind the lamp: at angles above 90 deg from the beam axis.
-
-    Args:
-        cos_angle: cosine of the angle from the beam axis, of any shape.
-        table: (m, 2) angle [deg] and relative intensity, interpolated linearly.
-    """
+    """Returns the relative intensity by a beam table (m, 2) of angle [deg] and share; 0 behind it and above 90 deg."""
     angle_deg = np.rad2deg(np.arccos(np.clip(cos_angle, -1.0, 1.0)))
     return np.where(np.asarray(cos_angle) < 0, 0.0, np.interp(angle_deg, *table.T, right=0.0))
 
 
 def colour(temperature_k: float) -> Array:
-    """Returns the intensities (3,) of a black body in R, G, B, relative to those of one at 6500 K with equal luminance.
-
-    Args:
-        temperature_k: colour temperature.
-    """
+    """Returns the intensities (3,) of a black body in R, G, B, relative to one at 6500 K with equal luminance."""
     power, white = _black_body(temperature_k), _black_body(WHITE_K)
     against_white = band_weights(white) @ (power / white)
     return against_white / (against_white @ LUMINANCE_SHARES)
 
 
 def _black_body(temperature_k: float) -> Array:
-    """Returns the power (n,) of a black body per wavelength at `bands.NM`, up to a factor (Planck 1901)."""
+    """Returns the power (n,) of a black body per wavelength at `NM`, up to a factor (Planck 1901)."""
     metres = NM * 1e-9
     return metres**-5 / np.expm1(_HC_PER_K / (metres * temperature_k))

@@ -1,18 +1,16 @@
 """Radiance of daylight in water with a flat surface, by the method of discrete ordinates, for one colour band.
 
-The water is homogeneous and lies between a surface, which reflects no upwelling light, and a black floor. With the
-depth z, the cosine mu of the angle of propagation from straight down and the azimuth from that of the sun's beam, the
-radiance is a cosine series in the azimuth whose terms L_m obey (Chandrasekhar 1960; Stamnes et al. 1988, Appl. Opt. 27,
-2502)
+The water is homogeneous, between a surface without internal reflection and a black floor. With the depth z, the cosine
+mu of the angle from straight down and the azimuth from the beam, the radiance is a cosine series in the azimuth whose
+terms L_m obey (Chandrasekhar 1960; Stamnes et al. 1988, Appl. Opt. 27, 2502)
 
     mu dL_m/dz = -c L_m + b integral h_m(mu, mu') L_m(mu') dmu' + beam,
     h_m = 1/2 sum_l (2 l + 1) chi_l P_l^m(mu) P_l^m(mu'),
 
-with chi_l the Legendre moments of the phase function, and P_l^m the associated Legendre functions multiplied by
-sqrt((l - m)! / (l + m)!). At the nodes of a quadrature this is a system of linear differential equations with constant
-coefficients, which is solved by eigenvectors. The forward peak counts as unscattered (delta-M+, Lin et al. 2018, J.
-Quant. Spectrosc. Radiat. Transf. 208, 140), and sunlight that is scattered once into the line of sight is computed with
-the phase function itself (Nakajima & Tanaka 1988, J. Quant. Spectrosc. Radiat. Transf. 40, 51).
+chi_l being the Legendre moments of the phase function, P_l^m the associated Legendre functions times sqrt((l - m)! / (l
++ m)!). At the nodes of a quadrature this is a linear system, solved by eigenvectors. The forward peak counts as
+unscattered (delta-M+, Lin et al. 2018, J. Quant. Spectrosc. Radiat. Transf. 208, 140); sunlight scattered once into the
+line of sight uses the phase function itself (Nakajima & Tanaka 1988, ibid. 40, 51).
 """
 
 from __future__ import annotations
@@ -38,17 +36,11 @@ _SLOPES = np.deg2rad(np.linspace(0.0, STEEPEST_DEG, 16)), np.deg2rad(np.linspace
 
 
 class BandOptics(NamedTuple):
-    """Optical properties of the water in one colour band.
+    """Optical properties of the water in one colour band."""
 
-    Args:
-        absorption_per_m: absorption coefficient a [1/m].
-        scattering_per_m: scattering coefficient b [1/m].
-        phase: table of the phase function.
-    """
-
-    absorption_per_m: float
-    scattering_per_m: float
-    phase: PhaseTable
+    absorption_per_m: float  # absorption coefficient a [1/m]
+    scattering_per_m: float  # scattering coefficient b [1/m]
+    phase: PhaseTable  # table of the phase function
 
 
 class _Scaled(NamedTuple):
@@ -60,24 +52,17 @@ class _Scaled(NamedTuple):
 
 
 class _Mode(NamedTuple):
-    """Solutions of one term of the series in azimuth.
+    """Solutions of one term of the series in azimuth."""
 
-    Args:
-        decay_per_m: (n,) eigenvalues.
-        down, up: (n, n) downwelling and upwelling parts of the decaying eigenvectors, as columns; the growing ones have
-            these parts exchanged.
-        beam_down, beam_up: (n,) particular solution at depth 0.
-        sky: (n,) radiance of the sky at the surface.
-        kernel: (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes, with P_l^m normalised as in `_legendre`.
-    """
-
-    decay_per_m: Array
+    decay_per_m: Array  # (n,) eigenvalues
+    # (n, n) downwelling and upwelling parts of the decaying eigenvectors, as columns; the growing ones have these parts
+    # exchanged
     down: Array
     up: Array
-    beam_down: Array
+    beam_down: Array  # (n,) particular solution at depth 0
     beam_up: Array
-    sky: Array
-    kernel: Array
+    sky: Array  # (n,) radiance of the sky at the surface
+    kernel: Array  # (orders l, n) products sqrt(2 l + 1) P_l^m at the nodes, with P_l^m normalised as in `_legendre`
 
 
 def legendre_moments(phase: PhaseTable, orders: int) -> Array:
@@ -94,12 +79,9 @@ def legendre_moments(phase: PhaseTable, orders: int) -> Array:
 
 
 class LightField:
-    """Radiance of daylight in water over a black floor, for 1 lx just below the surface.
+    """Radiance of daylight in water over a black floor, for 1 lx just below the surface, in `modes` terms of azimuth.
 
-    Args:
-        water: optical properties.
-        daylight: direction of the sun and share of the sky.
-        modes: number of terms of the series in azimuth; one is used for a sun at the zenith or without a beam.
+    One term is used for a sun at the zenith or without a beam.
     """
 
     def __init__(self, water: BandOptics, daylight: SunSky, modes: int):
@@ -115,24 +97,12 @@ class LightField:
         return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
-        """Returns the downwelling and the upwelling radiance without the beam [cd/m2].
-
-        Each is an array (modes, nodes): the terms of the series in azimuth at the nodes of the quadrature.
-
-        Args:
-            depth_m: depth below the surface.
-            floor_m: depth of the black floor.
-        """
+        """Returns the downwelling and the upwelling radiance without the beam, (modes, nodes) each [cd/m2]."""
         down, up = zip(*(self._at(mode, np.array([floor_m]), depth_m) for mode in self._modes), strict=True)
         return np.array(down)[:, 0], np.array(up)[:, 0]
 
     def illuminance(self, depth_m: float, floor_m: float) -> tuple[float, float]:
-        """Returns the illuminance of a horizontal plane by the beam and by all other light from above [lx].
-
-        Args:
-            depth_m: depth of the plane below the surface.
-            floor_m: depth of the black floor.
-        """
+        """Returns the illuminance of a horizontal plane at a depth by the beam and by all other light [lx]."""
         beam = self._daylight.beam_lx * self._daylight.sun_cosine * np.exp(-self.beam_per_m * depth_m)
         down, _ = self.scattered(depth_m, floor_m)
         return float(beam), float(2 * np.pi * (down[0] * self._weight * self._cosine).sum())
@@ -140,10 +110,9 @@ class LightField:
     def slope_form(self, depth_m: float, floor_m: float) -> Array:
         """Returns the light without the beam on a slope as a quadratic form (4, 4) of its normal [lx].
 
-        With the unit normal n in the axes x horizontally towards the sun, y to the left of x, and z up, the illuminance
-        is (n, 1) Q (n, 1)'. Q is fitted to floors of slopes up to `STEEPEST_DEG`, whose light follows from the moments
-        of the radiance and of Lambert's cosine (Ramamoorthi & Hanrahan 2001, J. Opt. Soc. Am. A 18, 2448); the
-        illuminance of a level floor, which has the weight `LEVEL_WEIGHT`, is almost exact.
+        With the unit normal n (x towards the sun, z up), the illuminance is (n, 1) Q (n, 1)'. Q is fitted to floors up
+        to `STEEPEST_DEG`, whose light follows from the moments of the radiance and of Lambert's cosine (Ramamoorthi &
+        Hanrahan 2001, J. Opt. Soc. Am. A 18, 2448); a level floor has the weight `LEVEL_WEIGHT`.
         """
         down, up = self.scattered(depth_m, floor_m)
         tilt, azimuth = (grid.ravel() for grid in np.meshgrid(*_SLOPES))
@@ -160,24 +129,14 @@ class LightField:
         return _fitted_form(np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), np.cos(tilt), light)
 
     def veil(self, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns the upwelling radiance at a depth, above black floors, as a cosine series in azimuth [cd/m2].
+        """Returns the upwelling radiance above black floors: azimuth series (modes, views, floors) [cd/m2].
 
-        Args:
-            depth_m: depth of the camera.
-            cosine: (views,) cosine of the angle between line of sight and straight down, above 0.
-            floor_m: (floors,) depths of the floor.
-
-        Returns:
-            (modes, views, floors) terms of the series.
+        `cosine` (views,) is that of the angle between line of sight and straight down, above 0; `floor_m` are depths.
         """
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 
     def _mode(self, m: int) -> _Mode:
-        """Returns the solutions for term m of the cosine series in azimuth, m from 0.
-
-        The size of the eigenvalue problem is halved by solving for sum and difference of downwelling and upwelling
-        radiance.
-        """
+        """Returns the solutions for term m of the cosine series in azimuth, m from 0."""
         c, b, chi = self._scaled
         mu, weight, order = self._cosine, self._weight, np.arange(m, ORDERS, dtype=np.float64)
         root = np.sqrt(2 * order + 1)[:, None]
@@ -202,11 +161,7 @@ class LightField:
         return _Mode(decay, down, up, z[: mu.size], z[mu.size :], sky, kernel)
 
     def _coefficients(self, mode: _Mode, floor_m: Array) -> Array:
-        """Returns the weights (floors, 2 n) of the decaying and growing eigenvectors, from the boundary conditions.
-
-        At the surface, the downwelling radiance is that of the sky. At each of the depths `floor_m`, the upwelling
-        radiance is 0.
-        """
+        """Returns the weights (floors, 2 n) of the decaying and growing eigenvectors, from the boundary conditions."""
         n, fade = mode.decay_per_m.size, np.exp(-mode.decay_per_m * floor_m[:, None])
         system = np.empty((floor_m.size, 2 * n, 2 * n))
         system[:, :n, :n], system[:, :n, n:] = mode.down, mode.up * fade[:, None]
@@ -256,14 +211,7 @@ class LightField:
         return (light + source * along / cosine).T
 
     def _exact_once(self, m: int, cosine: Array) -> Array:
-        """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0.
-
-        The light is given per metre of the line of sight [cd/m3].
-
-        Args:
-            m: number of the term, from 0.
-            cosine: (views,) cosine of the angle between line of sight and straight down.
-        """
+        """Returns term m (views,) of the azimuth series of sunlight scattered once into lines of sight at depth 0."""
         turns = 64
         azimuth = 2 * np.pi * (np.arange(turns) + 0.5) / turns
         mu0 = self._daylight.sun_cosine
@@ -279,9 +227,8 @@ class LightField:
 def _without_peak(water: BandOptics) -> _Scaled:
     """Returns the water without the forward peak of its phase function, a narrow Gaussian (delta-M+).
 
-    The peak has the moments f exp(-l^2 / (2 s^2)) of degree l, with f and s such that the remaining moments are 0 at
-    l = `ORDERS` and `ORDERS` + 1, i.e. reach 0 with slope 0. Moments that end with another slope (delta-M) cause
-    oscillations of the radiance, up to 6 % opposite the sun.
+    The peak has the moments f exp(-l^2 / (2 s^2)), with f and s such that the remaining moments reach 0 with slope 0 at
+    l = `ORDERS`; another slope (delta-M) makes the radiance oscillate by up to 6 %.
     """
     chi, b = legendre_moments(water.phase, ORDERS + 1), water.scattering_per_m
     peak = np.zeros(ORDERS)
@@ -294,10 +241,7 @@ def _without_peak(water: BandOptics) -> _Scaled:
 
 
 def _quadrature() -> tuple[Array, Array]:
-    """Returns cosines and weights of the quadrature nodes of one hemisphere.
-
-    They are Gauss-Legendre nodes, chosen separately outside and inside the cone in which the sky appears under water.
-    """
+    """Returns cosines and weights of the quadrature nodes of one hemisphere."""
     parts = []
     for n, low, high in ((NODES[0], 0.0, CRITICAL_COSINE), (NODES[1], CRITICAL_COSINE, 1.0)):
         x, w = np.polynomial.legendre.leggauss(n)
@@ -306,13 +250,7 @@ def _quadrature() -> tuple[Array, Array]:
 
 
 def _legendre(order: Array | int, m: int, cosine: Array) -> Array:
-    """Returns the associated Legendre function P_l^m times sqrt((l - m)! / (l + m)!), without the factor (-1)^m.
-
-    Args:
-        order: degree l.
-        m: order m.
-        cosine: argument of the function.
-    """
+    """Returns the associated Legendre function P_l^m times sqrt((l - m)! / (l + m)!), without the factor (-1)^m."""
     order = np.asarray(order, np.float64)
     return (-1.0) ** m * lpmv(m, order, cosine) / np.sqrt(poch(order - m + 1, 2 * m))
 
@@ -331,10 +269,7 @@ def _cosine_moment(order: int) -> float:
 
 
 def _fitted_form(x: Array, y: Array, z: Array, light: Array) -> Array:
-    """Returns the quadratic form (4, 4) of (x, y, z, 1) that best fits the illuminance (n,) of sloping floors.
-
-    x, y, z are the components (n,) of the unit normals of these floors. The form is symmetric in y, as is the light.
-    """
+    """Returns the quadratic form (4, 4) of (x, y, z, 1) that best fits the illuminance (n,) of sloping floors."""
     terms = np.stack([np.ones_like(z), z, x, z * z, x * z, x * x - y * y], 1)
     weight = np.where(z == 1, LEVEL_WEIGHT, 1.0)
     one, up, side, square, cross, across = np.linalg.lstsq(terms * weight[:, None], light * weight, rcond=None)[0]

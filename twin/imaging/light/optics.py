@@ -1,18 +1,15 @@
 """Image formation in water: light of the floor and backscatter of lamps and daylight.
 
-Radiance of a pixel that shows a floor of albedo rho at range r, for a camera and lamps on the same vehicle
-(Jaffe 1990, McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
+Radiance of a pixel that shows a floor of albedo rho at range r, for a camera and lamps on the same vehicle (Jaffe 1990,
+McGlamery 1979, in the form of Song et al. 2021, doi 10.1007/978-3-030-68790-8_29):
 
     L = rho/pi * (sum_i I_i(theta_i)/d_i^2 * max(cos, 0) * exp(-c d_i) + E_day) * exp(-c r)  +  B(r)
     B(r) = sum_i integral_0^r b p(psi_i) I_i(theta_i)/d_i^2 * exp(-c d_i) exp(-c s) ds  +  B_day(r)
 
-with I_i the intensity of lamp i at the angle theta_i from its beam axis, d_i the distance to the lamp, cos the cosine
-of the angle of incidence, E_day the illuminance by daylight and B_day its backscatter (`daylight`), psi_i the
-scattering angle at the distance s from the camera, p the phase function, a the absorption coefficient, b the scattering
-coefficient and c = a + b the attenuation (`water.Medium`). The model has no free scale factors. For lamps, these
-equations describe single scattering. With multiple scattering, light that is scattered on its way arrives too: that of
-the lamps as a softer beam (`lamp_light`), that of the floor as a blur (`forward_scatter`), and the backscatter consists
-of softened beams and is blurred (`backscatter`). Shadows and caustics are computed in other modules.
+with I_i the intensity of lamp i at the angle theta_i from its axis, d_i its distance, cos the cosine of incidence,
+psi_i the scattering angle at the distance s from the camera, E_day and B_day illuminance and backscatter of daylight
+(`daylight`), and a, b, c, p of `water.Medium`. With multiple scattering, scattered light arrives too: as a softer beam
+(`lamp_light`), a blur of the floor (`forward_scatter`) and blurred backscatter (`backscatter`).
 """
 
 from __future__ import annotations
@@ -28,13 +25,12 @@ from numpy.typing import NDArray
 from twin.core.records import Image, StereoRig
 from twin.core.row_parallel import in_row_bands
 from twin.imaging.light.backscatter import backscatter_table, grid_of, grid_rays, table_range_m
-from twin.imaging.light.daylight import DaylightVeil, floor_daylight
+from twin.imaging.light.daylight import DaylightVeil, Sky, floor_daylight, world_axes
 from twin.imaging.light.forward_scatter import ForwardScatter, Place
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.lamp_light import LampLight, floor_tables, with_a_zero
 from twin.imaging.light.lamps import LightSources, beam_share, light_sources_in_camera
 from twin.imaging.light.shading import shade
-from twin.imaging.light.sky import Sky, world_axes
 from twin.imaging.light.water import Medium
 from twin.imaging.scene.facets import FacetView
 from twin.imaging.scene.materials import Material
@@ -60,26 +56,18 @@ BEAM_STEPS = 2048  # number of steps of sqrt(1 - cos(angle)) from 0 to 1, which 
 
 
 class WaterSurface(NamedTuple):
-    """The water surface above a camera: its caustics, and its position relative to the camera.
+    """The water surface above a camera: its caustics, and its position relative to the camera."""
 
-    Args:
-        caustics: (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the
-            first row and column. None if daylight is uniform.
-        from_camera: (3, 4) map from a point in the camera axes to column and row in `caustics`, which grow towards east
-            and north, and depth below the surface [m].
-    """
-
+    # (n + 1, n + 1) daylight relative to its mean, n a power of two; the last row and column repeat the first row and
+    # column. None if daylight is uniform.
     caustics: NDArray[np.float32] | None
+    # (3, 4) map from a point in the camera axes to column and row in `caustics`, which grow towards east and north, and
+    # depth below the surface [m]
     from_camera: Array
 
 
 def calm_surface(world_from_camera: Array, reference_depth_m: float) -> WaterSurface:
-    """Returns the water surface above a camera without caustics, with columns and rows in metres east and north.
-
-    Args:
-        world_from_camera: (4, 4) pose of the camera.
-        reference_depth_m: depth below the surface of the plane z = 0 of the world.
-    """
+    """Returns the water surface above a camera without caustics, in metres east and north; see `WaterSurface`."""
     east, north, up = world_from_camera[:3]
     from_camera = np.array([east, north, -up])
     from_camera[2, 3] += reference_depth_m
@@ -87,71 +75,52 @@ def calm_surface(world_from_camera: Array, reference_depth_m: float) -> WaterSur
 
 
 class FloorView(NamedTuple):
-    """Properties of the floor that the shading of a camera needs besides its depth.
+    """Properties of the floor that the shading of a camera needs besides its depth."""
 
-    Args:
-        facets: triangles of the floor; None = the normals are computed from the depth.
-        lit: (lamps, H, W) uint8, 0 where floor or objects block the light of the lamp, else 1; the last one is for the
-            sun if it casts shadows; None = no shadows.
-        material: reflection of the unscattered light of lamps; None = Lambertian.
-        objects: normals of the pixels that show objects; None = the image shows the floor alone.
-    """
-
-    facets: FacetView | None = None
+    facets: FacetView | None = None  # triangles of the floor; None = the normals are computed from the depth
+    # (lamps, H, W) uint8, 0 where floor or objects block the light of the lamp, else 1; the last one is for the sun if
+    # it casts shadows; None = no shadows
     lit: Lit | None = None
-    material: Material | None = None
-    objects: ObjectView | None = None
+    material: Material | None = None  # reflection of the unscattered light of lamps; None = Lambertian
+    objects: ObjectView | None = None  # normals of the pixels that show objects; None = the image shows the floor alone
 
 
 class LightParts(NamedTuple):
-    """Parts of the light that reaches a camera, per colour band in photometric units [cd/m2]; (H, W, 3) float32 each.
+    """Parts of the light that reaches a camera, per band in photometric units [cd/m2]; (H, W, 3) float32 each."""
 
-    Args:
-        direct: light of the floor that was not scattered between floor and camera.
-        forward: light of the floor that was scattered between floor and camera; None without multiple scattering.
-        backscatter: light that the water scattered into the camera without reflection by the floor.
-    """
-
-    direct: Radiance
+    direct: Radiance  # light of the floor that was not scattered between floor and camera
+    # light of the floor that was scattered between floor and camera; None without multiple scattering
     forward: Radiance | None
-    backscatter: Radiance
+    backscatter: Radiance  # light that the water scattered into the camera without reflection by the floor
 
 
 class WhiteFloor(NamedTuple):
-    """Light of an image of a white floor, from which the light of a floor of any albedo follows.
+    """Light of an image of a white floor, from which the light of a floor of any albedo follows."""
 
-    Args:
-        floor: (H, W, 3) light of the white floor at the camera [cd/m2]. With multiple scattering, the path to the
-            camera attenuates it by absorption alone; otherwise by absorption and scattering.
-        backscatter: (H, W, 3) light that the water scatters into the camera [cd/m2].
-        unscattered: (H, W, 3) share of `floor` that is not scattered; ones (3,) without multiple scattering.
-        core: (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) without
-            multiple scattering.
-        spread: returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption
-            alone, and its albedo (H, W, 3), 1 = white; the floor around the image has the mean of this albedo. None
-            without multiple scattering.
-    """
-
+    # (H, W, 3) light of the white floor at the camera [cd/m2]. With multiple scattering, the path to the camera
+    # attenuates it by absorption alone; otherwise by absorption and scattering.
     floor: Radiance
-    backscatter: Radiance
-    unscattered: Array
+    backscatter: Radiance  # (H, W, 3) light that the water scatters into the camera [cd/m2]
+    unscattered: Array  # (H, W, 3) share of `floor` that is not scattered; ones (3,) without multiple scattering
+    # (H, W, 3) share of `floor` that is scattered, but not blurred by more than a pixel; zeros (3,) without multiple
+    # scattering
     core: Array
+    # returns the scattered light (H, W, 3) of the floor, given its light (H, W, 3) attenuated by absorption alone, and
+    # its albedo (H, W, 3), 1 = white; the floor around the image has the mean of this albedo. None without multiple
+    # scattering.
     spread: Callable[[Radiance, Radiance], Radiance] | None
 
 
 class _Tables(NamedTuple):
-    """Lookup tables of the shading kernel (`shading.shade`) for one camera.
+    """Lookup tables of the shading kernel (`shading.shade`) for one camera."""
 
-    Args:
-        beams: (lamps, n) intensity relative to `intensity_cd`, at equal steps of sqrt(1 - cos(angle)) in [0, 1].
-        soft: (lamps, 2, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; empty without multiple
-            scattering or without lamps.
-        backscatter: (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of
-            r / (r + `RANGE_SCALE_M`), with r the range; R, G, B and a zero.
-    """
-
+    # (lamps, n) intensity relative to `intensity_cd`, at equal steps of sqrt(1 - cos(angle)) in [0, 1]
     beams: NDArray[np.float32]
+    # (lamps, 2, n, m, 4) light of each lamp on the floor, see `lamp_light.floor_tables`; empty without multiple
+    # scattering or without lamps
     soft: NDArray[np.float32]
+    # (rows, cols, ranges, 4) radiance on a coarse pixel grid, at equal steps of r / (r + `RANGE_SCALE_M`), with r the
+    # range; R, G, B and a zero
     backscatter: NDArray[np.float32]
 
 
@@ -167,17 +136,9 @@ class _Output(NamedTuple):
 class Optics:
     """Model of the light that reaches each camera, for R, G, B.
 
-    Args:
-        rig: the rendered cameras.
-        illumination: water and daylight.
-        lamps: lamps on the vehicle.
-
     Attributes:
         light_sources: lamps and daylight in the axes of the left and of the right camera.
         lamp_light: light of the lamps in the water, in the axes of the left and of the right camera.
-
-    Raises:
-        TwinError: the beam table of a lamp is invalid, see `light_sources_in_camera`.
     """
 
     def __init__(self, rig: StereoRig, illumination: Illumination, lamps: Sequence[LampConfig]):
@@ -192,7 +153,8 @@ class Optics:
         self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.lamp_light[camera]))
         self._forward = ForwardScatter(rig, self._medium) if scatters else None
         # working memory of each camera, as both images may be computed at the same time
-        self._memory = cache(lambda camera: _working_memory(rig))
+        light_shape, half_shape = (rig.height_px, rig.width_px, 3), ((rig.height_px + 1) // 2, (rig.width_px + 1) // 2)
+        self._memory = cache(lambda camera: (np.empty(light_shape, np.float32), np.empty(half_shape, np.float32)))
         self._lamp_loss_per_m = self._medium.attenuation_per_m.astype(np.float32)
         loss_per_m = np.stack([self._medium.camera_loss_per_m, daylight.camera_loss_per_m])
         self._sky = Sky(floor_daylight(daylight), loss_per_m)
@@ -215,10 +177,9 @@ class Optics:
             albedo: (H, W, 3) uint8 albedo of the floor, 255 = white.
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor (backscatter only).
             camera: 0 left, 1 right.
-            floor: facets, shadows, material and objects; None = normals from the depth, no shadows, Lambertian, no
-                objects.
-            surface: the water surface; None = a calm surface, for a camera that points straight down at the planned
-                altitude, with east on its right.
+            floor: None = normals from the depth, no shadows, Lambertian, no objects.
+            surface: None = a calm surface above a camera that points straight down at the planned altitude, east on its
+                right.
         """
         out = np.empty(albedo.shape, np.float32)
         if self._forward is None:
@@ -249,11 +210,9 @@ class Optics:
     def floor_lx(
         self, depth: Depth, camera: int, floor: FloorView | None = None, surface: WaterSurface | None = None
     ) -> Radiance:
-        """Returns the illuminance of the floor (H, W, 3) [lx].
+        """Returns the illuminance of the floor (H, W, 3) [lx]; the arguments are those of `radiance`.
 
-        It is NaN where there is no floor, and where the transmission to the camera is `LEAST_TRANSMISSION` or less. It
-        is computed from the light of a white Lambertian floor, divided by the transmission from floor to camera. The
-        arguments are those of `radiance`.
+        It is NaN without floor, and where the transmission to the camera is `LEAST_TRANSMISSION` or less.
         """
         matt = None if floor is None else floor._replace(material=None)
         white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)
@@ -300,11 +259,7 @@ class Optics:
     def _floor_and_backscatter(
         self, albedo: Image, depth: Depth, camera: int, floor: FloorView | None, surface: WaterSurface | None
     ) -> tuple[Radiance, Radiance]:
-        """Returns the light of the floor at the camera and the backscatter [cd/m2].
-
-        The path to the camera attenuates the light of the floor by absorption alone with multiple scattering, otherwise
-        by absorption and scattering.
-        """
+        """Returns the light of the floor at the camera and the backscatter [cd/m2]."""
         light, backscatter = np.empty(albedo.shape, np.float32), np.empty(albedo.shape, np.float32)
         self._run((albedo, depth), camera, floor, surface, _Output(light, backscatter))
         return light, backscatter
@@ -319,16 +274,7 @@ class Optics:
         focal_px: float | None = None,
         day_loss_per_m: Array | None = None,
     ) -> None:
-        """Fills `out` by `shading.shade`.
-
-        Args:
-            image: albedo and depth.
-            camera, floor, surface: see `radiance`.
-            out: arrays to fill.
-            focal_px: focal length of the image of the surroundings, which gets no backscatter; None: the image is that
-                of `rig`, with backscatter.
-            day_loss_per_m: (3,) loss of daylight between floor and camera [1/m]; None: that of the illumination.
-        """
+        """Fills `out` by `shading.shade`."""
         albedo, depth = image
         focal = np.float32(focal_px or self._rig.focal_px)
         above = self._calm_surface if surface is None else surface
@@ -354,12 +300,6 @@ class Optics:
 def _or(value: Value | None, substitute: Value) -> Value:
     """Returns the value; the substitute if the value is None."""
     return substitute if value is None else value
-
-
-def _working_memory(rig: StereoRig) -> tuple[Radiance, Place]:
-    """Returns arrays for the light of the floor (H, W, 3), and for the argument `place` of `ForwardScatter.add`."""
-    shape = rig.height_px, rig.width_px
-    return np.empty((*shape, 3), np.float32), np.empty(((shape[0] + 1) // 2, (shape[1] + 1) // 2), np.float32)
 
 
 def range_of(depth: Depth, rig: StereoRig) -> Array:

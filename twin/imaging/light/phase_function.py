@@ -43,23 +43,15 @@ PETZOLD_INTEGRAL = 0.997385
 
 
 class PhaseTable(NamedTuple):
-    """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4).
+    """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4), narrow where it is steep.
 
-    The cells are narrow where the function is steep: with n = 4096, their width is 0.0017 deg at 0.1 deg and 0.017 deg
-    at 10 deg. The Monte Carlo reference evaluates and samples this piecewise constant function; `phase_at` interpolates
-    linearly between the centres of the cells.
-
-    Args:
-        density_per_sr: (n,) mean of the phase function over each cell.
-        cumulative: (n + 1,) share of the scattered light whose scattering angle is below each cell boundary.
-        cumulative_angle: (n + 1,) integral of density times angle up to each boundary, divided by `angle_integral`.
-        angle_integral: integral of density times angle from 0 to pi [rad^2/sr].
+    The Monte Carlo reference evaluates and samples this piecewise constant function.
     """
 
-    density_per_sr: Array
-    cumulative: Array
-    cumulative_angle: Array
-    angle_integral: float
+    density_per_sr: Array  # (n,) mean of the phase function over each cell
+    cumulative: Array  # (n + 1,) share of the scattered light whose scattering angle is below each cell boundary
+    cumulative_angle: Array  # (n + 1,) integral of density times angle up to each boundary, divided by `angle_integral`
+    angle_integral: float  # integral of density times angle from 0 to pi [rad^2/sr]
 
     @property
     def mean_cosine(self) -> float:
@@ -73,38 +65,21 @@ class PhaseTable(NamedTuple):
         angle = 2 * np.arcsin(np.linspace(0.0, 1.0, len(self.cumulative)) ** 2)
         return np.concatenate([np.cumsum((self.density_per_sr * np.diff(angle))[::-1])[::-1], [0.0]])
 
-    @property
-    def backscatter_fraction(self) -> float:
-        """Fraction of the scattered light that is scattered by more than 90 deg."""
-        boundary = 0.5**0.25 * (len(self.cumulative) - 1)
-        return 1 - float(np.interp(boundary, np.arange(len(self.cumulative)), self.cumulative))
-
 
 ParticleFunction = Literal["petzold", "fournier_forand", "henyey_greenstein"]
 
 
 class Scatterer(NamedTuple):
-    """Molecules and particles that scatter the light of one band.
+    """Molecules and particles that scatter the light of one band."""
 
-    Args:
-        particles: phase function of the particles.
-        molecular_share: share of the molecules in the scattering coefficient.
-        parameters: those of the phase function: index and slope (Fournier-Forand), mean cosine (Henyey-Greenstein).
-    """
-
-    particles: ParticleFunction = "petzold"
-    molecular_share: float = 0.0
+    particles: ParticleFunction = "petzold"  # phase function of the particles
+    molecular_share: float = 0.0  # share of the molecules in the scattering coefficient
+    # those of the phase function: index and slope (Fournier-Forand), mean cosine (Henyey-Greenstein)
     parameters: tuple[float, ...] = ()
 
 
 def molecular(angle: Array) -> Array:
-    """Returns the phase function of pure sea water [1/sr].
-
-    It is 0.06225 (1 + 0.835 cos(angle)^2) (Morel 1974; Mobley 1994, eq. 3.30).
-
-    Args:
-        angle: scattering angles of any shape [rad].
-    """
+    """Returns the phase function of pure sea water [1/sr] (Morel 1974; Mobley 1994, eq. 3.30)."""
     return 3 / (4 * np.pi * (3 + 0.835)) * (1 + 0.835 * np.cos(angle) ** 2)
 
 
@@ -116,11 +91,7 @@ def molecular_scattering_per_m(wavelength_nm: Array) -> Array:
 def petzold(angle: Array) -> Array:
     """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`.
 
-    The function is normalised to 1 over the sphere. Below the first angle of the table, it is extrapolated with the
-    slope of the first interval.
-
-    Args:
-        angle: scattering angles of any shape [rad].
+    It is normalised over the sphere, and extrapolated below the first angle with the slope of the first interval.
     """
     log_angle, log_density = np.log(np.deg2rad([row[0] for row in PETZOLD])), np.log([row[1] for row in PETZOLD])
     wanted = np.log(np.maximum(angle, 1e-12))
@@ -143,9 +114,7 @@ def henyey_greenstein(mean_cosine: float) -> PhaseFunction:
 def fournier_forand(index: float, slope: float) -> PhaseFunction:
     """Returns the phase function of Fournier & Forand (1994), in the form of Mobley et al. (2002, Appl. Opt. 41, 1035).
 
-    Args:
-        index: refractive index of the particles relative to water, above 1.
-        slope: exponent of the hyperbolic (Junge) size distribution, above 3 and below 5.
+    `index` of the particles relative to water is above 1, `slope` of the size distribution from 3 to 5.
     """
     nu = (3 - slope) / 2
 

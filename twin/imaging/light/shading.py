@@ -1,16 +1,13 @@
-"""Compiled kernels of `optics`: they process one row of pixels at a time, in loops that the compiler can vectorize.
+"""Compiled kernels of `optics`: one row of pixels at a time, in loops that the compiler can vectorize.
 
-A table lookup takes two loops over the row: the first computes the table cell and the fraction within the cell
-(`lookup`), the second reads the table. This lets the compiler vectorize the first loop. For the same reason, pixels of
-colour images are accessed in memory order.
+A table lookup takes two loops: the first computes the cell and the fraction within it (`lookup`), the second reads.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from twin.imaging.light.pixel_sum import sum_of_entries
-from twin.imaging.light.powers import LOG2_E, two_to
+from twin.imaging.light.vector_math import LOG2_E, sum_of_entries, two_to
 from twin.imaging.scene.facets import UNIT
 from twin.imaging.scene.materials import add_reflected
 from twin.kernels import kernel
@@ -31,40 +28,30 @@ def shade(
 ):  # fmt: skip
     """Computes the light of the floor and the backscatter in rows `first` to `end` - 1 of an image.
 
-    An empty array stands for an effect that the image does not have, so one compiled version serves all images without
-    a `material`; for `material` None, the compiler removes the code of materials. In the steps of the tables, r is the
-    range from the camera, and the scale is `RANGE_SCALE_M`.
+    An empty array stands for an effect that the image does not have, so that one compiled version serves all images;
+    for `material` None, the compiler removes the code of materials. In the steps of the tables, r is the range from the
+    camera, d the distance from a lamp, and the scale is `RANGE_SCALE_M`.
 
     Args:
         albedo: (H, W, 3) uint8, 255 = white.
         depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
-        focal: focal length [px].
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) relative intensity, at even steps of sqrt(1 - cos(angle)) from 0 to 1.
-        soft: (n, 2, k, l, 4) scattered light and all light of each lamp on the floor, relative to an isotropic lamp
-            of the same intensity in clear water, at even steps of sqrt(1 - cos(angle)) and, with d the distance from
-            the lamp, of d / (d + scale); empty with single scattering.
+        soft: (n, 2, k, l, 4) `lamp_light.floor_tables`; empty with single scattering.
         lamp_loss: (3,) attenuation of the unscattered light of lamps on its way to the floor [1/m].
         scatter_table: (rows, cols, ranges, 4) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
-        sky: tuple of the direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other
-            daylight (3, 10) [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the elements of
-            the quadratic form in the order xx, yy, zz, 2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and the
-            limits of the fit (3,) [m]; attenuation with range from the camera (2, 3) of lamp light and of daylight
-            [1/m]; caustics (m + 1, m + 1) or empty; (3, 4) map from a point in the camera axes to column and row in the
-            caustics and depth below the surface [m].
+        sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other daylight (3, 10)
+            [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the quadratic form as xx, yy,
+            zz, 2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and limits of the fit (3,) [m]; loss with range
+            (2, 3) of lamp light and daylight [1/m]; caustics (m + 1, m + 1) or empty; (3, 4) map from camera axes to
+            column and row of the caustics and depth [m].
         facets: triangles of the floor (`facets.FacetView`); without normals = normals from the depth.
-        lit: (n, H, W) or, with the sun, (n + 1, H, W) 0 where floor or objects block the light, else 1; empty =
-            no shadows.
-        material: reflection of the unscattered light of lamps (`materials.Material`); None = Lambertian.
-        objects: normals and labels of the pixels that show objects (`mesh_raster.ObjectView`); empty = no objects.
+        lit: (n, H, W), or (n + 1, H, W) with the sun: 0 where the light is blocked, else 1; empty = no shadows.
         out: (H, W, 3) image, filled with the light of the floor that reaches the camera.
-        other: (H, W, 3) image for the backscatter, to which the share `kept` of the light of the floor is added; if it
-            is empty, the backscatter is added to `out`.
-        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale); empty:
-            the light of the floor is not added to `other`.
-        place: array to fill with the fractional row of `kept` for every second pixel of every second row; not used if
-            `kept` is empty.
-        first, end: the rows `first` to `end` - 1 are computed.
+        other: (H, W, 3) image for the backscatter and the share `kept` of the floor; empty: backscatter goes to `out`.
+        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale), or
+            empty.
+        place: filled with the fractional row of `kept` for every second pixel of every second row.
     """
     height, width = depth.shape
     rows, cols, ranges, _ = scatter_table.shape
@@ -127,18 +114,10 @@ def shade(
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, range_m, normal):
-    """Computes range (W,) and normals (3, W) of the facets in a row of pixels.
+    """Computes range (W,) and normals (3, W) of the facets in a row of pixels, in the axes of the camera, upwards.
 
-    The normals are in the axes of the camera and point up in the world. A pixel that shows several facets gets the mean
-    of their unit normals at `SAMPLES`: the light of a matt facet is proportional to a component of its normal, so this
-    is the light of the whole area of the pixel. The points of the floor at the samples are those of the plane of the
-    facet at the centre of the pixel.
-
-    Args:
-        facets: `facets.FacetView`; its docstring defines the stored normals that are unpacked here.
-        cells: (n + 1, W) int32 working memory for the facet at each of the n `SAMPLES` and at the centre.
-        stored, mixed: (W,) int32 working memory.
-        work: (3, W) float32 working memory.
+    A pixel that shows several facets gets the mean of their normals at `SAMPLES`, on the plane of the central facet:
+    the light of a matt facet is proportional to a component of its normal.
     """
     normals, origin, grid, turn = facets
     zero, one, half, far = np.float32(0), np.float32(1), np.float32(0.5), np.float32(FAR_M)
@@ -185,16 +164,7 @@ def _range_and_facet_normal(facets, here, y, focal, cells, stored, mixed, work, 
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _cells_of_points(facets, floor, y, focal, shift, cells):
-    """Fills `cells` (W,) with the number of the facet that each pixel of a row shows at a point within the pixel.
-
-    Args:
-        facets: `facets.FacetView`.
-        floor: (W,) depth of the floor, and its relative decrease per pixel along the row and down.
-        y: ratio of y and depth at the centres of the pixels.
-        focal: focal length [px].
-        shift: column and row of the point, relative to the centre of the pixel [px].
-        cells: result; the first facet of cell (row, col) has the number 2 (row cols + col).
-    """
+    """Fills `cells` (W,) with the number of the facet that each pixel of a row shows at a point within the pixel."""
     normals, origin, grid, _ = facets
     z, along, down = floor
     rows, cols, _ = normals.shape
@@ -247,12 +217,7 @@ def _take_normals(objects, v, normal):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _range_and_normal(depth, v, y, focal, range_m, normal):
-    """Computes range (W,) and unit normals (3, W) of the floor in a row of pixels.
-
-    The normals point towards the camera. They are computed from the depth gradient, for a floor without facets. In each
-    direction, the smaller of the depth differences to the two neighbours is used, so a depth edge does not tilt the
-    normals next to it.
-    """
+    """Computes range (W,) and unit normals (3, W), towards the camera, from the depth of a floor without facets."""
     height, width = depth.shape
     one, half, beyond, far = np.float32(1.0), np.float32(0.5), np.float32(np.inf), np.float32(FAR_M)
     here, above, below = depth[v], depth[max(v - 1, 0)], depth[min(v + 1, height - 1)]
@@ -274,11 +239,10 @@ def _range_and_normal(depth, v, y, focal, range_m, normal):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _illuminate(lamp, here, y, focal, normal, out):
-    """Computes the illumination of the floor by a lamp for a row of pixels, without beam pattern and attenuation.
+    """Fills `out` (3, W) for a lamp without beam pattern and attenuation.
 
-    Fills `out` (3, W): row 0 with the illuminance that an isotropic lamp would cause in clear water, row 1 with
-    sqrt(1 - cos(angle from the beam axis)), row 2 with the distance from the lamp. Rows 0 and 1 are 0 and 1 where there
-    is no floor, where it faces away from the lamp, and more than 90 deg from the beam axis.
+    Rows: illuminance by an isotropic lamp in clear water; sqrt(1 - cos(angle from the beam axis)); distance. The first
+    two are 0 and 1 without floor, where it faces away, and more than 90 deg from the beam axis.
     """
     one, half, zero, far = np.float32(1.0), np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     x0, y0, z0, ax, ay, az, intensity = lamp[0], lamp[1], lamp[2], lamp[3], lamp[4], lamp[5], lamp[6]
@@ -301,11 +265,7 @@ def _illuminate(lamp, here, y, focal, normal, out):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
-    """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp.
-
-    `lamplight` (3, W) is the output of `_illuminate`; the light is attenuated on the path from lamp to floor with the
-    coefficients `per_m` (3,) [1/m].
-    """
+    """Adds to `light` (3, W) the illuminance by the unscattered light of a lamp."""
     steps, last = np.float32(beam.size - 1), np.int32(beam.size - 2)
     cell, _, share, _ = lookup
     for u in range(light.shape[1]):
@@ -323,11 +283,7 @@ def _add_lamp(lamp, beam, per_m, lamplight, lookup, light):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
-    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`.
-
-    `lamplight` (3, W) is the output of `_illuminate`. The unscattered light is included where `lit` (W,) is not 0, if
-    `direct`.
-    """
+    """Adds to `light` (3, W) the illuminance by a lamp, by bilinear interpolation of its table `soft`, see `shade`."""
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
     red, green, blue = lamp[7], lamp[8], lamp[9]
     _, n_rows, n_cols, _ = soft.shape
@@ -393,11 +349,9 @@ def _sample_caustics(here, y, focal, caustics, surface, lookup, share):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
-    """Computes the cosine of the angle between floor normal and sun, and the depth in water, for a row of W pixels.
+    """Fills row 1 of `daylight` (3, W) with row 0 times the cosine (at least 0) to the sun, row 2 with the depth [m].
 
-    Fills row 1 of `daylight` (3, W) with this cosine (at least 0) times row 0, and row 2 with the depth of the floor
-    below the water surface [m]. Row 0 is the daylight on the floor relative to its mean, see `_sample_caustics`; it is
-    0 in pixels without floor. The normals of these pixels are replaced by 0.
+    Row 0 is the daylight relative to its mean (`_sample_caustics`). The normals of pixels without floor become 0.
     """
     half, zero, far = np.float32(0.5), np.float32(0.0), np.float32(FAR_M)
     for u in range(here.size):
@@ -415,10 +369,7 @@ def _face_sun(here, y, focal, to_sun, surface, normal, daylight):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _add_daylight(sky, normal, range_m, daylight, light):
-    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera.
-
-    `daylight` (3, W) is that of `_face_sun`, with the sun's shadows in row 1.
-    """
+    """Adds to `light` (3, W) the daylight on the floor, attenuated on the path to the camera."""
     beam, diffuse, change, fitted, loss = sky
     per_m, zero = np.float32(LOG2_E), np.float32(0.0)
     level, low, high = fitted[0], fitted[1], fitted[2]
@@ -475,11 +426,7 @@ def _interpolate_backscatter(table, range_m, lookup, backscatter):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _reflect(albedo, light, backscatter, out):
-    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus `backscatter`.
-
-    For a floor of another material, `light` is daylight and the scattered light of the lamps; `backscatter` includes
-    the unscattered light of the lamps that the floor reflects.
-    """
+    """Fills `out` (W, 3) with the radiance of a Lambertian floor (an albedo of 255 is white) plus `backscatter`."""
     reflected = np.float32(1 / (255 * np.pi))
     white, filled = albedo.reshape(-1), out.reshape(-1)
     for u in range(out.shape[0]):

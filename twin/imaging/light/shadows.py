@@ -1,14 +1,9 @@
 """Shadows cast by the floor in the light of lamps and sun; they are visible because the lamps are not at the cameras.
 
-A point of the floor is in the shadow of a lamp if the straight ray to the lamp passes below the floor. The floor is the
-rendered surface: triangles over a grid of heights. The height of a triangle above a ray is greatest where the ray
-crosses one of its edges, so only edge crossings are tested, and only in blocks and in cells that are high enough to
-reach the ray.
-
-Not every pixel needs a ray. A shadow is cast by a crest, and the facets behind a crest face away from the lamp: a
-shadow therefore begins at such facets and is connected to them. Their pixels are marked dark without a ray. From them,
-and from every eighth pixel along rows and columns that is found dark, the shadows are completed by region growing: a
-ray is cast for every neighbour of a dark pixel.
+A point is in the shadow of a lamp if the ray to it passes below the floor, triangles over a grid of heights. The gap is
+least where the ray crosses an edge, so only edge crossings are tested, in blocks and cells high enough to reach it.
+Pixels of facets that face away are dark without a ray; from them, and from a grid of tested pixels, the shadows are
+completed by region growing.
 """
 
 from __future__ import annotations
@@ -19,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.grid_triangles import rises
 from twin.core.records import StereoRig
 from twin.core.row_parallel import in_row_bands
 from twin.imaging.light.illumination import Daylight
@@ -36,32 +32,21 @@ BIAS_M = 1e-4  # the floor must be this much higher than a ray to occlude it, as
 
 
 class _Grid(NamedTuple):
-    """Floor heights prepared for ray casting.
+    """Floor heights prepared for ray casting."""
 
-    Args:
-        height_m: (ny, nx) heights of the grid nodes; row 0 = south, column 0 = west.
-        cell_top_m: (ny - 1, nx - 1) height of the highest corner of each cell.
-        block_top_m: (rows, cols) height of the highest node of each block of cells.
-        west_m, south_m: position of the first node.
-        spacing_m: distance between neighbouring nodes.
-    """
-
-    height_m: NDArray[np.float32]
-    cell_top_m: NDArray[np.float32]
-    block_top_m: NDArray[np.float32]
-    west_m: float
+    height_m: NDArray[np.float32]  # (ny, nx) heights of the grid nodes; row 0 = south, column 0 = west
+    cell_top_m: NDArray[np.float32]  # (ny - 1, nx - 1) height of the highest corner of each cell
+    block_top_m: NDArray[np.float32]  # (rows, cols) height of the highest node of each block of cells
+    west_m: float  # position of the first node
     south_m: float
-    spacing_m: float
+    spacing_m: float  # distance between neighbouring nodes
 
 
 class Shadows:
     """Shadow casting: determines which pixels each lamp and the sun illuminate.
 
-    Args:
-        floor: heights of the floor.
-        rig: the rendered cameras.
-        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
-        to_sun: (3,) unit direction to the sun in the axes of the floor; None = no sun, or one that casts no shadow.
+    Lamps (lamps, 3) are in the axes of the left and right camera, `to_sun` (3,) in those of the floor; None = no
+    shadow.
     """
 
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None = None):
@@ -70,14 +55,11 @@ class Shadows:
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
-        """Returns masks (lamps, H, W) uint8: 0 where the floor occludes the lamp, else 1 (also without floor).
-
-        If the sun casts shadows, a mask of the sun follows those of the lamps.
+        """Returns masks (lamps, H, W), and one of the sun if it casts shadows: 0 where the floor occludes the light.
 
         Args:
             depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
-            world_from_camera: (4, 4) pose of this camera.
-            camera: 0 left, 1 right.
+            world_from_camera: (4, 4) pose of this camera, 0 left or 1 right.
             label: (H, W) not 0 where the pixel shows an object above the floor; None: all show the floor.
         """
         lamps = geometry.transform(world_from_camera, self._lamps[camera])
@@ -109,12 +91,7 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 
 @kernel(error_model="numpy")
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
-    """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W).
-
-    The mark is DARK where facets face away from the lamp, CLEAR without floor, else OPEN (rays decide, see
-    `_grow_shadows`). Pixels that show an object, i.e. whose `label` is not 0, are OPEN; without objects, `label` is
-    None.
-    """
+    """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W)."""
     height, _, _, west, south, spacing = grid
     width, cols = depth.shape[1], height.shape[1]
     points, parts, cells = np.empty((3, width)), np.empty((2, width)), np.empty(width, np.int32)
@@ -135,16 +112,7 @@ def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
 
 @kernel(error_model="numpy")
 def _find_floor(here, y, focal, pose, there, east, north, up):
-    """Fills the positions in the world of the points that the pixels of a row show.
-
-    Args:
-        here: (W,) depths of the pixels [m]; infinite where a pixel shows no floor.
-        y: row coordinate of the pixels on the image plane at depth 1.
-        focal: focal length [px].
-        pose: (4, 4) world_from_camera.
-        there: (W,) filled with whether each pixel shows the floor.
-        east, north, up: (W,) filled with the positions [m].
-    """
+    """Fills the positions in the world of the points that the pixels of a row show."""
     a, b, c = pose[0, 0], pose[0, 1] * y + pose[0, 2], pose[0, 3]
     d, e, f = pose[1, 0], pose[1, 1] * y + pose[1, 2], pose[1, 3]
     g, h, i = pose[2, 0], pose[2, 1] * y + pose[2, 2], pose[2, 3]
@@ -159,10 +127,7 @@ def _find_floor(here, y, focal, pose, there, east, north, up):
 
 @kernel(error_model="numpy")
 def _find_cells(at, start, spacing, n, part, cells, stride, is_first):
-    """Computes the grid cells of positions (w,) along an axis of n nodes, and the fractional positions in the cells.
-
-    The number of the cell, times `stride`, is added to `cells`, or replaces its values if `is_first`.
-    """
+    """Computes the grid cells of positions (w,) along an axis of n nodes, and the fractional positions in the cells."""
     per_m, last = 1 / spacing, n - 2.0
     for u in range(at.size):
         x = (at[u] - start) * per_m
@@ -179,9 +144,7 @@ def _find_rises(height, cols, part_x, part_y, cells, to_east, to_north):
         m = k + np.uint32(cols)
         south_west, south_east = height[k], height[k + np.uint32(1)]
         north_west, north_east = height[m], height[m + np.uint32(1)]
-        is_south_east = part_x[u] >= part_y[u]
-        to_east[u] = south_east - south_west if is_south_east else north_east - north_west
-        to_north[u] = north_east - south_east if is_south_east else north_west - south_west
+        to_east[u], to_north[u] = rises(south_west, south_east, north_west, north_east, part_x[u], part_y[u])
 
 
 @kernel(error_model="numpy")
@@ -196,11 +159,7 @@ def _face_lamp(lamp, spacing, east, north, up, to_east, to_north, there, out):
 
 @kernel(error_model="numpy")
 def _grow_shadows(grid, depth, focal, pose, lamps, out, first, end):
-    """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing.
-
-    A ray is cast for each OPEN pixel of a grid with the spacing `STRIDE_PX`, and for each OPEN neighbour of a DARK
-    pixel. In the completed masks, 0 is dark and 1 is lit.
-    """
+    """Completes the shadow masks of the lamps `first` to `end` - 1 by region growing."""
     height, width = depth.shape
     stack = np.empty(height * width, np.int32)
     for k in range(first, end):
@@ -260,11 +219,7 @@ def _cast(grid, depth, focal, pose, lamp, v, u):
 
 @kernel(error_model="numpy", inline="always")
 def _grid_steps(at, along, cell, size):
-    """Prepares the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart.
-
-    Returns:
-        Step of the cell index (-1, 0 or 1), t at the next grid line, and increment of t from line to line.
-    """
+    """Prepares the grid traversal of a ray `at + t * along` in one dimension, for grid lines `size` apart."""
     if along == 0:
         return 0, np.inf, np.inf
     per_along = 1 / along

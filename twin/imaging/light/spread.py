@@ -1,25 +1,18 @@
 """Multiple scattering of light near its straight path, as mixtures of Gaussians: the spread of a beam, and of an image.
 
-A lamp lights a point at the distance d. In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), the light
-that arrives is the beam convolved, in the angle at the lamp, with a kernel whose Hankel transform at the angular
-frequency k is
+In small-angle theory (Wells 1969; 1973, AGARD Lecture Series 61), the light of a lamp at the distance d is the beam
+convolved, in the angle at the lamp, with a kernel of the Hankel transform
 
     exp(-a d - b d (1 - K(k))),
 
-with a and b the absorption and scattering coefficients of the water, and K the transform of the kernel of light
-scattered once, per b d. The kernel of an image is that of a beam with the path reversed. Here K is not approximated by
-small angles, but exact for light scattered once, also at wide angles: with t the scattering angle, and alpha and beta
-the angles at the point and at the lamp of the triangle lamp, scattering, point (alpha + beta = t), the volume element
-divided by both squared distances is d(alpha) d(beta) d(azimuth) / d, so that
+K being that of light scattered once, per b d; the kernel of an image is that of the reversed path. Here K is exact for
+single scattering at any angle: with the scattering angle t = alpha + beta, alpha at the point and beta at the lamp,
 
     k1(beta) = integral over t > beta of p(t) g(t - beta) exp(-a d (path / d - 1)),  per d(beta) d(azimuth),
 
-with path / d = (sin(alpha) + sin(beta)) / sin(t). g is the response of the point to light that arrives at the angle
-alpha from the straight path: the cosine for a floor, 1 for a particle in the water. The integral of the kernel is below
-1 for a floor, as light scattered by wide angles misses it or is absorbed on its longer path.
-
-For a camera that views a floor at the range r, a ray of the camera is scattered by the angle t at the distance u r and
-meets the floor at tan(beta) = (1 - u) tan(t); its weight is p(t) sin(t), reduced by absorption on the excess path.
+with path / d = (sin(alpha) + sin(beta)) / sin(t), and g(alpha) the cosine for a floor, 1 for a particle. For a camera
+at the range r, a ray scattered by t at u r meets the floor at tan(beta) = (1 - u) tan(t), with the weight p(t) sin(t)
+and absorption on the excess path.
 """
 
 from __future__ import annotations
@@ -50,30 +43,19 @@ LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
 
 
 class Absorbed(NamedTuple):
-    """Optical properties of the water in one band, for the kernels of scattered light.
+    """Optical properties of the water in one band, for the kernels of scattered light."""
 
-    Args:
-        absorption_per_m: absorption coefficient a [1/m].
-        scattering_per_m: scattering coefficient b [1/m].
-        scatterer: molecules and particles that scatter the light.
-    """
-
-    absorption_per_m: float
-    scattering_per_m: float
-    scatterer: Scatterer
+    absorption_per_m: float  # absorption coefficient a [1/m]
+    scattering_per_m: float  # scattering coefficient b [1/m]
+    scatterer: Scatterer  # molecules and particles that scatter the light
 
 
 @lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
 def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
-    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), as a mixture of Gaussians.
+    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), at distances (n,) [m].
 
-    Args:
-        water: one band of the water.
-        distances_m: (n,) distances from the lamp.
-        receiver: where the light arrives, on a floor or on a particle in the water.
-
-    Returns:
-        (n, m) weights of normalised Gaussians in the angle at the lamp, with the standard deviations `LAMP_SIGMA_RAD`.
+    The result is the weights (n, m) of normalised Gaussians of standard deviations `LAMP_SIGMA_RAD`, in the angle at
+    the lamp.
     """
     rings = _rings(np.pi)
     once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
@@ -82,27 +64,16 @@ def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Rece
 
 @lru_cache(maxsize=64)
 def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
-    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), as a mixture of Gaussians.
+    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), at ranges (n,) [m].
 
-    Args:
-        water: one band of the water.
-        ranges_m: (n,) ranges of the floor.
-        sigmas: (m,) standard deviations of the Gaussians, as tangents; 0 is light that is not blurred.
-
-    Returns:
-        (n, m) weights of normalised Gaussians.
+    The result is the weights (n, m) of normalised Gaussians of standard deviations `sigmas` (tangents; 0 is no blur).
     """
     once = np.array([_camera_rings(water, r) for r in ranges_m])
     return _mixtures(once, _rings(MOST_TAN), water.scattering_per_m * np.array(ranges_m), np.array(sigmas))
 
 
 def ring_shares(edges: Array, sigmas: Array) -> Array:
-    """Returns the share (n, m) of each normalised Gaussian that lies in each of n rings.
-
-    Args:
-        edges: (n + 1,) edges of the rings.
-        sigmas: (m,) standard deviations of the Gaussians.
-    """
+    """Returns the share (n, m) of m normalised Gaussians in each of n rings with edges (n + 1,)."""
     beyond = np.exp(-(edges[:, None] ** 2) / (2 * sigmas**2))
     return beyond[:-1] - beyond[1:]
 
@@ -162,12 +133,7 @@ def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array
 
 @cache
 def _camera_geometry() -> tuple[Array, Array, Array]:
-    """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera.
-
-    Returns:
-        Index of the ring of tan(beta), and excess length of the scattered path over the straight one, divided by the
-        range, each (STEPS, ANGLES) over u and t; solid angles (ANGLES,) of the cells of t [sr].
-    """
+    """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera."""
     edges = _rings(np.pi / 2 * 0.999)
     t = _middle(edges)
     u = (np.arange(STEPS) + 0.5)[:, None] / STEPS
@@ -179,11 +145,7 @@ def _camera_geometry() -> tuple[Array, Array, Array]:
 
 
 def _camera_rings(water: Absorbed, range_m: float) -> Array:
-    """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r).
-
-    There is one value per ring of tan(beta), where beta is the angle at the camera between the point of the floor and
-    the pixel's ray. r is the range; a and b are absorption and scattering coefficient of the water.
-    """
+    """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r)."""
     ring, excess, solid = _camera_geometry()
     density = phase_at((water.scatterer,), np.cos(_middle(_rings(np.pi / 2 * 0.999))))[:, 0] * solid
     light = density / STEPS * np.exp(-water.absorption_per_m * range_m * excess)
@@ -194,12 +156,6 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
     """Returns the weights (n, m) of the Gaussians for light that is scattered at least once.
 
     The transform of that light, exp(-t) (exp(t K) - 1), is fitted by Gaussians with weights of 0 or more.
-
-    Args:
-        once: (n, rings) light scattered once in each ring, per optical thickness of scattering.
-        edges: (rings + 1,) edges of the rings.
-        thickness: (n,) optical thickness of scattering t.
-        sigmas: (m,) standard deviations of the Gaussians.
     """
     k = _frequencies(float(sigmas[sigmas > 0].min()), float(sigmas.max()))
     transform = once @ _ring_transforms(k, edges).T
@@ -212,13 +168,7 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
 
 
 def _fit(basis: Array, wanted: Array) -> Array:
-    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel.
-
-    Args:
-        basis: (frequencies, m) transforms of the Gaussians; the first row, at frequency 0, is multiplied by
-            `WEIGHT_OF_TOTAL`, so that the integral is fitted best.
-        wanted: (frequencies,) transform of the kernel.
-    """
+    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel."""
     total = wanted[0]
     if total <= 0:
         return np.zeros(basis.shape[1])
@@ -228,12 +178,7 @@ def _fit(basis: Array, wanted: Array) -> Array:
 
 
 def _frequencies(least: float, most: float) -> Array:
-    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least.
-
-    Args:
-        least, most: smallest and largest standard deviation of the Gaussians; the frequencies are in radians per unit
-            of these.
-    """
+    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least."""
     return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
 
 

@@ -1,9 +1,7 @@
 """Sun and sky above a level water surface: refracted direction of the sun, and radiance of the sky under water.
 
-A ray from the zenith angle t in air continues under water at the angle w with sin t = n sin w (Snell). The whole sky
-therefore appears within a cone around the zenith whose half angle is the critical angle of 48 deg (Snell's window). A
-sky of uniform radiance L appears in it with the radiance n^2 T(t) L, T being the Fresnel transmittance for unpolarised
-light (Mobley 1994, section 4.2; the n^2 law of radiance).
+A ray from the zenith angle t continues at w with sin t = n sin w (Snell), so the sky appears within 48 deg of the
+zenith. A uniform sky of radiance L has there n^2 T(t) L, T being the Fresnel transmittance (Mobley 1994, section 4.2).
 """
 
 from __future__ import annotations
@@ -21,15 +19,10 @@ CRITICAL_COSINE = float(np.sqrt(1 - 1 / SEA_WATER_INDEX**2))  # cosine of the ed
 
 
 class SunSky(NamedTuple):
-    """Daylight just below the surface, for an illuminance of 1 lx on the horizontal plane.
+    """Daylight just below the surface, for an illuminance of 1 lx on the horizontal plane."""
 
-    Args:
-        to_sun: (3,) unit direction to the refracted sun, east, north, up.
-        sky_share: share of the illuminance that is light of the sky; the rest is the beam of the sun.
-    """
-
-    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    sky_share: float = 0.0
+    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)  # (3,) unit direction to the refracted sun, east, north, up
+    sky_share: float = 0.0  # share of the illuminance that is light of the sky; the rest is the beam of the sun
 
     @property
     def sun_cosine(self) -> float:
@@ -48,11 +41,9 @@ class SunSky(NamedTuple):
 
 
 def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, float, float]:
-    """Returns the unit direction (east, north, up) to the sun as it appears under water.
+    """Returns the unit direction (east, north, up) to the sun under water, given its elevation and azimuth in air.
 
-    Args:
-        elevation_deg: elevation of the sun above the horizon, in air.
-        azimuth_deg: direction to the sun, counter-clockwise from x (east).
+    The azimuth is counter-clockwise from x (east).
     """
     sine = np.cos(np.deg2rad(elevation_deg)) / SEA_WATER_INDEX if elevation_deg < 90 else 0.0
     east, north = sine * np.cos(np.deg2rad(azimuth_deg)), sine * np.sin(np.deg2rad(azimuth_deg))
@@ -60,19 +51,12 @@ def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, f
 
 
 def sky_radiance(cosine: Array) -> Array:
-    """Returns the radiance [cd/m2] under water of a uniform sky that causes 1 lx just below the surface.
-
-    Args:
-        cosine: cosine of the zenith angle under water, of any shape; the sky is dark beyond the critical angle.
-    """
+    """Returns the radiance [cd/m2] under water of a uniform sky of 1 lx at a cosine of the zenith angle."""
     return _transmitted(cosine) / _SKY_LX
 
 
 def _transmitted(cosine: Array) -> Array:
-    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water.
-
-    It is 0 beyond the critical angle.
-    """
+    """Returns the Fresnel transmittance from air to water at the cosine of the angle in water."""
     under = np.asarray(cosine, np.float64)
     above = np.sqrt(np.maximum(1 - SEA_WATER_INDEX**2 * (1 - under**2), 0.0))
     inside = (under > 0) & (above > 0)
@@ -83,11 +67,7 @@ def _transmitted(cosine: Array) -> Array:
 
 
 def _sky_moments() -> tuple[float, float]:
-    """Returns the illuminance by a sky, and the ratio of its scalar illuminance to this illuminance.
-
-    The radiance of the sky just below the surface equals the transmittance [cd/m2]; the illuminance is that of a
-    horizontal plane [lx].
-    """
+    """Returns the illuminance by a sky, and the ratio of its scalar illuminance to this illuminance."""
     # the nodes are those of the cosine in air, which removes the root at the edge of the cone
     x, w = np.polynomial.legendre.leggauss(64)
     above = (x + 1) / 2

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 
 from twin.core.user_files import reading
 from twin.errors import TwinError
-from twin.imaging.light.bands import CENTRE_NM, NM, band_weights, effective_per_m
-from twin.imaging.light.light_spectra import Light, spectrum_of
 from twin.imaging.light.phase_function import Scatterer, molecular_scattering_per_m
+from twin.imaging.light.spectra import CENTRE_NM, NM, Light, band_weights, effective_per_m, spectrum_of, water_spectrum
 from twin.imaging.light.spread import Absorbed
-from twin.imaging.light.water_tables import water_spectrum
 from twin.scenario.model import ScatteringModel, WaterConfig
 
 Array = NDArray[np.float64]
@@ -25,18 +23,13 @@ MAX_SPECTRUM_BYTES = 10_000_000
 
 
 class Medium(NamedTuple):
-    """Optical properties of the water in the bands R, G, B.
+    """Optical properties of the water in the bands R, G, B."""
 
-    Args:
-        absorption_per_m: (3,) absorption coefficient a [1/m].
-        scattering_per_m: (3,) scattering coefficient b [1/m].
-        scatterers: for each band, phase function of the particles and molecular share of b.
-        multiple: whether multiple scattering is modelled; else all light that is scattered from its path is lost.
-    """
-
-    absorption_per_m: Array
-    scattering_per_m: Array
+    absorption_per_m: Array  # (3,) absorption coefficient a [1/m]
+    scattering_per_m: Array  # (3,) scattering coefficient b [1/m]
+    # for each band, phase function of the particles and molecular share of b
     scatterers: tuple[Scatterer, ...] = (Scatterer(),) * 3
+    # whether multiple scattering is modelled; else all light that is scattered from its path is lost
     multiple: bool = True
 
     @property
@@ -67,15 +60,12 @@ def medium(
     """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
 
     Args:
-        water: the water of a scenario.
         scattering: `imaging.scattering`; with "none", the water does not scatter.
-        path_m: path length of the light for which the effective absorption of each band is computed [m]; 0: mean
-            absorption of the band.
-        light: light whose spectrum weights absorption and scattering in a band.
+        path_m: path of the light for the effective absorption [m]; 0: mean absorption of the band.
 
     Raises:
         TwinError: absorption or scattering is missing or given twice, the spectrum cannot be read (`read_spectrum`), or
-            there is no spectrum of the water type or the light (`water_spectrum`, `spectrum_of`).
+            there is no spectrum of the water type or the light.
     """
     absorption, per_m = _coefficients(water, path_m, light)
     per_m = per_m * (water.turbidity if scattering != "none" else 0.0)
@@ -83,14 +73,9 @@ def medium(
 
 
 def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, ...]:
-    """Returns the phase function of the particles and the molecular share of each band.
+    """Returns the phase function of the particles and the molecular share of each band, given b (3,) [1/m].
 
-    With the phase function "sea", the molecular scattering coefficient is that of pure sea water (Morel 1974), at most
-    b, and the rest of b is due to particles; otherwise all scattering is due to particles.
-
-    Args:
-        water: the water of a scenario.
-        scattering_per_m: (3,) scattering coefficient b of molecules and particles [1/m].
+    With the phase function "sea", molecules scatter like pure sea water (Morel 1974), particles the rest.
     """
     if water.phase_function == "sea":
         molecules = molecular_scattering_per_m(np.array(CENTRE_NM))
@@ -105,11 +90,7 @@ def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, 
 
 
 def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
-    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type.
-
-    Raises:
-        TwinError: see `medium`.
-    """
+    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
     if given and water.spectrum_file is not None:
@@ -124,16 +105,13 @@ def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Arra
     elif water.jerlov == "clear":
         return np.zeros(3), np.zeros(3)
     else:
-        absorption, scattering, _ = water_spectrum(water.jerlov, water.source)
+        absorption, scattering = water_spectrum(water.jerlov, water.source)
     weights = band_weights(spectrum_of(light))
     return effective_per_m(absorption, weights, path_m), effective_per_m(scattering, weights)
 
 
 def read_spectrum(file: Path) -> tuple[Array, Array]:
-    """Returns absorption and scattering (n,) [1/m] at `bands.NM`, with linear interpolation between rows.
-
-    Args:
-        file: comma-separated rows of wavelength [nm], absorption, scattering [1/m]; # starts a comment.
+    """Returns absorption and scattering (n,) [1/m] at `NM` from comma-separated rows of nm, a, b; # is a comment.
 
     Raises:
         TwinError: the file cannot be read or is larger than `MAX_SPECTRUM_BYTES`, does not have 3 columns and 2 or more
@@ -160,15 +138,10 @@ def read_spectrum(file: Path) -> tuple[Array, Array]:
 
 
 def downwelling_per_m(water: Medium, mean_cosine: float = 1.0) -> Array:
-    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m].
+    """Returns the diffuse attenuation of daylight with depth, Kd (3,) [1/m], for a mean cosine mu0 below the surface.
 
-    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu0, G = 0.425 mu0 - 0.19; a fit to Monte Carlo
-    simulations of multiple scattering. Kd is the mean down to the depth that 1 % of the light reaches. For the phase
-    function of Petzold's harbour water, b / a of 2 to 6 and mu0 of 0.85 to 1, `light_field` agrees with it within 4 %.
-
-    Args:
-        water: optical properties of the water.
-        mean_cosine: mean cosine of the zenith angle of the light just below the surface, mu0.
+    Kirk (1984, Limnol. Oceanogr. 29, 350): Kd = sqrt(a^2 + G a b) / mu0, G = 0.425 mu0 - 0.19, a fit to Monte Carlo
+    down to the depth that 1 % of the light reaches. `light_field` agrees within 4 % for Petzold, b / a of 2 to 6.
     """
     a, b = water.absorption_per_m, water.scattering_per_m
     return np.sqrt(a**2 + (0.425 * mean_cosine - 0.19) * a * b) / mean_cosine

@@ -1,9 +1,7 @@
-"""Wind waves: the unified spectrum of Elfouhaily et al. (1997), from the longest gravity waves to capillary waves.
+"""Wind waves from gravity to capillary waves: the spectrum of Elfouhaily et al. (1997, J. Geophys. Res. 102, 15781).
 
-Elfouhaily, Chapron, Katsaros & Vandemark (1997, J. Geophys. Res. 102, 15781). The elevation of the surface has the
-spectrum S(k) = B(k) / k^3, with B the curvature spectrum; the slopes have the variance (mean square slope, mss)
-int k^2 S dk = int B / k dk. Waves with the wave number k are spread over directions phi from the wind with the density
-(1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed (inverse wave age 0.84).
+The elevation has the spectrum S(k) = B(k) / k^3, the slopes the variance int B / k dk. Waves are spread over directions
+phi from the wind with the density (1 + Delta(k) cos(2 phi)) / (2 pi). The sea is fully developed.
 """
 
 from __future__ import annotations
@@ -22,21 +20,12 @@ _SHORTEST_RAD_PER_M = 2e4  # the spectrum of shorter waves is negligible
 
 
 def angular_frequency(k: Array) -> Array:
-    """Returns the angular frequency of gravity-capillary waves in deep water [rad/s]: omega^2 = g k (1 + (k / 370)^2).
-
-    Args:
-        k: wave numbers, of any shape [rad/m].
-    """
+    """Returns the angular frequency of waves in deep water [rad/s]: omega^2 = g k (1 + (k / 370)^2)."""
     return np.sqrt(GRAVITY_MPS2 * k * (1 + (k / SLOWEST_RAD_PER_M) ** 2))
 
 
 def curvature_spectrum(k: Array, wind_mps: float) -> Array:
-    """Returns the omnidirectional curvature spectrum B(k), without unit (Elfouhaily et al. 1997, eq. 30 to 41).
-
-    Args:
-        k: wave numbers, of any shape, above 0 [rad/m].
-        wind_mps: wind speed 10 m above the sea.
-    """
+    """Returns the omnidirectional curvature spectrum B(k) at wave numbers above 0 (Elfouhaily, eq. 30 to 41)."""
     peak = GRAVITY_MPS2 * (INVERSE_WAVE_AGE / wind_mps) ** 2
     speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
     ratio = np.sqrt(k / peak)
@@ -50,12 +39,7 @@ def curvature_spectrum(k: Array, wind_mps: float) -> Array:
 
 
 def directionality(k: Array, wind_mps: float) -> Array:
-    """Returns Delta(k), the relative difference of the spectrum along and across the wind (Elfouhaily, eq. 57).
-
-    Args:
-        k: wave numbers, of any shape, above 0 [rad/m].
-        wind_mps: wind speed 10 m above the sea.
-    """
+    """Returns Delta(k), the relative difference of the spectrum along and across the wind (Elfouhaily, eq. 57)."""
     speed, peak_mps = angular_frequency(k) / k, wind_mps / INVERSE_WAVE_AGE
     short = 0.13 * _friction_mps(wind_mps) / SLOWEST_MPS
     return np.tanh(np.log(2) / 4 + 4 * (speed / peak_mps) ** 2.5 + short * (SLOWEST_MPS / speed) ** 2.5)
@@ -64,11 +48,7 @@ def directionality(k: Array, wind_mps: float) -> Array:
 def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
     """Returns the variance of the slope per area of the wave number plane [m^2/rad^2]; 0 at k = 0.
 
-    The integral over the whole plane is the mean square slope. The density is the same for opposite directions.
-
-    Args:
-        kx, ky: components of the wave number along and across the wind, broadcast against each other [rad/m].
-        wind_mps: wind speed 10 m above the sea.
+    `kx`, `ky` are the wave numbers along and across the wind [rad/m]; the integral is the mean square slope.
     """
     k = np.hypot(kx, ky)
     k_or_1 = np.where(k > 0, k, 1.0)
@@ -77,12 +57,7 @@ def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
 
 
 def slope_variance(wind_mps: float, above_rad_per_m: float = 1e-3) -> tuple[float, float]:
-    """Returns the variances of the slope along and across the wind, due to waves above a given wave number.
-
-    Args:
-        wind_mps: wind speed 10 m above the sea.
-        above_rad_per_m: wave number of the longest wave that is included.
-    """
+    """Returns the variances of the slope along and across the wind, due to waves above a given wave number."""
     k = np.geomspace(above_rad_per_m, max(_SHORTEST_RAD_PER_M, 2 * above_rad_per_m), 4000)
     per_k, quarter = curvature_spectrum(k, wind_mps) / k, directionality(k, wind_mps) / 4
     along, across = (float(np.trapezoid(per_k * share, k)) for share in (0.5 + quarter, 0.5 - quarter))

@@ -36,61 +36,41 @@ NO_FLOOR = height_field(np.zeros((2, 2)), 1.0, 0.0, 0.0)  # not used by the kern
 
 @dataclass(frozen=True)
 class BandWater:
-    """Optical properties of the water in one colour band.
+    """Optical properties of the water in one colour band."""
 
-    Args:
-        absorption_per_m: absorption coefficient a [1/m].
-        scattering_per_m: scattering coefficient b [1/m].
-        phase: phase function.
-    """
-
-    absorption_per_m: float
-    scattering_per_m: float
-    phase: PhaseFunction = petzold
+    absorption_per_m: float  # absorption coefficient a [1/m]
+    scattering_per_m: float  # scattering coefficient b [1/m]
+    phase: PhaseFunction = petzold  # phase function
 
 
 @dataclass(frozen=True)
 class Sunlight:
-    """Light of sun and sky that enters the water, just below the surface.
+    """Light of sun and sky that enters the water, just below the surface."""
 
-    Args:
-        to_sun: (3,) unit direction to the sun under water, in world axes.
-        normal_lx: illuminance just below the surface by the sun, on a plane that faces it [lx].
-        surface_m: height of the surface, z in world axes; light that rises above it is lost.
-        radius_rad: angular radius of the sun's disc under water, which matters for phase functions with a sharp peak;
-            0: parallel light.
-        sky_cd_m2: (n,) radiance of the sky just below the surface, at even steps of the cosine of the zenith angle from
-            0 to 1, n of 2 or more; empty: no light of the sky.
-    """
-
-    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    normal_lx: float = 0.0
-    surface_m: float = np.inf
+    to_sun: tuple[float, float, float] = (0.0, 0.0, 1.0)  # (3,) unit direction to the sun under water, in world axes
+    normal_lx: float = 0.0  # illuminance just below the surface by the sun, on a plane that faces it [lx]
+    surface_m: float = np.inf  # height of the surface, z in world axes; light that rises above it is lost
+    # angular radius of the sun's disc under water, which matters for phase functions with a sharp peak; 0: parallel
+    # light
     radius_rad: float = 0.0
+    # (n,) radiance of the sky just below the surface, at even steps of the cosine of the zenith angle from 0 to 1, n of
+    # 2 or more; empty: no light of the sky
     sky_cd_m2: tuple[float, ...] | Array = ()
 
 
 @dataclass(frozen=True)
 class ReferenceScene:
-    """Water, light and floor of a reference computation for one colour band.
+    """Water, light and floor of a reference computation for one colour band."""
 
-    Args:
-        water: optical properties of the water.
-        lamps: (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity [cd], by which the
-            relative intensities of `beams` are multiplied.
-        beams: for each lamp, (m, 2) angle from the axis [deg] and relative intensity.
-        albedo: albedo of the Lambertian floor.
-        relief: the floor; None = the plane z = 0.
-        sun: sunlight and light of the sky; by default none, and no surface.
-        lamp_radius_m: points within this distance of a lamp neither reflect nor scatter its unscattered light.
-    """
-
-    water: BandWater
+    water: BandWater  # optical properties of the water
+    # (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity [cd], by which the relative
+    # intensities of `beams` are multiplied
     lamps: Array
-    beams: Sequence[Array]
-    albedo: float = 0.5
-    relief: HeightField | None = None
-    sun: Sunlight = field(default_factory=Sunlight)
+    beams: Sequence[Array]  # for each lamp, (m, 2) angle from the axis [deg] and relative intensity
+    albedo: float = 0.5  # albedo of the Lambertian floor
+    relief: HeightField | None = None  # the floor; None = the plane z = 0
+    sun: Sunlight = field(default_factory=Sunlight)  # sunlight and light of the sky; by default none, and no surface
+    # points within this distance of a lamp neither reflect nor scatter its unscattered light
     lamp_radius_m: float = LAMP_RADIUS_M
 
 
@@ -104,21 +84,16 @@ class PixelRay(NamedTuple):
 
 @dataclass(frozen=True)
 class Effort:
-    """Size of a Monte Carlo computation.
+    """Size of a Monte Carlo computation."""
 
-    Args:
-        walks: number of pairs of random walks, rounded down to a multiple of `batches`; one walk of each pair starts on
-            the floor, the other in the water. In `plane_light`, it is the number of single walks.
-        batches: number of batches; the standard errors are computed from the scatter of their means.
-        seed: seed of the random numbers, one number or several; equal seeds give equal results.
-        plain: use the textbook estimator, which connects every vertex directly to the lamps and samples directions
-            only from the phase function (in the water) or Lambert's cosine (on the floor). It has the same mean and a
-            much larger variance; it serves to check the default estimator.
-    """
-
+    # number of pairs of random walks, rounded down to a multiple of `batches`; one walk of each pair starts on the
+    # floor, the other in the water. In `plane_light`, it is the number of single walks.
     walks: int = 100_000
-    batches: int = 32
-    seed: int | tuple[int, ...] = 1
+    batches: int = 32  # number of batches; the standard errors are computed from the scatter of their means
+    seed: int | tuple[int, ...] = 1  # seed of the random numbers, one number or several; equal seeds give equal results
+    # use the textbook estimator, which connects every vertex directly to the lamps and samples directions only from the
+    # phase function (in the water) or Lambert's cosine (on the floor). It has the same mean and a much larger variance;
+    # it serves to check the default estimator.
     plain: bool = False
 
 
@@ -131,15 +106,11 @@ class BatchMean(NamedTuple):
 
 @dataclass(frozen=True)
 class PixelLight:
-    """Light that reaches a pixel, by component [cd/m2].
+    """Light that reaches a pixel, by component [cd/m2]."""
 
-    Args:
-        sums: (batches, FIRST_BIN + 2 n) mean light of each batch, in the order of `sums` of `walk.walk`.
-        bin_edges_px: (n,) lower edges of the bins of blurred light, which are bins of the distance in the image between
-            the pixel and the projection of the floor point from which the light came.
-    """
-
-    sums: Array
+    sums: Array  # (batches, FIRST_BIN + 2 n) mean light of each batch, in the order of `sums` of `walk.walk`
+    # (n,) lower edges of the bins of blurred light, which are bins of the distance in the image between the pixel and
+    # the projection of the floor point from which the light came
     bin_edges_px: Array
 
     @property
@@ -171,14 +142,6 @@ class PixelLight:
         return _estimate(self.blurred_by_bin.sum((1, 2)))
 
     @property
-    def blurred_straight_lamp(self) -> BatchMean:
-        """Light of lamps, sun and sky that was scattered between floor and camera, but not on its way to the floor.
-
-        It was reflected once, by the floor.
-        """
-        return _estimate(self.blurred_by_bin[:, 0].sum(1))
-
-    @property
     def veil(self) -> BatchMean:
         """Light that was scattered into the camera without reflection by the floor."""
         return _estimate(self.sums[:, VEIL_ONCE] + self.sums[:, VEIL_MORE])
@@ -204,9 +167,6 @@ class PixelLight:
     def blurred_share(self, from_px: float, to_px: float = np.inf) -> BatchMean:
         """Returns the share of the blurred light in the bins between two edges; NaN if there is no blurred light.
 
-        Args:
-            from_px, to_px: two of `bin_edges_px`, or inf for `to_px`.
-
         Raises:
             ValueError: `from_px` or a finite `to_px` is not an edge.
         """
@@ -226,12 +186,9 @@ class PlaneLight:
     """Illuminance of a plane by daylight and by light of lamps: means of the batches [lx].
 
     Light that arrives from a lamp without scattering or reflection is not included.
-
-    Args:
-        sums: (batches, 3) direct light of the sun, direct light of the sky, light that was scattered or reflected.
     """
 
-    sums: Array
+    sums: Array  # (batches, 3) direct light of the sun, direct light of the sky, light that was scattered or reflected
 
     @property
     def total(self) -> BatchMean:
@@ -280,13 +237,7 @@ class KernelScene(NamedTuple):
 def pixel_light(
     scene: ReferenceScene, ray: PixelRay, effort: Effort, bin_edges_px: Sequence[float] = BIN_EDGES_PX
 ) -> PixelLight:
-    """Returns the light that reaches a pixel, in components.
-
-    Args:
-        scene: water, light and floor.
-        ray: the pixel.
-        effort: number of walks, and seed.
-        bin_edges_px: lower edges of the bins of blurred light, from 0, see `PixelLight`; the last bin is open.
+    """Returns the light that reaches a pixel, in components; `bin_edges_px` see `PixelLight`, the last bin is open.
 
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
@@ -297,13 +248,7 @@ def pixel_light(
 
 
 def plane_light(scene: ReferenceScene, point_m: Array, normal: Array, effort: Effort) -> PlaneLight:
-    """Returns the illuminance of a plane that does not disturb the light, in components.
-
-    Args:
-        scene: water, light and floor.
-        point_m: (3,) a point of the plane above the floor, in world axes [m].
-        normal: (3,) unit normal of the plane in world axes; light that arrives from the side of the normal counts.
-        effort: number of walks, and seed.
+    """Returns the illuminance of a plane that does not disturb the light, on the side of its normal (3,).
 
     Raises:
         TwinError: there are fewer than two batches or fewer walks than batches.
@@ -319,16 +264,9 @@ Light = TypeVar("Light", PixelLight, PlaneLight)
 def refined(
     light_of: Callable[[Effort], Light], enough: Callable[[Light], bool], effort: Effort, most_walks: int
 ) -> Light:
-    """Repeats a computation until its standard errors are small enough or `most_walks` would be exceeded.
+    """Returns the light of as many rounds as `enough` asks for, at most `most_walks` in all; the first always runs.
 
-    Args:
-        light_of: computes the light of one round, e.g. with `pixel_light` or `plane_light`.
-        enough: returns whether the standard errors of the light of all rounds so far are small enough.
-        effort: size of each round; the rounds differ by their seeds.
-        most_walks: largest number of walks of all rounds, as counted in `Effort`; the first round is always computed.
-
-    Returns:
-        The light with the batches of all rounds.
+    The rounds differ by their seeds; the result has the batches of all.
     """
     light, rounds = light_of(effort), 1
     while (rounds + 1) * effort.walks <= most_walks and not enough(light):
@@ -345,11 +283,7 @@ def _in_threads(trace: Callable[[np.random.Generator], Array], rngs: Sequence[np
 
 
 def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:
-    """Returns the number of walks (or pairs of walks) of a batch, and the random stream of each batch.
-
-    Raises:
-        TwinError: there are fewer than two batches or fewer walks than batches.
-    """
+    """Returns the number of walks (or pairs of walks) of a batch, and the random stream of each batch."""
     if effort.batches < 2 or effort.walks < effort.batches:
         raise TwinError("effort.batches", f"{effort.batches} for {effort.walks} walks", "2 or more, one walk in each")
     rngs = [np.random.default_rng(s) for s in np.random.SeedSequence(effort.seed).spawn(effort.batches)]
@@ -357,13 +291,7 @@ def _batches(effort: Effort) -> tuple[int, list[np.random.Generator]]:
 
 
 def lamps_in_world(sources: LightSources, world_from_camera: Array, band: int) -> Array:
-    """Returns the lamps (n, 7) of a `ReferenceScene` from the lamps in the axes of a camera.
-
-    Args:
-        sources: lamps in the axes of the camera.
-        world_from_camera: (4, 4) pose of that camera.
-        band: 0 red, 1 green, 2 blue.
-    """
+    """Returns the lamps (n, 7) of a `ReferenceScene` for a band (0 red, 1 green, 2 blue), from those of a camera."""
     rotation, origin = world_from_camera[:3, :3], world_from_camera[:3, 3]
     light_cd = sources.intensity_cd * sources.colour[:, band]
     return np.column_stack([sources.position_m @ rotation.T + origin, sources.axis @ rotation.T, light_cd])

@@ -1,35 +1,25 @@
 """Compiled random walks of light, traced backwards from a pixel: the kernel of the reference.
 
-The radiance of a pixel is the integral over all paths from lamps and sun that end on the ray of the pixel (Veach 1997,
-the path integral; Mobley 1994 for the quantities). A walk starts in one of two ways: at the floor point that the pixel
-shows, at the range r, with the share exp(-c r) that arrives unscattered, or at a first scattering between camera and
-floor, sampled from the truncated exponential distribution. Here c = a + b is the attenuation, the sum of absorption and
-scattering. Each vertex of the walk is connected in two ways to each lamp, of intensity I towards the vertex and at the
-distance d from it:
+The radiance of a pixel is the integral over all paths from lamps and sun (Veach 1997; Mobley 1994). A walk starts at
+the floor point of the pixel at the range r, with the share exp(-c r), or at a first scattering before the floor. Each
+vertex is connected in two ways to each lamp of intensity I at the distance d:
 
-* directly: rho/pi cos I/d^2 exp(-c d) at a floor of albedo rho, with cos the cosine of the angle of incidence, or
-  p I/d^2 exp(-c d) in the water, with p the phase function;
-* by one more scattering between vertex and lamp. With the scattering angle t = alpha + beta, where alpha and beta are
-  the angles at vertex and lamp of the triangle vertex, scattering, lamp, the volume element divided by the squares of
-  the distances from the scattering to vertex and lamp is (1/d) d(alpha) d(t) d(azimuth). If t is sampled in proportion
-  to p(t) t, and alpha uniformly between 0 and t, the weight has neither the peak of p nor the poles of these inverse
-  squares (compare Georgiev et al. 2013).
+* directly: rho/pi cos I/d^2 exp(-c d) at the floor, p I/d^2 exp(-c d) in the water;
+* by one more scattering. With the scattering angle t = alpha + beta, alpha and beta at vertex and lamp, the volume
+element divided by both squared distances is (1/d) d(alpha) d(t) d(azimuth). With t sampled in proportion to p(t) t, and
+alpha uniformly up to t, the weight has neither the peak of p nor poles (compare Georgiev et al. 2013).
 
-Light of a lamp whose first scattering is at a point of the water is sampled both by the second kind of connection and
-by the walk; `share_of_walk` weights the two. Vertices are connected directly to the sun, and the sky is sampled by
-walks that leave the water; at vertices in the water, a sun with a disc is sampled in both ways.
-
-The direction to the next vertex is sampled from a mixture: the phase function (or Lambert's cosine at the floor), lobes
-around the lamps and the sun, and, for downward walks in water with daylight, the upper hemisphere. Absorption reduces
-the weight of a walk. Russian roulette ends walks of small weight; no contribution is clipped.
+Light of a lamp first scattered in the water is sampled by the second connection and by the walk, weighted by
+`share_of_walk`; a sun with a disc likewise. The sky is sampled by walks that leave the water. The next direction is
+sampled from a mixture: phase function or Lambert's cosine, lobes around lamps and sun, and the upper hemisphere.
+Absorption reduces the weight; Russian roulette ends weak walks; no contribution is clipped.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from twin.imaging.reference.floor import LIFT_M, floor_distance, floor_normal, sees
-from twin.imaging.reference.sampling import (
+from twin.imaging.reference.directions import (
     density_at,
     guide_density,
     sample_angle,
@@ -38,6 +28,7 @@ from twin.imaging.reference.sampling import (
     turn,
     turn_by_cosine,
 )
+from twin.imaging.reference.floor_crossings import LIFT_M, floor_distance, floor_normal, sees
 from twin.kernels import kernel
 
 #: Indices of the sums to which `walk` adds light; the bins of the blurred light start at FIRST_BIN.
@@ -64,14 +55,9 @@ def beam_at(beam, cosine):
 
 @kernel
 def response(scene, kind, normal, direction, ox, oy, oz):
-    """Returns the share of the light from a direction that a vertex sends back along the path, per solid angle [1/sr].
+    """Returns the share of the light from the direction o that a vertex sends back along the path [1/sr].
 
-    Args:
-        scene: `pixel_light.KernelScene`.
-        kind: ON_FLOOR (albedo / pi times the cosine of the angle of incidence) or IN_WATER (phase function).
-        normal: unit normal of the floor; not used in water.
-        direction: unit direction in which the backward path arrived.
-        ox, oy, oz: unit direction from the vertex towards the light.
+    `normal` is that of the floor, `direction` the unit direction in which the backward path arrived.
     """
     if kind == ON_FLOOR:
         return scene.albedo / np.pi * max(normal[0] * ox + normal[1] * oy + normal[2] * oz, 0.0)
@@ -90,13 +76,8 @@ def towards(lamp, point):
 def straight(scene, kind, point, normal, direction, before, density, step_m):
     """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
 
-    Args:
-        scene, kind, normal, direction: see `response`.
-        point: the vertex.
-        before: the previous vertex of the walk.
-        density: density with which the direction from `before` to this vertex was sampled [1/sr]; if it is above 0, the
-            light of each lamp is weighted by `share_of_walk`.
-        step_m: distance between the two vertices.
+    If `density` [1/sr], with which the direction from `before` was sampled, is above 0, it is weighted by
+    `share_of_walk`.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -185,14 +166,7 @@ def sunlight(scene, kind, point, normal, direction, guided, rng):
 
 @kernel
 def share_of_escape(scene, density, path_m):
-    """Returns the weight of the walk's estimate of the light of the sun's disc.
-
-    It follows from the balance heuristic, as in `share_of_walk`.
-
-    Args:
-        density: density with which the walk samples the direction [1/sr].
-        path_m: distance to the surface in this direction.
-    """
+    """Returns the weight of the walk's estimate of the sun's disc (balance heuristic) for its density [1/sr]."""
     by_walk = density * np.exp(-scene.scattering * path_m)
     by_connection = 1 / (2 * np.pi * (1 - scene.sun_cosine))
     return by_walk / (by_walk + by_connection)
@@ -200,15 +174,9 @@ def share_of_escape(scene, density, path_m):
 
 @kernel
 def light_above(scene, from_water, density, path_m, x, y, z):
-    """Returns the radiance just below the surface from a direction: that of the sky and of the sun's disc [cd/m2].
+    """Returns the radiance of sky and sun's disc just below the surface from the unit direction (x, y, z) [cd/m2].
 
-    The disc is included only for a last vertex in the water; its radiance is weighted by `share_of_escape`.
-
-    Args:
-        from_water: whether the last vertex of the walk is a scattering in the water.
-        density: density with which the direction was sampled at the last vertex [1/sr].
-        path_m: distance from the last vertex to the surface.
-        x, y, z: unit direction towards the light, in world axes.
+    The disc counts only for a last vertex in the water, weighted by `share_of_escape`.
     """
     last = scene.sky.shape[0] - 1
     light = 0.0
@@ -259,14 +227,9 @@ def next_direction(scene, kind, point, normal, direction, guided, rng):
 
 @kernel
 def direction_density(scene, kind, point, direction, guided, own, x, y, z):
-    """Returns the density [1/sr] of `next_direction` at the direction (x, y, z).
+    """Returns the density [1/sr] of `next_direction` at the direction (x, y, z), whose response at the vertex is `own`.
 
-    Args:
-        kind: ON_FLOOR or IN_WATER.
-        direction: unit direction in which the backward path arrived at the vertex.
-        guided: share of the directions that are sampled around lamps and sun.
-        own: response of the vertex to the direction (x, y, z). It is the density of the directions sampled from the
-            phase function; divided by the albedo, that of the directions sampled from Lambert's cosine.
+    `own` is the density of the phase function; divided by the albedo, that of Lambert's cosine.
     """
     own = own / scene.albedo if kind == ON_FLOOR else own
     upwards = upward_share(scene, kind, direction, guided)
@@ -287,16 +250,8 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
 def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
     """Returns the weight of the walk's estimate of the light that leaves a lamp and is first scattered at a point.
 
-    The walk and `by_one_scattering` sample the same point with the densities per volume w and s; their estimates
-    are weighted by w / (w + s) and s / (w + s) (the balance heuristic of Veach 1997, section 9.2.2). The common factor
-    1 / step_m^2 of both densities is left out.
-
-    Args:
-        lamp_m: distance of the lamp from the previous vertex of the walk, where light scattered at the point arrives.
-        phase: value of the phase function for the scattering at the point [1/sr].
-        to_lamp_m: distance of the lamp from the point.
-        density: density with which the walk samples the direction from the previous vertex to the point [1/sr].
-        step_m: distance of the point from the previous vertex.
+    The walk and `by_one_scattering` sample the point with the densities per volume w and s; the weights are w / (w + s)
+    and s / (w + s) (balance heuristic, Veach 1997, section 9.2.2), without the common factor 1 / step_m^2.
     """
     by_walk = density * scene.scattering * np.exp(-scene.scattering * step_m)
     by_connection = phase * lamp_m / (2 * np.pi * scene.angle_integral * to_lamp_m * to_lamp_m)
@@ -305,15 +260,10 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
 
 @kernel
 def bin_of(view, bin_edges_px, x, y, z):
-    """Returns the bin of the distance in the image between a pixel and the projection of a point.
+    """Returns the bin of the distance in the image between a pixel and the projection of a point; the last one is open.
 
-    The last bin has no upper limit and also holds points behind the camera.
-
-    Args:
-        view: (5, 3) axes of the camera in the world as rows 0 to 2, its position [m] as row 3, and in row 4 column and
-            row of the pixel relative to the principal point, then the focal length [px].
-        bin_edges_px: (n,) lower edges of the bins, from 0.
-        x, y, z: the point in the world [m].
+    `view` (5, 3) has the axes of the camera in the world, its position [m], and column and row of the pixel from the
+    principal point and the focal length [px]. Points behind the camera are in the last bin.
     """
     a, b, c = x - view[3, 0], y - view[3, 1], z - view[3, 2]
     depth = a * view[2, 0] + b * view[2, 1] + c * view[2, 2]
@@ -331,19 +281,10 @@ def bin_of(view, bin_edges_px, x, y, z):
 
 @kernel
 def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
-    """Adds the light of one random walk to `sums`.
+    """Adds the light of one random walk from `point` to `sums`, arriving in the unit `direction`.
 
-    Args:
-        scene: `pixel_light.KernelScene`.
-        view, bin_edges_px: see `bin_of`.
-        kind: ON_FLOOR if the first vertex is the floor point of the pixel, IN_WATER if it is a scattering on its ray.
-        point: (3,) first vertex.
-        direction: (3,) unit direction in which the backward path arrives there.
-        weight: weight of the first vertex.
-        rng: random stream.
-        sums: (FIRST_BIN + 2 n,) sums of light [cd/m2], modified in place: DIRECT, LAMP_SCATTERED, VEIL_ONCE and
-            VEIL_MORE; then the light from the floor that was scattered on its way to the camera, in n bins for light
-            that had illuminated the floor without scattering or reflection, and in n bins for all other light.
+    `sums` (FIRST_BIN + 2 n,) [cd/m2]: DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE; then n bins of blurred light that
+    had reached the floor straight, and n bins of all other.
     """
     unscattered, before_floor, at_first_floor = kind == ON_FLOOR, kind == IN_WATER, False
     n_bins, at_bin, start = bin_edges_px.shape[0], 0, weight
@@ -408,11 +349,9 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
 
 @kernel
 def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
-    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2] by component and bin, ordered as `sums` of `walk`.
+    """Returns the light of a pixel (FIRST_BIN + 2 n,) [cd/m2], ordered as `sums` of `walk`: the mean of pairs of walks.
 
-    It is the mean over `n_walks` pairs of walks: one that starts at the floor and one that starts in the water. The
-    unscattered light of lamps and sun on the floor point of the pixel is computed without walks. The other arguments
-    are those of `walk`.
+    One walk of a pair starts at the floor, one in the water; unscattered light on the floor point takes none.
     """
     sums = np.zeros(FIRST_BIN + 2 * bin_edges_px.shape[0])
     centre = (view[3, 0], view[3, 1], view[3, 2])
@@ -448,18 +387,7 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
 
 @kernel
 def trace_plane(scene, point, normal, n_walks, rng):
-    """Returns the illuminance (3,) of a plane that does not disturb the light [lx].
-
-    Its elements are direct light of the sun, direct light of the sky, and light that was scattered or reflected. Direct
-    light of lamps is not included.
-
-    Args:
-        scene: `pixel_light.KernelScene`.
-        point: a point of the plane [m].
-        normal: unit normal of the plane; light that arrives from the side of the normal counts.
-        n_walks: number of walks.
-        rng: random stream.
-    """
+    """Returns the illuminance (3,) of a plane: direct light of the sun, of the sky, and all other light [lx]."""
     out, sums, no_view, edges = np.zeros(3), np.zeros(FIRST_BIN + 2), np.zeros((5, 3)), np.zeros(1)
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     guided = 0.0 if scene.plain else GUIDED_AT_FLOOR

@@ -1,10 +1,7 @@
 """Facets of the floor: the normals of the triangles of its height grid, for the shading of the pixels that show them.
 
-The depth of a pixel gives a point of the floor, which lies in one of the two triangles of a cell of the grid. The
-rendered floor consists of the same triangles (`twin.scenes.floor`), so the normal is that of the rendered facet.
-
-A normal n, which points up, is stored in 32 bits by the stereographic projection (nx, ny) / (1 + nz), whose components
-lie in [-1, 1] and take 16 bits each. The error of a normal is below 0.004 deg at any slope.
+The depth of a pixel gives a point in one of the two triangles of a cell, those that are rendered (`twin.scenes.floor`).
+A normal, which points up, is stored in 32 bits as (nx, ny) / (1 + nz), 16 bits each; its error is below 0.004 deg.
 """
 
 from __future__ import annotations
@@ -25,7 +22,7 @@ class Heights(Protocol):
     """Grid of floor heights; row 0 = south, column 0 = west. Its south-west node is at `west_m`, `south_m`."""
 
     @property
-    def height_m(self) -> NDArray[np.float32]: ...
+    def height_m(self) -> NDArray[np.floating]: ...
     @property
     def spacing_m(self) -> float: ...
     @property
@@ -35,29 +32,21 @@ class Heights(Protocol):
 
 
 class FacetView(NamedTuple):
-    """Facets of the floor relative to a camera.
+    """Facets of the floor relative to a camera."""
 
-    Args:
-        normals: (rows, cols, 2) int32 stored normals of the two triangles of each cell, south-east and north-west of
-            the diagonal from the cell's south-west to its north-east node.
-        origin: (2,) column and row of the cell near the camera to which `grid_from_camera` refers, so that single
-            precision suffices.
-        grid_from_camera: (2, 4) map from a point in the axes of the camera [m] to column and row relative to `origin`.
-        camera_from_world: (3, 3) rotation from world axes to those of the camera.
-    """
-
+    # (rows, cols, 2) int32 stored normals of the two triangles of each cell, south-east and north-west of the diagonal
+    # from the cell's south-west to its north-east node
     normals: NDArray[np.int32]
+    # (2,) column and row of the cell near the camera to which `grid_from_camera` refers, so that single precision
+    # suffices
     origin: NDArray[np.int32]
+    # (2, 4) map from a point in the axes of the camera [m] to column and row relative to `origin`
     grid_from_camera: NDArray[np.float32]
-    camera_from_world: NDArray[np.float32]
+    camera_from_world: NDArray[np.float32]  # (3, 3) rotation from world axes to those of the camera
 
 
 class Facets:
-    """Facets of a floor, for cameras in any pose.
-
-    Args:
-        floor: heights of the floor.
-    """
+    """Facets of a floor, for cameras in any pose."""
 
     def __init__(self, floor: Heights):
         self._normals = _stored_normals(np.ascontiguousarray(floor.height_m, np.float32), floor.spacing_m)
@@ -94,10 +83,6 @@ def _store(rise_east, rise_north, spacing):
     """Returns the stored normal (x, y, z) of a triangle, with x east and y north.
 
     Its upper 16 bits are `UNIT` x / (1 + z), its lower 16 bits `UNIT` y / (1 + z).
-
-    Args:
-        rise_east, rise_north: change of height over one cell towards east and north [m].
-        spacing: side of a cell [m].
     """
     per = -UNIT / (spacing + np.sqrt(rise_east * rise_east + rise_north * rise_north + spacing * spacing))
     return np.int32((np.int64(np.round(rise_east * per)) << 16) | (np.int64(np.round(rise_north * per)) & 0xFFFF))

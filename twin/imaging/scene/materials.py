@@ -1,24 +1,16 @@
 """Reflection of light by the floor: Lambertian, Oren-Nayar or Hapke, and specular highlights.
 
-A material is given by its bidirectional reflectance f [1/sr]: radiance = f * illuminance. With i and o the unit
-vectors to the light and to the camera, mu_i and mu_o the cosines of incidence and of view, c = i . o the cosine of the
-phase angle g, and rho the albedo of the texture:
+A material has a bidirectional reflectance f [1/sr]: radiance = f * illuminance. With mu_i and mu_o the cosines of
+incidence and view, c that of the phase angle g, and rho the albedo of the texture:
 
 Lambertian: f = rho / pi.
-
 Oren & Nayar 1994 (qualitative model, their eq. 30), sigma the standard deviation of the slope angle of V-grooves:
     f = rho / pi * (A + B max(0, s) / max(mu_i, mu_o)),  s = c - mu_i mu_o,
     A = 1 - 0.5 sigma^2 / (sigma^2 + 0.33),  B = 0.45 sigma^2 / (sigma^2 + 0.09)
-where s / max(mu_i, mu_o) equals cos(azimuth difference) sin(alpha) tan(beta) of the paper.
-
-Hapke 1981 (isotropic scatterers; Hapke 1986 for the opposition effect B_g), a layer of grains without larger relief:
+Hapke 1981 (isotropic scatterers; Hapke 1986 for B_g), w from the diffusive reflectance rho = (1 - gamma) / (1 + gamma):
     f = w / (4 pi) / (mu_i + mu_o) * (1 + B_g + H(mu_i) H(mu_o) - 1),
     H(x) = (1 + 2x) / (1 + 2x gamma),  gamma = sqrt(1 - w),  B_g = B0 / (1 + tan(g/2) / h)
-The single-scattering albedo w follows from the albedo: rho is the diffusive reflectance (1 - gamma) / (1 + gamma).
-
-Specular highlights: the share F of the light that meets a microfacet is mirrored, the share 1 - F reflected as above.
-With the distribution D of the normals m of microfacets and the shadowing-masking function G of GGX (Walter et al. 2007,
-eqs. 20, 33 and 34; F does not depend on the angle, so that energy is conserved):
+Specular highlights of a share F (the rest is reflected as above), D and G of GGX (Walter et al. 2007, eqs. 20, 33, 34):
     f_s = F D(m) G(i) G(o) / (4 mu_i mu_o)
 
 Daylight, and lamp light that was scattered on its way to the floor, are reflected as by a Lambertian floor.
@@ -41,20 +33,13 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}
 
 
 class Material(NamedTuple):
-    """Reflection of the floor.
+    """Reflection of the floor."""
 
-    Args:
-        kind: LAMBERT, OREN_NAYAR or HAPKE.
-        a, b: coefficients A and B of Oren and Nayar's model.
-        specular: share F of the light that is mirrored.
-        alpha_squared: square of GGX's width parameter, the tangent of the highlight's `specular_width_deg`.
-    """
-
-    kind: int
-    a: np.float32
+    kind: int  # LAMBERT, OREN_NAYAR or HAPKE
+    a: np.float32  # coefficients A and B of Oren and Nayar's model
     b: np.float32
-    specular: np.float32
-    alpha_squared: np.float32
+    specular: np.float32  # share F of the light that is mirrored
+    alpha_squared: np.float32  # square of GGX's width parameter, the tangent of the highlight's `specular_width_deg`
 
 
 def material_of(terrain: TerrainConfig) -> Material | None:
@@ -73,13 +58,10 @@ def material_of(terrain: TerrainConfig) -> Material | None:
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def reflectance(material, albedo, mu_i, mu_o, phase):
-    """Returns the bidirectional reflectance [1/sr].
+    """Returns the bidirectional reflectance [1/sr], in single precision.
 
-    Args:
-        material: `Material`.
-        albedo: albedo, 0 to 1; like the following arguments in single precision.
-        mu_i, mu_o: cosines of the angles of incidence and of view, above 0.
-        phase: cosine of the phase angle.
+    `mu_i`, `mu_o` are the cosines of incidence and of view, above 0, `phase` that of the phase angle, `albedo` is 0 to
+    1.
     """
     kind, a, b, specular, alpha_squared = material
     one, two, zero = np.float32(1), np.float32(2), np.float32(0)
@@ -106,18 +88,14 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
-    """Adds the light of one lamp that the floor reflects to the camera to `reflected`, for one row of W pixels.
+    """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected`.
 
     Args:
-        material: `Material`.
-        lamp: properties of the lamp, of which the first three are its position in the axes of the camera [m].
+        lamp: its first three values are the position in the axes of the camera [m].
         albedo: (W, 3) uint8, 255 = white.
         here: (W,) depth [m].
-        y: tangent of the row's angle from the optical axis.
-        focal: focal length [px].
         normal: (3, W) unit normals in the axes of the camera.
         arriving: (3, W) illuminance by the lamp, attenuated on the path from lamp to floor [lx].
-        reflected: (3, W) radiance at the floor, before attenuation on the path to the camera [cd/m2].
     """
     one, half, tiny = np.float32(1), np.float32(0.5), np.float32(1e-4)
     for u in range(here.size):

@@ -1,14 +1,9 @@
 """Rasterization of triangle meshes into images of depth, normals and labels, with a depth test, as in OpenGL.
 
-One kernel serves the cameras, the shadow maps of lamps and sun, and the view from above that gives the true heights.
-A pixel shows the triangle that the ray through the pixel centre meets first, and has the exact depth of the point where
-they meet. Within a triangle, 1 / depth is linear in column and row in a perspective view; in a parallel view, depth is
-linear.
-
-Triangles are about as large as a pixel, so most of the time would be lost to branches that the processor predicts
-wrongly. Each part of a mesh (`objects.parts`) therefore passes through loops that write lists, almost without
-branches: triangles that cover pixel centres, covered pixel centres, drawn pixels. Parts outside the image, and parts of
-closed meshes of which all triangles face away, are left out; this does not change the image.
+One kernel serves the cameras, the shadow maps, and the view from above that gives the true heights. A pixel shows the
+triangle that the ray through its centre meets first, with the exact depth; 1 / depth (in a parallel view, depth) is
+linear in the image. Triangles are about as large as a pixel, so each part of a mesh (`objects.parts`) passes through
+loops that write lists, almost without branches. Parts outside the image or facing away are left out.
 """
 
 from __future__ import annotations
@@ -34,80 +29,50 @@ MARGIN_PX = 1e-3  #: the same, in the image
 
 
 class Projection(NamedTuple):
-    """Projection of points in the axes of a camera (x right, y down, z forward).
+    """Projection of points in the axes of a camera (x right, y down, z forward)."""
 
-    Args:
-        focal_px: focal length of a perspective view [px], or pixels per metre of a parallel view.
-        cx_px, cy_px: column and row of the optical axis.
-        near_m: triangles with a corner at a smaller depth are left out.
-        perspective: whether columns and rows are those of a pinhole camera.
-    """
-
-    focal_px: float
-    cx_px: float
+    focal_px: float  # focal length of a perspective view [px], or pixels per metre of a parallel view
+    cx_px: float  # column and row of the optical axis
     cy_px: float
-    near_m: float
-    perspective: bool
+    near_m: float  # triangles with a corner at a smaller depth are left out
+    perspective: bool  # whether columns and rows are those of a pinhole camera
 
 
 class ObjectView(NamedTuple):
-    """Objects in an image.
+    """Objects in an image."""
 
-    Args:
-        normal: (H, W, 3) float32 unit normals in the axes of the camera, valid where `label` is not 0.
-        label: (H, W) uint16, 1 + number of the object that the pixel shows; 0: the floor, or nothing.
-    """
-
+    # (H, W, 3) float32 unit normals in the axes of the camera, valid where `label` is not 0
     normal: NDArray[np.float32]
-    label: NDArray[np.uint16]
+    label: NDArray[np.uint16]  # (H, W) uint16, 1 + number of the object that the pixel shows; 0: the floor, or nothing
 
 
 class Target(NamedTuple):
-    """Images (H, W) that a mesh is drawn into, in the pixels where the mesh is nearer than `depth`.
+    """Images (H, W) that a mesh is drawn into, in the pixels where the mesh is nearer than `depth`."""
 
-    Args:
-        depth: depth along the optical axis [m]; inf where there is nothing.
-        albedo: (H, W, 3) uint8; None: not drawn.
-        normal: (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn.
-        label: (H, W) uint16 number that identifies the mesh in each pixel; None: not drawn.
-        uv: (H, W, 3) float32 values interpolated between `DrawnMesh.uv` of the vertices; None: not drawn.
-    """
-
-    depth: Depth
-    albedo: NDArray[np.uint8] | None = None
+    depth: Depth  # depth along the optical axis [m]; inf where there is nothing
+    albedo: NDArray[np.uint8] | None = None  # (H, W, 3) uint8; None: not drawn
+    # (H, W, 3) float32 unit normals in the axes of the camera, towards the camera; None: not drawn
     normal: NDArray[np.float32] | None = None
+    # (H, W) uint16 number that identifies the mesh in each pixel; None: not drawn
     label: NDArray[np.uint16] | None = None
+    # (H, W, 3) float32 values interpolated between `DrawnMesh.uv` of the vertices; None: not drawn
     uv: NDArray[np.float32] | None = None
 
 
 class DrawnMesh(NamedTuple):
-    """A mesh to draw into images.
+    """A mesh to draw into images."""
 
-    Args:
-        mesh: triangles.
-        camera_from_object: (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera.
-        label: number to write into `Target.label`.
-        closed: whether the mesh is closed, so that the triangles that face away are not drawn.
-        parts: bounds of the parts of the mesh.
-        uv: (n, 3) values of the vertices, drawn into `Target.uv`; None: `Target.uv` is not drawn.
-    """
-
-    mesh: Mesh
-    camera_from_object: Array
-    label: int = 0
-    closed: bool = False
-    parts: Parts = UNKNOWN
+    mesh: Mesh  # triangles
+    camera_from_object: Array  # (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera
+    label: int = 0  # number to write into `Target.label`
+    closed: bool = False  # whether the mesh is closed, so that the triangles that face away are not drawn
+    parts: Parts = UNKNOWN  # bounds of the parts of the mesh
+    # (n, 3) values of the vertices, drawn into `Target.uv`; None: `Target.uv` is not drawn
     uv: NDArray[np.float32] | None = None
 
 
 def draw_meshes(drawn: Sequence[DrawnMesh], projection: Projection, target: Target) -> None:
-    """Draws meshes into images, in the pixels where a mesh is nearer than what they show, in parallel bands of rows.
-
-    Args:
-        drawn: the meshes, in the order in which they are drawn.
-        projection: projection of the camera.
-        target: images to draw into, modified in place.
-    """
+    """Draws meshes in their order into images in place, where they are nearer than what these show."""
     draw = []
     for item in drawn:
         points = np.ascontiguousarray(item.mesh.vertices_m.T)
@@ -129,10 +94,7 @@ def _draw(
     points, faces, colours, uv, parts, matrix, projection, depth, albedo, normal, label, places, number, closed, first,
     end,
 ):  # fmt: skip
-    """Compiled kernel of `draw_meshes`: draws the rows `first` to `end` - 1 of a mesh with the points (3, n).
-
-    The compiler removes the code for images that are None.
-    """
+    """Compiled kernel of `draw_meshes`: draws the rows `first` to `end` - 1 of a mesh with the points (3, n)."""
     n = faces.shape[0]
     shown = np.empty((n + PART_FACES - 1) // PART_FACES, np.int32)
     window = 0, depth.shape[1], first, end
@@ -192,12 +154,10 @@ def _draw(
 def _list_parts(parts, matrix, projection, window, closed, shown):
     """Writes the numbers of the parts that the image may show to `shown`; returns how many there are.
 
-    The other parts are nearer than the near plane, have no pixel centre of the `window` (first column, end, first row,
-    end) in the rectangle around their box, or belong to a closed mesh and all their triangles face away. A triangle
-    with the corner p and the unit normal m faces away from a camera at e if m (p - e) >= 0. With the centre c of the
-    part, w = c - e, the angle b between w and the axis of the cone of normals, and the angle a of this cone,
-    m (p - e) >= |w| cos(a + b) - behind_m (see `Parts`). In a parallel view, w is the direction of view, and m w >= 0
-    suffices.
+    The others are nearer than the near plane, outside the `window` (first column, end, first row, end), or of a closed
+    mesh and facing away. With the centre c of the part, w = c - e from a camera at e, the angle b between w and the
+    axis of the cone of normals, and the angle a of this cone, m (p - e) >= |w| cos(a + b) - behind_m (see `Parts`) for
+    the corner p and normal m of every triangle; in a parallel view, w is the direction of view.
     """
     centre, half, axis, cos_sin, behind = parts
     focal, cx, cy, near, perspective = projection
@@ -236,12 +196,7 @@ def _list_parts(parts, matrix, projection, window, closed, shown):
 
 @kernel(error_model="numpy", forceinline=True)
 def _interval(row, centre, half):
-    """Returns centre and half extent of a box along one axis of the camera.
-
-    Args:
-        row: (4,) row of the map from the axes of the box to this axis.
-        centre, half: (3,) centre and half extent of the box in its own axes [m].
-    """
+    """Returns centre and half extent of a box along one axis of the camera."""
     middle = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2] + row[3]
     return middle, abs(row[0]) * half[0] + abs(row[1]) * half[1] + abs(row[2]) * half[2]
 
@@ -258,10 +213,7 @@ def _inverse(matrix):
 
 @kernel(error_model="numpy")
 def _project(points, matrix, projection, point, place):
-    """Computes the points (3, n) in camera axes, and their `place` (3, n): column, row and 1 / depth or -depth.
-
-    Columns are NaN for points nearer than the near plane.
-    """
+    """Computes the points (3, n) in camera axes, and their `place` (3, n): column, row and 1 / depth or -depth."""
     focal, cx, cy, near, perspective = projection
     a, b, c = points
     n = a.size
@@ -303,10 +255,7 @@ def _list_triangles(faces, start, end, place, window, closed, kept):
 
 @kernel(error_model="numpy", forceinline=True)
 def _rectangle(ua, va, ub, vb, uc, vc, window):
-    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle.
-
-    Only pixels of the `window` count, see `_list_parts`. If there are none, a last value is less than the first one.
-    """
+    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle."""
     left, right, top, bottom = window
     u0, u1 = max(np.ceil(min(ua, ub, uc)), np.float64(left)), min(np.floor(max(ua, ub, uc)), np.float64(right - 1))
     v0, v1 = max(np.ceil(min(va, vb, vc)), np.float64(top)), min(np.floor(max(va, vb, vc)), np.float64(bottom - 1))
@@ -319,13 +268,9 @@ def _list_pixels(
 ):  # fmt: skip
     """Lists the pixel centres that the triangles `kept[k]` to `kept[n_kept - 1]` cover, from row `row` of the first on.
 
-    The rectangle around a triangle is divided into blocks of 2 x 2 pixels, of which most triangles need one. For each
-    block, the function writes its triangle, its first column and row, and the weights of the second and third corner
-    at its pixels. A hit is 4 times the number of a block plus that of a pixel in it.
-
-    Returns:
-        Number of hits, and the values of `k` and `row` at which to continue if the arrays are full; `n_kept` for `k` if
-        all triangles are listed.
+    For each block of 2 x 2 pixels it writes triangle, first column and row, and the weights of the second and third
+    corner. A hit is 4 times the number of a block plus that of a pixel in it. Returns the number of hits, and `k` and
+    `row` to go on from if the arrays are full.
     """
     u, v = place[0], place[1]
     n_blocks, n_hits = 0, 0
@@ -359,10 +304,7 @@ def _list_pixels(
 
 @kernel(error_model="numpy", forceinline=True)
 def _normal(point, i, j, k, perspective):
-    """Returns the unit normal of a triangle in camera axes, towards the camera.
-
-    i, j, k are the columns of its corners in `point` (3, n).
-    """
+    """Returns the unit normal of a triangle in camera axes, towards the camera."""
     x, y, z = point[0], point[1], point[2]
     px, py, pz, qx, qy, qz = x[j] - x[i], y[j] - y[i], z[j] - z[i], x[k] - x[i], y[k] - y[i], z[k] - z[i]
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx

@@ -19,25 +19,14 @@ LEAST_COSINE = 0.1  #: smallest cosine of the angle between ray and normal; smal
 
 
 class TexturedSurface(NamedTuple):
-    """Textures of the meshes in an image.
+    """Textures of the meshes in an image."""
 
-    Args:
-        textures: the textures.
-        of_label: (labels,) int32 number of the texture of the mesh that `Target.label` names; -1: none.
-    """
-
-    textures: Textures
-    of_label: NDArray[np.int32]
+    textures: Textures  # the textures
+    of_label: NDArray[np.int32]  # (labels,) int32 number of the texture of the mesh that `Target.label` names; -1: none
 
 
 def paint_textures(target: Target, projection: Projection, surface: TexturedSurface) -> None:
-    """Draws the textures into `target.albedo` wherever `target.label` names a mesh with a texture.
-
-    Args:
-        target: images that `draw_meshes` has drawn into; none of them is None.
-        projection: projection of the camera.
-        surface: the textures.
-    """
+    """Draws the textures into `target.albedo` after `draw_meshes`; none of the images of `target` is None."""
     _paint(*target, projection, *surface.textures, surface.of_label)
 
 
@@ -72,13 +61,7 @@ def _paint(depth, albedo, normal, label, uv, projection, texels, levels, of_labe
 
 @kernel(error_model="numpy", inline="always")
 def _sample(texels, level, across, down):
-    """Returns red, green and blue of a level at texture coordinates, interpolated bilinearly; the texture repeats.
-
-    Args:
-        texels: texels of all levels of all textures.
-        level: index of the level's first texel, and its numbers of rows and columns.
-        across, down: texture coordinates; a whole number is one repetition of the texture.
-    """
+    """Returns red, green and blue of a level at texture coordinates, interpolated bilinearly; the texture repeats."""
     first, rows, cols = level
     col, row = (across - np.floor(across)) * cols - 0.5, (down - np.floor(down)) * rows - 0.5
     c0, r0 = int(np.floor(col)), int(np.floor(row))

@@ -1,10 +1,8 @@
 """Shadows that objects cast on the floor, on each other and on themselves, in the light of lamps and sun.
 
-For each light, the objects are drawn into a depth image as seen from the light (shadow map, Williams 1978), which spans
-the points that the camera sees and has about as many pixels as its image. A point is in the shadow where the map shows
-a nearer object. The edges of shadows are accurate to a pixel of the map, which is about as large as a pixel of the
-image. Objects are drawn into the map with the level of detail that suits the map, so a point on an object counts as lit
-unless the map shows a surface that is nearer to the light by more than a bias of some pixels.
+For each light, the objects are drawn into a depth image as seen from it (shadow map, Williams 1978), which spans the
+points that the camera sees, with pixels about as large. A point is in the shadow where the map shows an object nearer
+to the light by more than a bias of some pixels.
 """
 
 from __future__ import annotations
@@ -33,29 +31,17 @@ STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias g
 
 
 class _LightView(NamedTuple):
-    """View from a light, for its shadow map.
+    """View from a light, for its shadow map."""
 
-    Args:
-        light_from_camera: (4, 4) transform from the axes of the camera to those of the view.
-        projection: projection of the map.
-        limits: (k, 4) planes of the view, see `Objects.in_view`.
-        shape: rows and columns of the map.
-    """
-
-    light_from_camera: Array
-    projection: Projection
-    limits: Array
-    shape: tuple[int, int]
+    light_from_camera: Array  # (4, 4) transform from the axes of the camera to those of the view
+    projection: Projection  # projection of the map
+    limits: Array  # (k, 4) planes of the view, see `Objects.in_view`
+    shape: tuple[int, int]  # rows and columns of the map
 
 
 class ObjectShadows:
-    """Shadow casting by objects.
-
-    Args:
-        objects: the objects.
-        rig: the rendered cameras.
-        lamp_positions_m: for each camera (0 left, 1 right), positions (lamps, 3) in its axes.
-        to_sun: (3,) unit direction to the sun in world axes; None: the sun casts no shadow.
+    """Shadow casting by objects; the lamps are in the axes of the left and right camera, `to_sun` in those of the
+    world.
     """
 
     def __init__(self, objects: Objects, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None):
@@ -70,15 +56,10 @@ class ObjectShadows:
         world_from_camera: Array,
         moment: tuple[int, float],
     ) -> None:
-        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun, or faces away from it.
-
-        The last mask is that of the sun if it casts shadows.
+        """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away.
 
         Args:
-            lit: 0 where the floor occludes the light, else 1; modified in place.
             depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
-            view: the objects in the image.
-            world_from_camera: (4, 4) pose of this camera.
             moment: camera (0 left, 1 right), and time since the start of the survey [s].
         """
         camera, time_s = moment
@@ -114,13 +95,7 @@ class ObjectShadows:
 
 
 def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
-    """Returns the view from a lamp, with its axis in the mean direction of the points; None if no point is ahead of it.
-
-    Args:
-        lamp_m: (3,) position of the lamp in the axes of the camera.
-        points: (n, 3) points that the map shows, in the axes of the camera [m].
-        shape: rows and columns of the image.
-    """
+    """Returns the view from a lamp, its axis in the mean direction of the points; None if no point is ahead."""
     away = points - lamp_m
     rotation = _axes_along((away / np.linalg.norm(away, axis=1, keepdims=True)).mean(axis=0))
     seen = away @ rotation
@@ -141,13 +116,7 @@ def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightVi
 
 
 def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
-    """Returns the parallel view from the sun.
-
-    Args:
-        to_sun: (3,) unit direction to the sun in the axes of the camera.
-        points: (n, 3) points that the map shows, in the axes of the camera [m].
-        shape: rows and columns of the image.
-    """
+    """Returns the parallel view from the sun."""
     rotation = _axes_along(-to_sun)
     seen = points @ rotation
     low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
@@ -160,13 +129,7 @@ def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightVie
 
 
 def _scale(low: Array, high: Array, shape: tuple[int, int]) -> float:
-    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image.
-
-    Args:
-        low, high: (2,) lower and upper ends of the map along columns and rows: tangents for a focal length, metres for
-            a scale.
-        shape: rows and columns of the image.
-    """
+    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image."""
     area = np.maximum(high - low, 1e-3).prod()
     return float(np.sqrt(shape[0] * shape[1] / area))
 
@@ -186,12 +149,7 @@ def _axes_along(forward: Array) -> Array:
 
 
 def _looking(rotation: Array, position_m: Array) -> Array:
-    """Returns the transform (4, 4) from the axes of the camera to those of a view.
-
-    Args:
-        rotation: (3, 3) axes of the view, as columns, in the axes of the camera.
-        position_m: (3,) origin of the view in the axes of the camera.
-    """
+    """Returns the transform (4, 4) from the axes of the camera to those of a view."""
     return geometry.inverse(geometry.pose(rotation, position_m))
 
 
@@ -199,9 +157,8 @@ def _looking(rotation: Array, position_m: Array) -> Array:
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
     """Sets `lit` (H, W) to 0 in the rows `first` to `end` - 1 where the map `nearest` shows an object that occludes.
 
-    A point is occluded if the depth in the map is less than that of the point minus a bias. On the floor, the bias is
-    one pixel of the map. On an object, it is BIAS_PX (1 + t) pixels, where t is the tangent of the angle of
-    incidence or, if smaller, STEEPEST. Surfaces of objects that face away from the light are not lit either.
+    The bias is one pixel of the map on the floor, and BIAS_PX (1 + t) pixels on an object, t being the tangent of the
+    angle of incidence up to STEEPEST. Surfaces of objects that face away are not lit.
     """
     height, width = depth.shape
     x = (np.arange(width) - 0.5 * (width - 1)) / focal
@@ -227,19 +184,7 @@ def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first
 
 @kernel(error_model="numpy", forceinline=True)
 def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
-    """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map.
-
-    Args:
-        depth: (w,) depth of the points in the camera [m].
-        x: (w,) their horizontal tangents in the camera.
-        y: vertical tangent of the row.
-        matrix: (3, 4) map from the axes of the camera to those of the view.
-        projection: projection of the map.
-        shape: rows and columns of the map.
-        cell: filled with the numbers of the pixels.
-        reach: filled with the depths of the points in the view [m].
-        bias: filled with the size of a pixel at these depths [m].
-    """
+    """Computes the pixels of the map that show the points of a row (w,), numbered row by row; -1 outside the map."""
     scale, cx, cy, _, perspective = projection
     rows, cols = shape
     for u in range(depth.size):
@@ -259,12 +204,7 @@ def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
 
 @kernel(error_model="numpy", forceinline=True)
 def _cosine(depth, x, y, normal, matrix, perspective):
-    """Returns the cosine of the angle between the normal (3,) at a point and the direction to the light.
-
-    The normal has the axes of the camera.
-
-    The tangents `x`, `y` and the depth [m] of the point are those in the camera; see `_find_cells`.
-    """
+    """Returns the cosine of the angle between the normal (3,) at a point and the light, in camera axes."""
     z = np.float64(depth)
     x, y = x * z, y * z
     nx, ny, nz = normal[0], normal[1], normal[2]

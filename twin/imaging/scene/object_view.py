@@ -24,12 +24,9 @@ LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image 
 
 
 class Objects:
-    """Objects in the world, with the level of detail that a view needs.
+    """Objects in the world, with the level of detail that a view needs; plants sway in the current (3,).
 
-    Args:
-        placed: the objects.
-        current_mps: (3,) velocity of the current, in which plants sway.
-        floor: tiles of a mesh floor, which are drawn like objects and numbered after them; None: the floor is no mesh.
+    The tiles of a mesh floor are drawn like objects and numbered after them.
     """
 
     def __init__(
@@ -48,15 +45,11 @@ class Objects:
         self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
 
     def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> list[DrawnMesh]:
-        """Returns the meshes of the objects in view, in the order of the depth of their centres.
-
-        Labels are 1 + the index in `placed`.
+        """Returns the meshes of the objects in view by depth of their centres; labels are 1 + the index in `placed`.
 
         Args:
             camera_from_world: (4, 4) transform from world axes to those of the camera.
-            limits: (k, 4) planes of the view frustum in these axes: unit normal, which points inward, and offset [m].
-            pixel: projection, whose pixels determine the levels of detail.
-            time_s: time since the start of the survey.
+            limits: (k, 4) planes of the view frustum in these axes: inward unit normal and offset [m].
         """
         centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
@@ -74,11 +67,7 @@ class Objects:
         return drawn
 
     def uv_of(self, number: int) -> NDArray[np.float32] | None:
-        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes.
-
-        Args:
-            number: index of the mesh in `placed`.
-        """
+        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes."""
         return self._uv[number - self._n_objects] if number >= self._n_objects else None
 
 
@@ -86,25 +75,14 @@ def draw_objects(
     objects: Objects, target: Target, camera_from_world: Array, limits: Array, projection: Projection,
     time_s: float = 0.0,
 ) -> None:  # fmt: skip
-    """Draws the objects in view into images, with their numbers + 1 as labels, and the textures of a mesh floor.
-
-    Args:
-        objects: the objects.
-        target: images to draw into; with textures, none of them is None.
-        camera_from_world, limits, projection, time_s: see `Objects.in_view`.
-    """
+    """Draws the objects in view into images, labelled by their numbers + 1, and the textures of a mesh floor."""
     draw_meshes(objects.in_view(camera_from_world, limits, projection, time_s), projection, target)
     if objects.surface is not None:
         paint_textures(target, projection, objects.surface)
 
 
 class ObjectRenderer:
-    """Renderer that draws objects into images of the floor.
-
-    Args:
-        objects: the objects.
-        rig: calibration of the rendered cameras.
-    """
+    """Renderer that draws objects into images of the floor."""
 
     def __init__(self, objects: Objects, rig: StereoRig):
         self._objects = objects
@@ -112,14 +90,7 @@ class ObjectRenderer:
         self._limits = frustum(rig)
 
     def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
-        """Draws the objects into `albedo` (H, W, 3) and `depth` (H, W) in place; returns their normals and labels.
-
-        Args:
-            albedo: (H, W, 3) uint8 albedo of the floor.
-            depth: (H, W) float32 depth of the floor along the optical axis [m]; inf where there is no floor.
-            world_from_camera: (4, 4) pose of the camera.
-            time_s: time since the start of the survey.
-        """
+        """Draws the objects into `albedo` (H, W, 3) uint8 and `depth` (H, W) [m] in place; returns their view."""
         view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
         uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)
         target = Target(depth, albedo, *view, uv)

@@ -26,9 +26,7 @@ class Renderer:
     A renderer owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
 
     Args:
-        scene: MuJoCo model of the scene.
         width_px, height_px, vfov_deg: image size and vertical field of view; square pixels, centred principal point.
-        znear_m, zfar_m: depths of the clipping planes.
 
     Raises:
         TwinError: OpenGL is not available.
@@ -61,11 +59,7 @@ class Renderer:
         self._shown = np.ones(len(self._tiles), dtype=bool)
 
     def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; inf = no floor.
-
-        Args:
-            world_from_camera: (4, 4) pose of the camera.
-        """
+        """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; inf = no floor."""
         self._gl.make_current()
         self._set_pose(world_from_camera)
         self._show(visible_tiles(self._scene_model, world_from_camera, self._tan))
@@ -105,21 +99,14 @@ class Renderer:
             camera.up[:] = -world_from_camera[:3, 1]
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Shows only the tiles of the mask `visible` (n,).
-
-        The others lose their mesh, as MuJoCo renders geoms without a mesh in almost no time.
-        """
+        """Shows only the tiles of the mask `visible` (n,)."""
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible
 
 
 def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
-    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded.
-
-    Raises:
-        TwinError: OpenGL is not available.
-    """
+    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded."""
     try:
         gl = offscreen_context(width_px, height_px)
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -146,12 +133,9 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the floor tiles that may be in view; all others lie outside a plane of the view frustum.
+    """Returns a mask (n,) of the floor tiles that may be in view, not outside a plane of the view frustum.
 
-    Args:
-        scene: MuJoCo model of the scene.
-        world_from_camera: (4, 4) pose of the camera.
-        half_tangents: (2,) tangents of half the horizontal and vertical field of view.
+    `half_tangents` (2,) are those of half the horizontal and vertical field of view.
     """
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T

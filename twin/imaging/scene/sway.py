@@ -1,8 +1,7 @@
 """Plants that bend and sway in the current.
 
-The deflection of a plant is proportional to the square of the height above its holdfast, as that of a cantilever near
-its fixed end. It leans with the current and oscillates about this mean deflection, at the frequency at which a body of
-its width sheds eddies (Strouhal number).
+The deflection grows with the square of the height above the holdfast (cantilever); it leans with the current and
+oscillates at the frequency at which a body of its width sheds eddies (Strouhal number).
 """
 
 from __future__ import annotations
@@ -26,10 +25,7 @@ def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) ->
     """Returns the mesh of a plant as the current bends it; unchanged without a horizontal current.
 
     Args:
-        mesh: a level of detail of the upright plant, in the axes of the object.
-        item: the plant, of which `mesh` is a level of detail.
         current_mps: (3,) velocity of the current in the world.
-        time_s: time since the start of the survey.
     """
     speed = float(np.hypot(*current_mps[:2]))
     if speed == 0:
@@ -48,14 +44,7 @@ def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) ->
 
 
 def largest_displacement_m(item: PlacedObject, current_mps: Array) -> float:
-    """Returns an upper bound of the distance by which `swayed` moves a vertex of a plant in the world, at any time [m].
-
-    It is 0 for an object that does not sway.
-
-    Args:
-        item: the object.
-        current_mps: (3,) velocity of the current in the world.
-    """
+    """Returns an upper bound of the distance by which `swayed` moves a vertex [m]; 0 if it does not sway."""
     if not item.model.sways:
         return 0.0
     aside = _lean(float(np.hypot(*current_mps[:2]))) * (1 + OSCILLATION)  # deflection of the tip / height

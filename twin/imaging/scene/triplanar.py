@@ -1,12 +1,8 @@
 """Albedo of steep parts of the floor by triplanar mapping: textures projected horizontally, see `twin.terrains.walls`.
 
-The albedo depends only on the point of the floor. Its texture is filtered over the footprint of the pixel on the
-rendered facet: trilinearly between levels of resolution (Williams 1983), at several places along the major axis of the
-footprint, because walls are seen obliquely (anisotropic filter, McCormack et al. 1999, Feline).
-
-The steep pixels of a row pass through short loops, most of them without branches, so that the compiler vectorizes them.
-A colour is one integer with a lane of 21 bits for each band; the weights of all samples of a pixel are integers that
-add up to WHOLE, so a weighted sum of colours takes one multiplication for each texel and never leaves its lane.
+The texture is filtered over the footprint of the pixel on the facet: trilinearly between levels (Williams 1983), at
+several places along the major axis (McCormack et al. 1999, Feline). The steep pixels of a row pass through short loops
+without branches. A colour is one integer with a lane of 21 bits per band; the weights of all samples add up to WHOLE.
 """
 
 from __future__ import annotations
@@ -17,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.grid_triangles import rises
 from twin.core.records import Image
 from twin.core.row_parallel import in_row_bands
 from twin.kernels import kernel
@@ -37,30 +34,20 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depth
 
 
 class WallSurface(NamedTuple):
-    """Steep parts of a floor for the compiled kernels. All coordinates are texels of the texture of the walls.
+    """Steep parts of a floor for the compiled kernels. All coordinates are texels of the texture of the walls."""
 
-    Args:
-        height: (ny, nx) float32 heights of the floor below its highest point.
-        number: (ny - 1, nx - 1), weights: (n, 2, 2, 2): see `twin.terrains.walls.Walls`.
-        texels: (n,) uint64 colours of all levels, row by row.
-        levels: (LEVELS, 3) int64: number of the first texel, rows and columns of each level, finest first. A texel of a
-            level is the mean of 2 x 2 texels of the level before.
-        spacing, length: distance between the nodes, length of the texture [texels].
-        corner_m: (2,) x and y of the south-west corner of the floor [m].
-        high_m: greatest height of the floor [m].
-        texel_m: side of a texel [m].
-    """
-
-    height: NDArray[np.float32]
-    number: NDArray[np.int32]
+    height: NDArray[np.float32]  # (ny, nx) float32 heights of the floor below its highest point
+    number: NDArray[np.int32]  # (ny - 1, nx - 1), weights: (n, 2, 2, 2): see `twin.terrains.walls.Walls`
     weights: NDArray[np.float32]
-    texels: NDArray[np.uint64]
+    texels: NDArray[np.uint64]  # (n,) uint64 colours of all levels, row by row
+    # (LEVELS, 3) int64: number of the first texel, rows and columns of each level, finest first. A texel of a level is
+    # the mean of 2 x 2 texels of the level before.
     levels: NDArray[np.int64]
-    spacing: np.float32
+    spacing: np.float32  # distance between the nodes, length of the texture [texels]
     length: np.float32
-    corner_m: Array
-    high_m: float
-    texel_m: float
+    corner_m: Array  # (2,) x and y of the south-west corner of the floor [m]
+    high_m: float  # greatest height of the floor [m]
+    texel_m: float  # side of a texel [m]
 
 
 def wall_surface(terrain: Terrain) -> WallSurface | None:
@@ -96,15 +83,7 @@ def _levels(texture: Image) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
 def paint_walls(
     surface: WallSurface, albedo: Image, depth: NDArray[np.float32], world_from_camera: Array, focal_px: float
 ) -> None:
-    """Blends the texture of the walls into an image of the floor, in place.
-
-    Args:
-        surface: steep parts of the floor.
-        albedo: (H, W, 3) uint8 albedo with the texture projected from above.
-        depth: (H, W) depth of the floor along the optical axis [m]; inf where there is no floor.
-        world_from_camera: (4, 4) pose of the camera; x right, y down, z forward.
-        focal_px: focal length; the optical axis is at the centre of the image.
-    """
+    """Blends the texture of the walls into the albedo (H, W, 3) of a centred pinhole camera, in place."""
     pose = np.array(world_from_camera[:3]) / surface.texel_m  # east, north and down from the highest point [texels]
     pose[:2, 3] -= surface.corner_m / surface.texel_m
     pose[2] = -pose[2]
@@ -120,15 +99,7 @@ def paint_walls(
 def paint_walls_from_above(
     surface: WallSurface, albedo: Image, x_m: NDArray[np.floating], y_m: NDArray[np.floating], step_m: float
 ) -> None:
-    """Blends the texture of the walls into a parallel view of the floor from above, in place.
-
-    Args:
-        surface: steep parts of the floor.
-        albedo: (rows, cols, 3) uint8 albedo with the texture projected from above.
-        x_m: (cols,) x of the samples.
-        y_m: (rows,) y of the samples.
-        step_m: distance between the samples.
-    """
+    """Blends the texture of the walls into a parallel view of the floor from above, in place."""
     spacing_m = float(surface.spacing) * surface.texel_m
     columns, rows = (x_m - surface.corner_m[0]) / spacing_m, (y_m - surface.corner_m[1]) / spacing_m
     _paint_from_above(surface, albedo, columns, rows, np.float32(step_m / surface.texel_m))
@@ -136,13 +107,7 @@ def paint_walls_from_above(
 
 @kernel(fastmath=_FAST, error_model="numpy")
 def _paint(surface, albedo, depth, view, origin, focal, first, end):
-    """Compiled kernel of `paint_walls` for the rows first to end - 1.
-
-    Args:
-        view: (3, 4) map from the axes of the camera [m] to east and north of the cell `origin`, and down from the
-            highest point of the floor [texels].
-        origin: (2,) column and row of this cell.
-    """
+    """Compiled kernel of `paint_walls` for the rows first to end - 1."""
     height, width = depth.shape
     work, steep = np.empty((_N_WORK, width), np.float32), np.empty((3, width), np.int32)
     total, used = np.empty(width, np.uint64), np.empty(width, np.int64)
@@ -221,10 +186,7 @@ def _find(surface, depth, y, view, origin, focal, work, steep):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _place(surface, origin, work, steep, n):
-    """Fills the rows _EAST and _NORTH of `work` with the slopes of the facets, _X and _Y with the signed weights.
-
-    The slopes are the increase of the depth below the highest point, divided by the distance.
-    """
+    """Fills the rows _EAST and _NORTH of `work` with the slopes of the facets, _X and _Y with the signed weights."""
     height, number, weights = surface.height, surface.number, surface.weights
     per_cell = np.float32(1) / surface.spacing
     one = np.float32(1)
@@ -232,9 +194,8 @@ def _place(surface, origin, work, steep, n):
         c, r, s, t = steep[1, i], steep[2, i], work[_COL, i], work[_ROW, i]
         south_west, south_east = height[r, c], height[r, c + 1]
         north_west, north_east = height[r + 1, c], height[r + 1, c + 1]
-        lower = s >= t
-        work[_EAST, i] = (south_east - south_west if lower else north_east - north_west) * per_cell
-        work[_NORTH, i] = (north_east - south_east if lower else north_west - south_west) * per_cell
+        east, north = rises(south_west, south_east, north_west, north_east, s, t)
+        work[_EAST, i], work[_NORTH, i] = east * per_cell, north * per_cell
         k = number[r, c]
         sw, se, nw, ne = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
         work[_X, i] = (
@@ -303,12 +264,9 @@ def _blend(surface, albedo, work, steep, n, total, used):
 def _footprints(across, down, work, n):
     """Fills the rows _MAJOR_ALONG to _LEVEL of `work`: the filter of the pixels.
 
-    With J the (2, 2) displacement in the texture to the next pixel along both axes, the footprint is an ellipse, and
-    its squared axes are the eigenvalues of J J^T. There are as many samples along the major axis as it is longer than
-    the minor axis, MOST_SAMPLES at most, and the texels of the level are as large as the distance between the samples.
-
-    Args:
-        across, down: (W,) displacement along the columns of the texture; that along its rows is in `work`.
+    With J the (2, 2) displacement in the texture to the next pixels, the squared axes of the footprint are the
+    eigenvalues of J J^T. There are as many samples along the major axis as it is longer than the minor, at most
+    MOST_SAMPLES.
     """
     zero, one, half, most = np.float32(0), np.float32(1), np.float32(0.5), np.float32(MOST_SAMPLES)
     size = work[_LEVEL]
@@ -330,14 +288,7 @@ def _footprints(across, down, work, n):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _filtered(texels, levels, weight, along, turned, work, i, total, used):
-    """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added.
-
-    Args:
-        weight: weight of the texture in this pixel, 0 to 1.
-        along: column in the texture [texels].
-        turned: -1 if the texture runs from right to left, else 1.
-        of_pixel: column of `work`.
-    """
+    """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added."""
     samples, level = np.int64(work[_SAMPLES, i]), min(work[_LEVEL, i], np.float32(LEVELS - 1.001))
     fine = np.int64(level)
     each = np.int64(weight * np.float32(WHOLE) / work[_SAMPLES, i] + np.float32(0.5))
@@ -354,10 +305,7 @@ def _filtered(texels, levels, weight, along, turned, work, i, total, used):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _sample(texels, levels, level, along, below, weight):
-    """Returns `weight` times the colour of a level at a point [finest texels], interpolated bilinearly.
-
-    The texels of the edges continue beyond the texture.
-    """
+    """Returns `weight` times the colour of a level at a point [finest texels], interpolated bilinearly."""
     first, rows, cols = levels[level, 0], levels[level, 1], levels[level, 2]
     zero, half, scale = np.float32(0), np.float32(0.5), np.float32(1) / np.float32(1 << level)
     col = min(max(along * scale - half, zero), np.float32(cols - 2))

@@ -1,4 +1,4 @@
-"""Weighted sums of neighbouring colours, in vector instructions.
+"""Vectorized arithmetic of the compiled loops: powers of two, and weighted sums of neighbouring colours.
 
 The compiler does not vectorize across the bands of a colour, and reads tables element by element. These intrinsics emit
 the vector operations themselves: for 4 x 4 pixels of an image, and for entries of a table of R, G, B and a zero.
@@ -6,10 +6,33 @@ the vector operations themselves: for 4 x 4 pixels of an image, and for entries 
 
 from __future__ import annotations
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
+
+from twin.kernels import kernel
+
+LOG2_E = 1.4426950408889634
+LEAST = -126.0  # exponent of the smallest normal number in single precision; smaller exponents are clipped to it
+
+
+@kernel(inline="always")
+def two_to(t):
+    """Returns 2^t for t from -126 to 127 with a relative error of 2e-7, exactly 1 at 0; a smaller t counts as -126.
+
+    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 is computed by a minimax polynomial, 2^n by setting the
+    exponent bits of a float32.
+    """
+    one, t = np.float32(1.0), max(t, np.float32(LEAST))
+    n = np.floor(t + np.float32(0.5))
+    f = t - n
+    p = np.float32(9.671513e-3) + f * np.float32(1.3264727e-3)
+    p = np.float32(2.4022242e-1) + f * (np.float32(5.5507336e-2) + f * p)
+    power = np.int32((np.int32(n) + np.int32(127)) << np.int32(23)).view(np.float32)
+    return power * (one + f * (np.float32(6.931470e-1) + f * p))
+
 
 _PIXELS, _BANDS = 4, 3
 _FUSED = ("contract",)  # lets the compiler fuse multiplication and addition
@@ -18,14 +41,10 @@ _NUMBER, _INDEX = ir.FloatType(), ir.IntType(32)
 
 @intrinsic
 def sum_of_pixels(typingctx, image, start, stride, weights, at):
-    """Returns the three weighted sums (R, G, B) of 4 x 4 pixels of a float32 image; no bounds are checked.
+    """Returns the weighted sums (R, G, B) of 4 x 4 pixels of a float32 image (H, 3 W); no bounds are checked.
 
-    Args:
-        image: (H, 3 W) image, contiguous.
-        start: index of the first band of the top left pixel in the flattened image.
-        stride: number of values from row to row.
-        weights: (8, n) weights of the columns (0 to 3) and of the rows (4 to 7), contiguous float32.
-        at: column of `weights`.
+    `start` is the index of the top left value, `stride` that from row to row; column `at` of `weights` (8, n) holds the
+    weights of the columns (0 to 3) and of the rows (4 to 7).
     """
     result = types.UniTuple(types.float32, _BANDS)
     signature = result(image, types.int64, types.int64, weights, types.int64)
@@ -61,8 +80,6 @@ def sum_of_entries(typingctx, table, places, weights):
     """Returns the three weighted sums (R, G, B) of entries of a float32 table; no bounds are checked.
 
     Args:
-        table: flattened table of R, G, B and a zero, contiguous.
-        places: tuple of the indices of R of each entry, uint32.
         weights: tuple of their weights, float32.
     """
     result = types.UniTuple(types.float32, _BANDS)

@@ -77,10 +77,8 @@ def turn_by_cosine(x, y, z, cosine, rng):
 def sample_guide(cumulative_angle, rng):
     """Returns the cosine of a random angle from the direction to a lamp or the sun, for directions sampled around it.
 
-    The distribution is a mixture of two, each with probability 1/2. The first is for light that is scattered once
-    between lamp and point: its angle is uniform between 0 and a scattering angle that is sampled by `sample_angle`. The
-    second is wider, for light that is scattered more often: Henyey-Greenstein with the mean cosine `GUIDE_G`, by
-    inversion.
+    Half of them are for light scattered once (uniform between 0 and a `sample_angle`), half are wider
+    (Henyey-Greenstein with the mean cosine `GUIDE_G`, by inversion).
     """
     if rng.random() < 0.5:
         return np.cos(sample_angle(cumulative_angle, rng) * rng.random())
@@ -93,11 +91,8 @@ def sample_guide(cumulative_angle, rng):
 def guide_density(density_per_sr, beyond, angle_integral, cosine):
     """Returns the density [1/sr] of the directions of `sample_guide` at the cosine of the angle from the lamp or sun.
 
-    Args:
-        density_per_sr: (n,) phase function table [1/sr].
-        beyond: (n + 1,) integral of the phase function over the angle, from each cell boundary to pi [rad/sr].
-        angle_integral: integral of phase function times angle from 0 to pi [rad^2/sr].
-        cosine: cosine of the angle from the lamp or the sun.
+    `beyond` (n + 1,) is the integral of the phase function from each cell boundary to pi [rad/sr], `angle_integral`
+    that of phase function times angle [rad^2/sr].
     """
     g, cells = GUIDE_G, density_per_sr.shape[0]
     x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 1e-18)))

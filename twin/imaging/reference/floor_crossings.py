@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.core.floor_rays import cast_ray
+from twin.core.grid_triangles import rises
 from twin.kernels import kernel
 
 LIFT_M = 1e-6  # distance by which a path vertex on the floor is moved off the floor, along the normal
@@ -13,12 +14,9 @@ TOLERANCE_M = 1e-4  # an intersection with the floor this close to the end of a 
 
 @kernel
 def floor_distance(is_plane, field, ox, oy, oz, dx, dy, dz):
-    """Returns the distance [m] at which the ray from (ox, oy, oz) intersects the floor; inf if it does not.
+    """Returns the distance [m] at which the ray from o in the unit direction d meets the floor; inf if it does not.
 
-    Args:
-        is_plane: whether the floor is the plane z = 0; if not, it is `field`.
-        field: height field (`floor_rays.HeightField`).
-        dx, dy, dz: unit direction, z up.
+    The floor is the plane z = 0 if `is_plane`, else `field`.
     """
     if is_plane:
         return -oz / dz if dz < 0 else np.inf
@@ -74,7 +72,7 @@ def _height_and_slopes(field, x, y):
     u, v = u - c, v - r
     h00, h01 = field.height_m[r, c], field.height_m[r, c + 1]
     h10, h11 = field.height_m[r + 1, c], field.height_m[r + 1, c + 1]
-    east, north = (h01 - h00, h11 - h01) if u >= v else (h11 - h10, h10 - h00)
+    east, north = rises(h00, h01, h10, h11, u, v)
     return h00 + u * east + v * north, east / field.spacing_m, north / field.spacing_m
 
 
