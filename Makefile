@@ -32,7 +32,7 @@ slow: env ## whole surveys and benchmarks
 
 docs: env ## the documentation as a site, in site/
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
-	$(BIN)/mkdocs build --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 agreement: env ## the gate of the surrogate: 64 rendered surveys, then docs/agreement.md and its figure
 	$(BIN)/twin study agreement --out runs/study-agreement --resume; status=$$?; \
