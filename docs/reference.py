@@ -10,8 +10,8 @@ from twin.scenario.model import Scenario
 
 HEAD = """# Scenario keys
 
-Written by `python docs/reference.py docs/reference/scenario.md` from the model of the scenario; `twin schema` prints the same
-as a JSON schema for editors. How the keys work together is in the [scenario guide](../guide/scenario.md).
+Written by `python docs/reference.py docs/reference/scenario.md` from the model of the scenario; `twin schema` prints
+the same as a JSON schema for editors. How the keys work together is in the [scenario guide](../guide/scenario.md).
 """
 _TITLES = {"lamps": "[[lamps]]", "beacons": "[[beacons]]", "objects": "[[objects]]"}
 _UNIT = re.compile(r"\s*\[([^\[\],]+)\](?=$|;)")

@@ -59,5 +59,5 @@ def test_the_readme_fits_a_screen_or_two_and_the_findings_are_no_diary():
 
 def test_commands_are_those_of_shell_blocks_without_those_that_ran_already():
     script = runpy.run_path(str(ROOT / "tests" / "readme_commands.py"))["script"]
-    page = "```sh\nmake demo  # first\ntwin plan reef\n```\n\n    twin doctor\n\n```toml\nseed = 1\n```\n\n```sh\nls\n```\n"
+    page = "```sh\nmake demo # a\ntwin plan reef\n```\n\n    twin doctor\n\n```toml\na = 1\n```\n\n```sh\nls\n```\n"
     assert script(page, ["make demo"]) == "set -eux\ntwin plan reef\nls\n"
