@@ -94,3 +94,11 @@ def test_the_search_starts_where_three_sigmas_of_the_image_positions_exceed_the_
         cov = np.zeros((6, 6))
         cov[axis, axis] = (factor * limit) ** 2
         assert wide_search.may_exceed(SEARCH_PX, node.points, cov, RIG) is expected
+
+
+def test_a_prediction_whose_covariance_is_not_positive_definite_does_not_accept_any_motion():
+    """After registrations with the mosaic, an eigenvalue may be negative, here along x."""
+    cov, found_cov = np.diag([1e-6] * 3 + [-3.5e-7, 1e-4, 1e-4]), np.eye(6) * 1e-6
+    near, far = (geometry.exp(np.array([0, 0, 0, x, 0, 0])) @ MOTION for x in (0.002, 0.5))
+    assert wide_search.agrees(near, found_cov, MOTION, cov)
+    assert not wide_search.agrees(far, found_cov, MOTION, cov)

@@ -15,7 +15,7 @@ from twin.imaging.light.illumination import Daylight, Illumination, daylight_at,
 from twin.imaging.light.phase_function import petzold, tabulate
 from twin.imaging.light.sun_sky import SunSky
 from twin.imaging.light.water import Medium, medium
-from twin.imaging.light.waves import GRAVITY_MPS2, slope_variance
+from twin.imaging.light.waves import GRAVITY_MPS2, curvature_spectrum, directionality, slope_variance
 from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig
 
 CLEAR = medium(WaterConfig(jerlov="clear"))
@@ -88,6 +88,22 @@ def test_mean_square_slope_agrees_with_sun_glitter(wind_mps):
     along, across = slope_variance(wind_mps)
     assert along + across == pytest.approx(0.003 + 0.00512 * wind_mps, rel=0.3)
     assert along / across == pytest.approx(0.00316 * wind_mps / (0.003 + 0.00192 * wind_mps), rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("wind_mps", "level"), [(6.0, 0.01 * (1 + np.log(0.20698 / 0.23))), (12.0, 0.01 * (1 + 3 * np.log(0.47699 / 0.23)))]
+)
+def test_the_slowest_waves_have_the_published_curvature_and_directionality(wind_mps, level):
+    """Elfouhaily et al. (1997), eq. 40, 41, 44 and 57, where the long waves have died out: at 370 and 740 rad/m."""
+    friction_mps = wind_mps * np.sqrt(1e-3 * (0.8 + 0.065 * wind_mps))
+    slowest, shorter = curvature_spectrum(np.array([370.0, 740.0]), wind_mps)
+    assert slowest == pytest.approx(level / 2, rel=0.01)
+    shorter_mps = np.sqrt(9.81 / 740 * (1 + 2**2))
+    assert shorter / slowest == pytest.approx(0.23 / shorter_mps * np.exp(-0.25), rel=0.01)
+    delta = np.arctanh(directionality(np.array([370.0]), wind_mps))[0]
+    assert delta - np.log(2) / 4 - 4 * (0.23 * 0.84 / wind_mps) ** 2.5 == pytest.approx(
+        0.13 * friction_mps / 0.23, rel=0.01
+    )
 
 
 def test_the_waves_of_the_tile_and_the_unresolved_ones_have_the_slopes_of_the_spectrum():

@@ -48,6 +48,16 @@ def test_the_blur_length_is_speed_exposure_focal_length_over_depth(length_px, an
     assert abs(across @ grown @ across) < 0.002 and np.abs(after[0] - before[0]).max() < 1e-4
 
 
+def test_the_kernel_of_a_short_path_has_the_moments_of_a_uniform_path():
+    light, path = np.ones((H, W, 3), np.float32), (1.8, -1.3)  # on a background: light is cut off at 0
+    light[45, 60] += 1.0
+    share = blur_by_motion(light, FLOOR, FOCAL, sideways(path), 0.01)[..., 0] - 1.0
+    u, v = U - 60, V - 45
+    for power, moment in (((2, 0), 1 / 12), ((0, 2), 1 / 12), ((1, 1), 1 / 12), ((2, 2), 1 / 80)):
+        expected = moment * path[0] ** power[0] * path[1] ** power[1]
+        assert (share * u ** power[0] * v ** power[1]).sum() == pytest.approx(expected, abs=1e-5)
+
+
 def test_the_blur_is_the_mean_of_the_images_along_the_path():
     rng = np.random.default_rng(1)
     frequencies = rng.uniform(-0.9, 0.9, (30, 2))  # waves of seven pixels and longer [rad/px]

@@ -17,7 +17,7 @@ from twin.judge.control import control_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.metrics import EvaluationInput, check_require, empty_metrics, evaluate
 from twin.judge.overlap import overlap_metrics
-from twin.judge.require import more_is_better, number_paths
+from twin.judge.require import meets_limit, more_is_better, number_paths
 from twin.judge.swaths import leg_numbers, travel_direction
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
@@ -211,6 +211,16 @@ def test_the_far_end_of_a_track_is_farthest_from_the_start_as_planned():
     result = dataclasses.replace(RESULT, final=Trajectory(TRUTH.trajectory.times_s, poses))
     rows = evaluated(result, ELEVATION, TRUTH, RIG)["tracks"]
     assert [row["farthest_error_m"] for row in rows] == pytest.approx([0.03, 0.07])
+
+
+@pytest.mark.parametrize(("name", "worse"), [("map.le90_m", 0.1), ("map.completeness", -0.1)])
+def test_a_value_at_its_limit_meets_it(name, worse):
+    assert [meets_limit(name, value, 0.5) for value in (0.5 - worse, 0.5, 0.5 + worse, None)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
 
 
 def test_requirements_bound_errors_from_above_and_quality_from_below():

@@ -104,3 +104,14 @@ def test_old_versions_of_a_module_are_removed(package):
     versions = list((package.parents[1] / "cache" / "seabed-twin" / "kernels" / "twin.callee").iterdir())
     assert len(versions) == twin.kernels._VERSIONS_KEPT
     assert run(package)[1] == 1
+
+
+def test_processes_that_compile_at_once_write_different_files(package):
+    """One file with the code of the other process would be called with arguments of the wrong types."""
+    run(package)
+    code = "from twin.callee import scale; before = scale._cache._cache_file._load_index; "
+    code += "scale._cache._cache_file._load_index = lambda: {}; scale(1); scale._cache._cache_file._load_index = before"
+    variables = {**os.environ, "NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(package.parents[1] / "cache")}
+    subprocess.run([sys.executable, "-c", code], cwd=package.parent, env=variables, check=True)
+    assert run(package)[0] == 5.0
+    assert len(list((package.parents[1] / "cache").rglob("callee.scale*.nbc"))) == 2

@@ -59,13 +59,13 @@ CASES = {
     ),
     "missed": (
         dict(**missed("map.le90_m", 0.031)), "complete, requirement missed", "bad",
-        ["Requirement missed: map.le90_m is 0.031, at most 0.02 is required."],
+        ["Requirement missed: map.le90_m is 0.031 m, at most 0.02 m is required."],
     ),
     "holes": (
         dict(map={"completeness_area": 0.81, "le90_area_m": None}, **missed()),
         "complete, requirement missed", "bad",
         ["Requirement missed: map.le90_area_m is infinite (only 81 % of the asked area has a height), "
-         "at most 0.02 is required."],
+         "at most 0.02 m is required."],
     ),
     "NEES": (
         dict(consistency={"nees_position_mean": 8.71}), "complete, with warnings", "warn",

@@ -522,3 +522,24 @@ def test_texels_are_as_fine_as_the_pixels_of_the_images_by_default(values: list[
 )
 def test_integers_of_a_toml_file_have_64_bits(value, valid):
     assert (not list(value_errors({"a": {"b": [value]}}))) is valid
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides", "inherits"),
+    [
+        ("[plan]\ntracks = 1", [], True),
+        ('[terrain]\ncover = "sand"', [], True),
+        ('[terrain]\nkind = "cliffs"', [], False),
+        ('[terrain]\nkind = "file"\nheight_file = "hill.npy"', [], False),
+        ("", ["terrain.kind=cliffs"], False),
+        ("", ["terrain.kind=cliffs", "objects.0.size_m=0.3"], True),
+        ("", ["terrain.cover=sand"], True),
+    ],
+)
+def test_the_objects_of_a_base_file_stay_on_its_floor(tmp_path, text, overrides, inherits):
+    file = tmp_path / "own.toml"
+    file.write_text(f'extends = "quickstart"\n{text}\n')
+    scenario = load_scenario(file, overrides)
+    assert len(scenario.objects) == (len(load_scenario("quickstart").objects) if inherits else 0)
+    file.write_text(f'extends = "quickstart"\n{text}\n[[objects]]\nshape = "crate"\nposition_m = [0.0, 0.0]\n')
+    assert [item.shape for item in load_scenario(file).objects] == ["crate"]

@@ -1,5 +1,7 @@
 """Degraded surveys in studies, holes of the map in the search, and completeness with every map statistic."""
 
+import re
+
 import numpy as np
 import pytest
 from study_surveys import STUDY, fly, study_of
@@ -43,7 +45,7 @@ def test_the_report_of_a_study_names_the_reason_of_degraded_surveys(study, tmp_p
     assert {r.reason for r in analysis.failure_reasons if r.status == "degraded"} == {"the stereo residuals are … px"}
     monkeypatch.setattr("twin.studies.report.draw_all", lambda *_: {}, raising=False)
     write_report(study, analysis, tmp_path / "study.html")
-    assert "<td>degraded</td><td>6</td>" in (tmp_path / "study.html").read_text()
+    assert re.search(r">degraded</td><td[^>]*>6</td>", (tmp_path / "study.html").read_text())
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,7 @@ from twin.errors import TwinError
 
 if TYPE_CHECKING:
     from twin.recordings.replay import ReplayResult
-    from twin.scenario.model import Scenario
-    from twin.session.conclusion import RunResult
+    from twin.report.run_result import RunResult
 
 app = typer.Typer(
     help="Digital twin of an underwater stereo survey: simulates it and compares trajectory and map with the truth.",
@@ -677,7 +676,8 @@ def _run_survey(
     _require_rendering()
     from twin import survey  # imported here because it needs OpenGL
 
-    folder = _new_folder(scenario, out)  # last, because two surveys that begin at once must find different folders
+    # last, because two surveys that begin at once must find different folders
+    folder = outputs.run_folder(scenario) if out is None else outputs.new_folder(out)
     with console.progress_bar() as progress:
         return survey.run(scenario, folder, progress, live)
 
@@ -690,10 +690,3 @@ def _require_rendering() -> None:
     if not check.ok:
         console.print_error(str(check))
         raise typer.Exit(2)
-
-
-def _new_folder(scenario: Scenario, out: Path | None) -> Path:
-    """Returns the run folder: `out`, or the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty."""
-    if out is not None:
-        return outputs.new_folder(out)
-    return outputs.unused_folder(Path("runs") / f"{outputs.file_stem(scenario.name)}-{scenario.seed}")

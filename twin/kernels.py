@@ -11,6 +11,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import uuid
 from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
@@ -23,6 +24,7 @@ import platformdirs
 from numba.core import config
 
 _ROOT = Path(__file__).parents[1]
+_HOST_AND_START = uuid.uuid4().hex[:8]  # with the process number, which a fork changes
 _VERSIONS_KEPT = 8  #: of each module; those of the least recent processes are removed
 
 # `from .a.b import c, d`, also with its names in brackets over several lines, and `import a.b`
@@ -137,8 +139,20 @@ def _enable_caching(dispatcher: Any) -> None:
     config.CACHE_LOCATOR_CLASSES = f"{__name__}.{KernelLocator.__name__}"  # pyright: ignore[reportAttributeAccessIssue]
     try:
         dispatcher.enable_caching()
+        _use_own_file_names(dispatcher)
     finally:
         config.CACHE_LOCATOR_CLASSES = before  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _use_own_file_names(dispatcher: Any) -> None:
+    """Puts a name of this process into the names of its files of machine code.
+
+    numba numbers the files of a function. Two processes that compile it at once for different types of arguments would
+    write the same file, and later load code for the wrong types. Names of their own cost an entry of the index at most.
+    """
+    file = dispatcher._cache._cache_file
+    name = file._data_name_pattern.replace("{number:d}", "{process}.{number:d}")
+    file._data_name = lambda number: name.format(process=f"{_HOST_AND_START}-{os.getpid()}", number=number)
 
 
 def _reachable(file: Path) -> set[Path]:

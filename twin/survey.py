@@ -13,10 +13,11 @@ from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.pipeline import Navigator
 from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
+from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
 from twin.session.assembly import make_navigator, open_world
-from twin.session.conclusion import FlownSurvey, RunResult, conclude
+from twin.session.conclusion import FlownSurvey, conclude
 from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
 from twin.world.flight import Flight

@@ -90,24 +90,31 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
 def print_plan(summary: PlanSummary) -> None:
     """Prints the tables of a plan on stdout, and its warnings on stderr."""
     from twin.planning import summary as plan_summary
-    from twin.report.wording import plain
 
     print_table(f"Plan of {summary.mission.scenario.name}", plan_summary.rows(summary))
     print_table("Over the floor", plan_summary.floor_rows(summary))
     if summary.require:
-        rows = [
-            (name, f"{plain(r['value'])} expected", f"limit {plain(r['limit'])}", "ok" if r["passed"] else "MISSED")
-            for name, r in summary.require.items()
-        ]
-        print_table("Required", rows)
+        print_requirements(summary.require, " expected", "ok")
     for sentence in summary.warnings:
         print_error(f"Warning: {sentence}.")
+
+
+def print_requirements(require: dict[str, dict[str, Any]], suffix: str, passed: str) -> None:
+    """Prints a table of the requirements; `passed` is the word for a limit that is met."""
+    from twin.report.wording import with_unit
+
+    rows = [
+        (name, with_unit(name, row["value"]) + suffix, f"limit {with_unit(name, row['limit'])}",
+         passed if row["passed"] else "MISSED")
+        for name, row in require.items()
+    ]  # fmt: skip
+    print_table("Required", rows)
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Prints the verdict on a survey or replay, its reasons and warnings, the key figures and the requirements."""
     from twin.report.verdict import badge, first_lines
-    from twin.report.wording import key_figures, plain, replay_summary
+    from twin.report.wording import key_figures, replay_summary
 
     seed = "" if metrics["seed"] is None else f", seed {metrics['seed']}"
     print(f"{metrics['name']}{seed}: {badge(metrics).text}")
@@ -117,11 +124,7 @@ def print_metrics(metrics: dict[str, Any]) -> None:
         print(f"- {sentence}")
     print_table("Key figures", [tuple(figure) for figure in key_figures(metrics)])
     if metrics["require"]:
-        rows = [
-            (name, plain(r["value"]), f"limit {plain(r['limit'])}", "passed" if r["passed"] else "MISSED")
-            for name, r in metrics["require"].items()
-        ]
-        print_table("Required", rows)
+        print_requirements(metrics["require"], "", "passed")
 
 
 def print_outputs(folder: Path) -> None:

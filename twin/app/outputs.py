@@ -6,10 +6,14 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from twin.core.output_folder import check_folder, check_path
 from twin.core.paths import resolved
 from twin.errors import TwinError
+
+if TYPE_CHECKING:
+    from twin.scenario.model import Scenario
 
 #: Largest number of bytes of the name of a scenario or study that a file name contains.
 _STEM_BYTES = 100
@@ -29,6 +33,11 @@ def unused_folder(first: Path) -> Path:
         count += 1
         folder = first.with_name(f"{first.name}-{count}")
     return new_folder(folder)
+
+
+def run_folder(scenario: Scenario) -> Path:
+    """Returns the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty; raises TwinError as above."""
+    return unused_folder(Path("runs") / f"{file_stem(scenario.name)}-{scenario.seed}")
 
 
 def output_file(file: Path, option: str = "--out") -> Path:

@@ -94,7 +94,7 @@ def _effect(name: str, error_m: float, sigma_m: float, where: str) -> _Effect:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields findings for lost frames, for nodes without links to the previous node or to any, for failed links."""
+    """Yields findings for lost frames, for nodes without a link to the previous node or to any, for failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
@@ -208,7 +208,11 @@ def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
 
 
 def _scale(quality: EstimationQuality) -> Iterator[Finding]:
-    """Yields findings for lengths from the images that differ from those of the navigation sensors."""
+    """Yields a finding if lengths from the images differ from those of the navigation sensors.
+
+    The scale along the optical axis is judged only where that across it is right: a rotation that images and a DVL of
+    different scales determine together is wrong, and with it the part of the DVL's displacement along the axis.
+    """
     for check, scale, which, cause in (
         ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),
         ("depth_scale", quality.depth_scale, " along the optical axis", "the baseline or the focal length"),
@@ -217,6 +221,7 @@ def _scale(quality: EstimationQuality) -> Iterator[Finding]:
             ratio = f"{scale.estimate:.3f} +- {scale.sigma:.3f} times those of {scale.sensors}"
             text = f"the lengths{which} from the images are {ratio}: {cause} is not as calibrated"
             yield Finding(check, abs(scale.estimate - 1), MAX_SCALE_ERROR, text)
+            return
 
 
 def _median(values: Iterator[float | None]) -> float | None:

@@ -287,7 +287,7 @@ class StereoVision:
             matched = self.matcher.match(node, [moved])[0]
         with self.stopwatch("network"):
             motion = None if matched is None else self.matcher.motion(node, moved, matched)
-        if motion is None or anywhere or wide_search.agrees(motion.a_from_b, predicted, predicted_cov):
+        if motion is None or anywhere or wide_search.agrees(motion.a_from_b, motion.cov, predicted, predicted_cov):
             return motion
         return None
 

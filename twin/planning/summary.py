@@ -12,7 +12,7 @@ from twin.judge.require import judge_requirements
 from twin.judge.summary_statistics import finite_tree
 from twin.planning.cost import ComputingCost, computing_cost
 from twin.planning.expected_error import ExpectedError, expected_error
-from twin.report.wording import length, percent, plain
+from twin.report.wording import length, percent, with_unit
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
 from twin.world.planning import SHORT_PERCENT
@@ -115,7 +115,8 @@ def _known(name: str, predicted: dict[str, dict[str, float | None]]) -> bool:
 def _missed(require: dict[str, dict[str, Any]]) -> list[str]:
     """Returns a sentence for each requirement that the plan is expected to miss."""
     return [
-        f"{name} is expected to miss its limit: {plain(r['value'])} expected, limit {plain(r['limit'])}"
+        f"{name} is expected to miss its limit: {with_unit(name, r['value'])} expected, "
+        f"limit {with_unit(name, r['limit'])}"
         for name, r in require.items()
         if not r["passed"]
     ]

@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from twin.report.figures import WIDTH_IN, log_scale, to_data_uri
+from twin.report.figures import WIDTH_IN, log_axis, log_scale, to_data_uri
 from twin.report.run_errors import run_errors
 from twin.report.run_folder import Run
 from twin.report.style import COLOURS, FIGURE_STYLE
@@ -98,6 +98,7 @@ def height_error_curves(runs: Sequence[Run], names: Sequence[str]) -> Figure | N
     if not axes.lines:
         return None
     axes.axhline(90, color=COLOURS["limit"], linewidth=0.8)
-    axes.set(xlabel="absolute height error [m]", ylabel="cells up to this error [%]", xscale="log", ylim=(0, 100))
+    axes.set(xlabel="absolute height error [m]", ylabel="cells up to this error [%]", ylim=(0, 100))
+    log_axis(axes.xaxis)
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
     return figure

@@ -125,21 +125,31 @@ def log_scale(axes: Axes) -> None:
     sizes = np.concatenate([np.zeros(0), *(np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines)])
     sizes = sizes[sizes > 0]
     if len(sizes):
-        log_axis(axes.yaxis, axes.set_yscale)
+        log_axis(axes.yaxis)
         axes.set_ylim(0.7 * float(np.percentile(sizes, 1)), None)
 
 
-def log_axis(axis: Any, set_scale: Callable[[str], None], steps: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
-    """Makes an axis logarithmic, with labels at the given multiples of the powers of 10.
+class _RoundNumbers(LogLocator):
+    """Ticks at 1, 2 and 5, at 1 and 3 or at 1 times powers of 10: the most whose labels do not touch."""
 
-    Args:
-        axis: x or y axis.
-        set_scale: sets the scale of this axis by name, `Axes.set_xscale` or `Axes.set_yscale`.
-        steps: multiples, from 1 to less than 10.
-    """
-    set_scale("log")
-    axis.set_major_locator(LogLocator(subs=steps))
-    axis.set_major_formatter(lambda value, _: f"{value:g}")
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        axis: Any = self.axis
+        space = max(axis.get_tick_space() // (2 if axis.axis_name == "x" else 1), 1)  # labels are broader than high
+        decades = 10.0 ** np.arange(np.floor(np.log10(vmin)), np.log10(vmax) + 1)
+        shown = decades
+        for steps in ((1, 2, 5), (1, 3), (1,)):
+            ticks = np.outer(decades, steps).ravel()
+            shown = ticks[(ticks >= vmin) & (ticks <= vmax)]
+            if 0 < len(shown) <= space:
+                break
+        return shown[:: -(-len(shown) // space) or 1]
+
+
+def log_axis(axis: Any, label: Callable[[float], str] = "{:g}".format) -> None:
+    """Makes an x or y axis logarithmic, with labels at round numbers; the default formatter would write raw markup."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    axis.set_major_locator(_RoundNumbers())
+    axis.set_major_formatter(lambda value, _: label(value))
     axis.set_minor_formatter(lambda *_: "")
 
 
@@ -158,8 +168,8 @@ def stage_bars(run: Run) -> Figure | None:
         notes = [length(row.rmse_m), improvement(row.gain), row.disabled]
         axes.text(row.rmse_m or min(errors_m), y, "   ".join(["", *filter(None, notes)]), va="center")
     axes.set_yticks(bars, [LABELS[row.stage] for row in rows])
-    axes.set(xscale="log", xlim=(min(errors_m) / 3, max(errors_m) * 3), xlabel="position error of the keyframes (RMSE)")
-    axes.xaxis.set_major_formatter(lambda value_m, _: length(value_m))
+    log_axis(axes.xaxis, length)
+    axes.set(xlim=(min(errors_m) / 3, max(errors_m) * 3), xlabel="position error of the keyframes (RMSE)")
     axes.grid(visible=False, axis="y")
     return figure
 
@@ -276,6 +286,7 @@ def network_plot(run: Run) -> Figure | None:
         return None
     figure = Figure(figsize=(WIDTH_IN, 4.4))
     axes = _map_axes(figure.add_subplot())
+    axes.set_adjustable("datalim")  # a network along a line fills the figure too
     axes.add_collection(
         LineCollection(list(positions[edges][:, :, :2]), colors=COLOURS["link"], linewidths=0.5, alpha=0.6)
     )
@@ -307,7 +318,8 @@ def timing_bars(run: Run) -> Figure | None:
             axes.plot([row.budget_ms] * 2, [y - 0.4, y + 0.4], color=COLOURS["limit"], linewidth=2)
     axes.set_yticks(bars, [PROCESSING_STAGES[row.stage] for row in rows])
     shortest = min(row.mean_ms or 1.0 for row in rows)
-    axes.set(xscale="log", xlim=(shortest / 3, None), xlabel="mean time per call [ms] (red: budget)")
+    log_axis(axes.xaxis)
+    axes.set(xlim=(shortest / 3, None), xlabel="mean time per call [ms] (red: budget)")
     axes.grid(visible=False, axis="y")
     return figure
 

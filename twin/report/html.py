@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
@@ -33,12 +34,31 @@ def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
         length=wording.length,
         percent=wording.percent,
         plain=wording.plain,
+        with_unit=wording.with_unit,
         ms=wording.milliseconds,
         angle=wording.angle,
         milliradians=wording.milliradians,
         ratio=wording.ratio,
     )
-    return environment.get_template(template).render(**context)
+    return _for_narrow_screens(environment.get_template(template).render(**context))
+
+
+def _for_narrow_screens(page: str) -> str:
+    """Returns a page whose cells carry the names of their columns, and whose images can have the focus (page.css)."""
+    page = re.sub(r"<table>.*?</table>", _with_column_names, page, flags=re.DOTALL)
+    return page.replace("<img ", '<img tabindex="0" ')
+
+
+def _with_column_names(table: re.Match[str]) -> str:
+    """Returns the HTML of a table whose header is its first row."""
+    text = re.sub(r"(?<=[a-z\d][._])(?=[a-z][^<>]*<)", "<wbr>", table[0])  # keys may be broken at their dots
+    names = [re.sub(r"<.*?>", "", name) for name in re.findall(r"<th>(.*?)</th>", text, re.DOTALL)]
+
+    def row(match: re.Match[str]) -> str:
+        column = iter(names)
+        return re.sub(r"<td\b", lambda _: f'<td data-column="{next(column, "")}"', match[0])
+
+    return re.sub(r"<tr>.*?</tr>", row, text, flags=re.DOTALL) if names else table[0]
 
 
 def _source(package: str, name: str) -> str | None:

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 from twin.judge.map_error import INFINITE_WITH_HOLES
 from twin.judge.require import more_is_better
-from twin.report.wording import percent, plain
+from twin.report.wording import percent, with_unit
 
 #: Level of a badge: green, amber or red. The name is also the badge's CSS class in page.css.
 Level = Literal["good", "warn", "bad"]
@@ -60,7 +60,7 @@ def _missed(metrics: Mapping[str, Any]) -> list[str]:
     """Returns a sentence for each requirement that was missed."""
     return [
         f"Requirement missed: {name} is {_value(name, row['value'], metrics)}, "
-        f"{'at least' if more_is_better(name) else 'at most'} {plain(row['limit'])} is required."
+        f"{'at least' if more_is_better(name) else 'at most'} {with_unit(name, row['limit'])} is required."
         for name, row in (metrics.get("require") or {}).items()
         if not row["passed"]
     ]
@@ -69,7 +69,7 @@ def _missed(metrics: Mapping[str, Any]) -> list[str]:
 def _value(name: str, value: float | None, metrics: Mapping[str, Any]) -> str:
     """Returns the value of a metric as text: "unknown" if it has none, "infinite" if holes make it infinite."""
     if value is not None:
-        return plain(value)
+        return with_unit(name, value)
     known = metrics["map"].get("completeness_area")
     if name in INFINITE_WITH_HOLES and known is not None:
         return f"infinite (only {percent(known)} of the asked area has a height)"

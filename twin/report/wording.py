@@ -10,6 +10,10 @@ from twin.judge.warnings import nees_bounds
 from twin.scenario.water_sources import WATER_SOURCES
 
 DASH = "–"  # noqa: RUF001
+#: Units by the suffix of a metric's name.
+_UNITS = {
+    "_m": " m", "_s": " s", "_ms": " ms", "_deg": " deg", "_px": " px", "_percent": " %", "_mb": " MiB",
+}  # fmt: skip
 
 #: Display names of the processing stages in metrics.json (`timing.stages`) and of the sum of all keyframe stages.
 PROCESSING_STAGES = {
@@ -135,6 +139,12 @@ def milliseconds(value_ms: float | None) -> str:
 def plain(value: Any) -> str:
     """Returns a value as text, a float with at most four significant digits; a dash for None."""
     return DASH if value is None else f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def with_unit(name: str, value: float | None) -> str:
+    """Returns a number as `plain` with the unit that its dotted name ends with, e.g. "0.02 m"; a dash for None."""
+    unit = next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
+    return plain(value) + (unit if value is not None else "")
 
 
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:

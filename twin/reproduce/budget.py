@@ -16,6 +16,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
 from twin.judge.budget import KEYFRAME_STAGES
+from twin.report.figures import log_axis
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, percent, write_exhibit
 from twin.reproduce.paper_flight import Flown, fly_aligned
@@ -157,7 +158,7 @@ def draw(stages: Mapping[str, Any], n_keyframes: int, file: Path) -> None:
         for k, name in enumerate(names[::-1]):
             limit = FRAME_MS if name == "f2f" else KEYFRAME_MS
             axes.plot([limit, limit], [k - 0.4, k + 0.4], color=COLOURS["limit"], linewidth=2)
-        axes.set(xscale="log", xlabel="mean time per frame (F2F) or keyframe [ms]")
-        axes.xaxis.set_major_formatter("{x:g}")
+        axes.set(xlabel="mean time per frame (F2F) or keyframe [ms]")
+        log_axis(axes.xaxis)
         axes.grid(visible=False, axis="y")
         FigureCanvasAgg(figure).print_png(str(file))

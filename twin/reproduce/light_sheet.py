@@ -12,6 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from twin.imaging.reference.pixel_light import BatchMean
+from twin.report.figures import log_axis
 from twin.report.style import FIGURE_STYLE
 from twin.reproduce.light_cell import LightCell
 
@@ -67,9 +68,8 @@ def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[
                 label=water if lamps == "leds" else None,
             )  # fmt: skip
     axes.axhline(1.0, color="#9aa8b0", linewidth=1)
-    axes.set(yscale="log", xlabel="height [m] (one column of markers per pixel)", ylabel=label, title=label)
-    axes.yaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_minor_formatter("{x:g}")
+    log_axis(axes.yaxis)
+    axes.set(xlabel="height [m] (one column of markers per pixel)", ylabel=label, title=label)
     axes.legend(fontsize=7, title="circles: LED lamps\ntriangles: spots", title_fontsize=7, loc="center left",
                 bbox_to_anchor=(1.0, 0.5))  # fmt: skip
 
@@ -98,8 +98,8 @@ def _blur(axes: Axes, cells: Sequence[LightCell]) -> None:
             axes.plot(cell.blur_far.value, cell.model.blur_far, marker, color=colour, markersize=4, fillstyle="none")
     axes.plot([1e-3, 1], [1e-3, 1], color="#9aa8b0", linewidth=1)
     axes.set(
-        xscale="log", yscale="log", xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="reference", ylabel="model",
+        xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="reference", ylabel="model",
         title="blur: share within 2 px (full), beyond 40 px (open)",
     )  # fmt: skip
-    axes.xaxis.set_major_formatter("{x:g}")
-    axes.yaxis.set_major_formatter("{x:g}")
+    log_axis(axes.xaxis)
+    log_axis(axes.yaxis)

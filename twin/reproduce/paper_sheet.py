@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from twin.judge.alignment import keyframe_errors_m
 from twin.judge.map_error import height_error
 from twin.judge.trajectory import path_errors
-from twin.report.figures import hillshade
+from twin.report.figures import hillshade, log_axis
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.reproduce.paper_flight import Flown
 
@@ -53,8 +53,8 @@ def draw_tracks(flights: Mapping[str, Flown], tracks: Sequence[int], file: Path)
         for axes, track in zip(panels, tracks, strict=False):
             for (name, flown), colour in zip(flights.items(), SHADES, strict=False):
                 _keyframe_errors(axes, flown, track, name, colour)
-            axes.set(title=f"track {track}", yscale="log")
-            axes.yaxis.set_major_formatter("{x:g}")
+            axes.set(title=f"track {track}")
+            log_axis(axes.yaxis)
         panels[0].legend(fontsize=7)
         figure.supxlabel("keyframe")
         figure.supylabel("position error [mm]")
@@ -135,6 +135,6 @@ def _histogram(axes: Axes, flights: Mapping[str, Flown]) -> None:
     top = max((float(np.percentile(size, 99)) for size in sizes.values() if len(size)), default=1.0)
     for (name, size), colour in zip(sizes.items(), (*SHADES, "#999999"), strict=False):
         axes.hist(np.minimum(size, top), bins=60, range=(0, top), histtype="step", color=colour, label=name)
-    axes.set(xlabel="absolute height error [mm]; last bar: or larger", ylabel="cells", yscale="log")
-    axes.yaxis.set_major_formatter("{x:g}")
+    axes.set(xlabel="absolute height error [mm]; last bar: or larger", ylabel="cells")
+    log_axis(axes.yaxis)
     axes.legend(fontsize=8)

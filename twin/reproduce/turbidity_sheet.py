@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from twin.report.figures import log_axis
 from twin.report.style import FIGURE_STYLE
 from twin.reproduce.turbidity_level import MIN_VISIBLE_CONTRAST, TurbidityLevel
 
@@ -87,8 +88,8 @@ def _curves(axes: Axes, levels: Sequence[TurbidityLevel]) -> None:
     axes.axvline(image_range_m, color="#9aa8b0", linewidth=1)
     axes.text(image_range_m * 1.02, 1.15, "range of the images above", color="#5d6d76")
     axes.set(
-        xlim=(ranges_m[0], ranges_m[-1]), ylim=(0.003, 1.5), yscale="log", xlabel="range [m]",
+        xlim=(ranges_m[0], ranges_m[-1]), ylim=(0.003, 1.5), xlabel="range [m]",
         ylabel="contrast relative to clear water", title="Contrast of fine detail against range, green light",
     )  # fmt: skip
-    axes.set_yticks([0.01, 0.1, 1.0], ["1 %", "10 %", "100 %"])
+    log_axis(axes.yaxis, lambda share: f"{100 * share:g} %")
     axes.legend(loc="upper right", bbox_to_anchor=(1.0, 0.92))

@@ -39,6 +39,8 @@ _OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
 _PLUGIN_SECTIONS = {"control": "controllers", "estimate": "estimators", "terrain": "terrains"}
 _IN_PYTHON = "in Python: allow_plugins=True"
 _ABSENT = object()
+#: Keys of [terrain] that say which floor it is.
+_FLOOR_KEYS = ("kind", "plugin", "height_file", "mesh_file")
 #: Largest number of errors that are listed.
 _MAX_ERRORS = 20
 
@@ -58,12 +60,14 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins
             `FILE:LINE: key: problem (allowed: ...)`, and those of overrides in lines that begin with `--set`.
     """
     tree, source, errors = _read_with_base(find_scene(path), including_files=())
+    base = copy.deepcopy(tree)
     source = source.model_copy(update={"overrides": tuple(overrides), "allow_plugins": allow_plugins})
     for override in overrides:
         try:
             _apply_override(tree, override)
         except ScenarioError as error:
             errors += error.lines
+    _leave_objects_on_their_floor(tree, base)
     try:
         scenario = validated(tree, Scenario, source)
     except ScenarioError as error:
@@ -114,6 +118,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
         except ScenarioError as error:
             problem = error.lines[0].removeprefix(f"{key}: ")
             raise ScenarioError([source.describe(TwinError(key, problem))]) from None
+    _leave_objects_on_their_floor(changed, tree)
     scenario = validated(changed, Scenario, source)
     scenario._source = source
     return scenario
@@ -247,7 +252,17 @@ def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict
         message = f"no such file {name} (allowed: a path relative to this file, or one of {allowed})"
         raise ScenarioError([*errors, f"{file}:{line}: extends: {message}"])
     base_tree, base_source, base_errors = _read_with_base(base_file, (*including_files, resolved(file)))
-    return _merge(base_tree, tree), Source(path=file, lines=lines, base=base_source), errors + base_errors
+    merged = _merge(base_tree, tree)
+    _leave_objects_on_their_floor(merged, base_tree)
+    return merged, Source(path=file, lines=lines, base=base_source), errors + base_errors
+
+
+def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:
+    """Removes objects that a tree has from its base, in place, if its floor is another: that is where they lie."""
+    floors = [terrain if isinstance(terrain := one.get("terrain"), dict) else {} for one in (tree, base)]
+    other_floor = any(floors[0].get(key) != floors[1].get(key) for key in _FLOOR_KEYS)
+    if other_floor and tree.get("objects") == base.get("objects"):
+        tree.pop("objects", None)
 
 
 def _base_file(base: str, folder: Path) -> Path | None:

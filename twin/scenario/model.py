@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import (
@@ -71,6 +72,19 @@ class Section(BaseModel):
     """Base class of the sections, which are immutable and reject unknown keys, NaN and infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Returns a copy with some fields changed, validated like new values.
+
+        Raises:
+            ValidationError: a field is unknown, or its value is invalid.
+        """
+        copied = super().model_copy(deep=deep)
+        if update:
+            changed = type(self).model_validate({**vars(self), **update})
+            object.__setattr__(copied, "__dict__", vars(changed))
+            object.__setattr__(copied, "__pydantic_fields_set__", self.model_fields_set | set(update))
+        return copied
 
     @field_validator("*", mode="before")
     @classmethod

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from twin.core.interrupts import StageGuard
@@ -14,6 +13,7 @@ from twin.core.timing import Stopwatch, timing_summary
 from twin.estimate.pipeline import Navigator, finish_in_stage
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.plugin.navigator import NOTE
+from twin.report.run_result import RunResult
 from twin.report.run_writer import PlannedTruth, RunFolder, SurveyRecord
 from twin.scenario.idealisations import idealisations
 from twin.scenario.model import Scenario
@@ -25,14 +25,6 @@ from twin.world.mission import Mission
 from twin.world.world import World
 
 T = TypeVar("T")
-
-
-class RunResult(NamedTuple):
-    """Outcome of a survey: status "complete", "degraded" or "aborted", its metrics (metrics.json), and its folder."""
-
-    status: str
-    metrics: dict[str, Any]
-    folder: Path
 
 
 class FlownSurvey(NamedTuple):

@@ -134,7 +134,7 @@ def _draw_pairs(axes: Axes, metric: str, rendered: Array, surrogate: Array) -> N
     x, y = (np.minimum(values, edge) for values in (rendered, surrogate))
     axes.plot(x, y, "o", markersize=3.5, color=COLOURS["online"], alpha=0.7)
     if logarithmic:
-        log_axis(axes.xaxis, axes.set_xscale, (1.0,) if high > 30 * low else (1.0, 3.0))
-        log_axis(axes.yaxis, axes.set_yscale)
+        log_axis(axes.xaxis)
+        log_axis(axes.yaxis)
     axes.set(xlim=(start, edge), ylim=(start, edge), xlabel="rendered", ylabel="surrogate")
     axes.set_title(textwrap.fill(wording.metric_name(metric), 30), fontsize=8)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from twin.judge.map_error import with_completeness
 from twin.judge.require import more_is_better
 from twin.studies import statistics
-from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values
+from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values, rounded
 from twin.studies.design import axis_names
 from twin.studies.statistics import Array, Interval, SobolIndex
 from twin.studies.study_file import Study
@@ -387,4 +387,4 @@ def _strength(sensitivity: Sensitivity) -> float:
 
 def _range_text(values: Array) -> str:
     low, high = float(values.min()), float(values.max())
-    return f"{low:.3g}" if low == high else f"{low:.3g} to {high:.3g}"
+    return rounded(low) if low == high else f"{rounded(low)} to {rounded(high)}"

@@ -150,7 +150,7 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     def of_run(first: int, last: int) -> Answer:
         chosen = (bins >= first) & (bins <= last)
         low, high = float(x[chosen].min()), float(x[chosen].max())
-        return searched.answer(chosen, f"{low:.3g} to {high:.3g}" if high > low else f"{low:.4g}", low, high)
+        return searched.answer(chosen, f"{rounded(low)} to {rounded(high)}" if high > low else f"{low:.4g}", low, high)
 
     runs = {(i, j): of_run(i, j) for i in range(n_bins) for j in range(i, n_bins)}
     return [runs[run] for run in _decided_runs(runs, 0, n_bins - 1, record.required)]
@@ -239,3 +239,8 @@ def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], re
         return False
     opposite = "fails" if verdict == "passes" else "passes"
     return all(runs[i, j].verdict != opposite for i in range(first, last + 1) for j in range(i, last + 1))
+
+
+def rounded(value: float) -> str:
+    """Returns a number with three significant digits, or all digits before the decimal point, without an exponent."""
+    return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -23,7 +23,6 @@ from twin.studies.wording import metric_name, metric_value
 
 PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
 _MAX_POINTS = 3000
-_ROW_IN = 2.7
 
 
 def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
@@ -39,11 +38,11 @@ def draw_all(analysis: StudyAnalysis) -> dict[str, str]:
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
 
 
-def make_panels(count: int, columns: int = 3) -> tuple[Figure, list[Axes]]:
+def make_panels(count: int, columns: int = 3, row_in: float = 2.7) -> tuple[Figure, list[Axes]]:
     """Returns a figure and its `count` axes, in rows of at most `columns`; by default, four axes form a square."""
     columns = 2 if count == 4 and columns == 3 else min(columns, count)
     rows = -(-count // columns)
-    figure = Figure(figsize=(WIDTH_IN if columns > 1 else WIDTH_IN * 0.62, _ROW_IN * rows))
+    figure = Figure(figsize=(WIDTH_IN if columns > 1 else WIDTH_IN * 0.62, row_in * rows))
     axes = list(figure.subplots(rows, columns, squeeze=False).flat)
     for spare in axes[count:]:
         spare.remove()
@@ -102,7 +101,7 @@ def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], group
         axes.set_xlim(-0.5, len(names) - 0.5)
         return np.arange(len(names), dtype=float)
     if spans_decades(values):
-        log_axis(axes.xaxis, axes.set_xscale)
+        log_axis(axes.xaxis)
     else:
         axes.xaxis.set_major_locator(MaxNLocator(6))
     axes.set_xlim(*_axis_range(values[chosen], spans_decades(values)))
@@ -146,7 +145,7 @@ def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -
         edges = _bin_edges(values, log)
         axes.hist(values, list(edges), color=COLOURS["online"], alpha=0.75)
         if log:
-            log_axis(axes.xaxis, axes.set_xscale)
+            log_axis(axes.xaxis)
         else:
             axes.xaxis.set_major_locator(MaxNLocator(4))
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
@@ -207,7 +206,7 @@ def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
         if (limit := analysis.limits.get(metric)) is not None:
             axes.axhline(limit, color=LIMIT, linestyle="--", linewidth=1)
         if spans_decades(y[included]):
-            log_axis(axes.yaxis, axes.set_yscale)
+            log_axis(axes.yaxis)
         unit_axis(axes.yaxis, metric)
         axes.set_xlabel(key)
     return figure
@@ -230,20 +229,19 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
     metrics = list(dict.fromkeys(s.metric for s in shown))
     if not shown:
         return None
-    count = max(sum(s.metric == metric for s in shown) for metric in metrics)
-    figure = Figure(figsize=(WIDTH_IN, 0.9 + 0.36 * count))
-    panels = figure.subplots(1, len(metrics), squeeze=False, sharey=True)[0]
     keys = list(dict.fromkeys(s.key for s in shown))
+    figure, panels = make_panels(len(metrics), row_in=0.9 + 0.36 * len(keys))
+    left = panels[0].get_position().x0
     for metric, axes in zip(metrics, panels, strict=True):
         for s in (s for s in shown if s.metric == metric):
             y, r = -keys.index(s.key), s.correlation
             axes.barh(y, r.value, 0.6, color=NOT_PASSED if r.value > 0 else COLOURS["online"], alpha=0.8)
             axes.plot([r.low, r.high], [y, y], color=COLOURS["truth"], linewidth=1.2)
         axes.axvline(0, color=COLOURS["truth"], linewidth=0.8)
-        axes.set(xlim=(-1.05, 1.05), xlabel="rank correlation")
-        axes.set_title(metric_name(metric), fontsize=9)
+        axes.set(xlim=(-1.05, 1.05), ylim=(0.6 - len(keys), 0.6), xlabel="rank correlation")
+        axes.set_title(axis_label(metric), fontsize=9)
         axes.grid(visible=False, axis="y")
-    panels[0].set_yticks([-k for k in range(len(keys))], keys)
+        axes.set_yticks([-k for k in range(len(keys))], keys if axes.get_position().x0 == left else [])
     return figure
 
 
@@ -265,7 +263,7 @@ def key_histograms(analysis: StudyAnalysis) -> Figure | None:
         both, colours = [values[good], values[bad]], [PASSED, NOT_PASSED]
         axes.hist(both, list(edges), stacked=True, color=colours, label=["passed", "not passed"], alpha=0.85)
         if log:
-            log_axis(axes.xaxis, axes.set_xscale)
+            log_axis(axes.xaxis)
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
         axes.set_xlabel(key)
     panels[0].set_ylabel("surveys")

@@ -202,11 +202,11 @@ def trade_off_figure(shown: list[Candidate], result: TuningResult, config: Tunin
         for candidates, style in _groups(shown, result, config):
             x = [c.number if x_index is None else c.objectives[x_index] for c in candidates]
             axes.plot(x, [c.objectives[y_index] for c in candidates], **style)
-        for axis, set_scale, k in ((axes.xaxis, axes.set_xscale, x_index), (axes.yaxis, axes.set_yscale, y_index)):
+        for axis, k in ((axes.xaxis, x_index), (axes.yaxis, y_index)):
             if k is not None:
                 values = np.array([c.objectives[k] for c in shown])
                 if spans_decades(values):
-                    log_axis(axis, set_scale)
+                    log_axis(axis)
                 _format_axis(axis, config.objectives[k])
         if x_index is None:
             axes.set_xlabel("trial")
@@ -222,7 +222,7 @@ def searched_keys_figure(shown: list[Candidate], result: TuningResult, config: T
         for candidates, style in _groups(shown, result, config):
             axes.plot([c.values[key] for c in candidates], [c.objectives[k] for c in candidates], **style)
         if config.search[key].kind == "log_uniform":
-            log_axis(axes.xaxis, axes.set_xscale)
+            log_axis(axes.xaxis)
         axes.set_xlabel(key)
         _format_axis(axes.yaxis, config.objectives[k])
     return figure

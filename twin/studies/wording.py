@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.judge.require import more_is_better
-from twin.report.wording import DASH, length, percent, plain
+from twin.report.wording import DASH, length, percent, with_unit
 from twin.studies.analysis import KeyComparison, StudyAnalysis, count_similar
 from twin.studies.answers import Answer
 from twin.studies.statistics import LEVEL, Interval
@@ -44,7 +44,7 @@ def metric_value(metric: str, value: float | None) -> str:
         return DASH
     if metric.endswith("_m"):
         return length(value)
-    return plain(float(value)) + (" s" if metric.endswith("_s") else "")
+    return with_unit(metric, float(value))
 
 
 def metric_interval(metric: str, interval: Interval) -> str:

@@ -45,17 +45,21 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
     return bool(_SIGMAS**2 * np.median(variance_px2) > range_px**2)
 
 
-def agrees(found: Array, predicted: Array, cov: Array) -> bool:
-    """Returns whether a motion lies within the error of its prediction (chi-square, 99.99 %).
+def agrees(found: Array, found_cov: Array, predicted: Array, cov: Array) -> bool:
+    """Returns whether a measured motion lies within the errors of itself and its prediction (chi-square, 99.99 %).
 
     Where the texture repeats, features of the whole images may agree on a motion that is wrong by a period.
 
     Args:
         found, predicted: (4, 4) motions between the same two cameras.
-        cov: (6, 6) covariance of the prediction [rotation, translation] (rad, m), in the axes of the second camera.
+        found_cov: (6, 6) covariance of `found` [rotation, translation] (rad, m), in the axes of the second camera.
+        cov: (6, 6) that of the prediction. As a difference of accumulated covariances it may have negative eigenvalues,
+            which count as zero.
     """
     error = geometry.log(geometry.inverse(predicted) @ found)
-    return bool(error @ np.linalg.pinv(cov, hermitian=True) @ error <= _CHI2)
+    values, axes = np.linalg.eigh((cov + cov.T) / 2)
+    both = axes * np.maximum(values, 0) @ axes.T + found_cov
+    return bool(error @ np.linalg.solve(both, error) <= _CHI2)
 
 
 def coarse_motion(

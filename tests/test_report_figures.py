@@ -1,0 +1,84 @@
+"""Figures and numbers of the pages: which bar is which, labels of logarithmic axes, units of limits."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_hex
+from matplotlib.figure import Figure
+
+from twin.report import figures, wording
+from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.studies.answers import rounded
+
+
+def test_bars_before_and_after_alignment_have_the_heights_and_colours_of_their_labels():
+    tracks = [
+        {"track": 1, "before_ga_rmse_m": 0.03, "after_ga_rmse_m": 0.01},
+        {"track": 2, "before_ga_rmse_m": 0.05, "after_ga_rmse_m": None},
+    ]
+    run: Any = SimpleNamespace(metrics={"tracks": tracks})
+    figure = figures.track_bars(run)
+    assert figure is not None
+    before, after = figure.axes[0].containers
+    assert [(bar.get_height(), bar.get_x() < k) for k, bar in enumerate(before)] == [(0.03, True), (0.05, True)]
+    assert [bar.get_height() for bar in after] == [0.01, 0.0]
+    for bars, label, role in ((before, "before GA", "online"), (after, "after GA", "final")):
+        assert bars.get_label() == label
+        assert to_hex(bars[0].get_facecolor()) == COLOURS[role]
+
+
+@pytest.mark.parametrize("low", [0.0007, 0.03, 4.0])
+@pytest.mark.parametrize("ratio", [3, 20, 300, 1e5])
+def test_labels_of_a_logarithmic_axis_are_numbers_that_do_not_touch(low, ratio):
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(2.6, 2.0))
+        canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
+        figures.log_axis(axes.xaxis, wording.length)
+        axes.set_xlim(low, low * ratio)
+        canvas.draw()
+    places = [place for place in axes.xaxis.get_majorticklocs() if low <= place <= low * ratio]
+    labels = axes.xaxis.get_majorticklabels()
+    boxes = [label.get_window_extent(canvas.get_renderer()) for label in labels]
+    assert [label.get_text() for label in labels] == [wording.length(place) for place in places] != []
+    assert all(one.x1 < other.x0 for one, other in zip(boxes, boxes[1:], strict=False))
+    assert not any(label.get_text() for label in axes.xaxis.get_minorticklabels())
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("map.le90_m", 0.02, "0.02 m"), ("timing.ga_ms", 3.0, "3 ms"), ("timing.wall_s", 3.0, "3 s"),
+        ("trajectory.final.heading_rmse_deg", 0.1, "0.1 deg"), ("orthomosaic.ce90_px", 1.5, "1.5 px"),
+        ("trajectory.final.drift_percent", 0.2, "0.2 %"), ("map.completeness", 0.95, "0.95"), ("map.le90_m", None, "–"),  # noqa: RUF001
+    ],
+)  # fmt: skip
+def test_a_limit_has_the_unit_of_its_metric(name, value, text):
+    assert wording.with_unit(name, value) == text
+
+
+def test_bounds_of_a_range_have_no_exponent():
+    assert [rounded(value) for value in (0.01234, 1.896, 999.4, 1997.3, 2e6)] == [
+        "0.0123",
+        "1.9",
+        "999",
+        "1997",
+        "2000000",
+    ]
+    assert np.isfinite(float(rounded(-12345.6)))
+
+
+@pytest.mark.parametrize(
+    ("function", "value", "text"),
+    [
+        (wording.length, 0.00043, "0.43 mm"), (wording.length, 0.0064, "6.4 mm"), (wording.length, -0.083, "-8.3 cm"),
+        (wording.length, 1.0, "1.00 m"), (wording.milliradians, 0.1, "1.7 mrad"), (wording.angle, 0.1, "0.10°"),
+        (wording.percent, 0.9996, "> 99.9 %"), (wording.percent, 0.0004, "< 0.1 %"), (wording.percent, 0.5, "50 %"),
+    ],
+)  # fmt: skip
+def test_numbers_are_written_in_their_unit(function, value, text):
+    assert function(value) == text
+    assert function(None) == wording.DASH

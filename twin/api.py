@@ -1,0 +1,265 @@
+"""The public functions of the package, each of which does what the command of its name does.
+
+A scene is a name in scenes/, a file, or a `Scenario`. Values of its keys are set by sections, as in
+`twin.run("reef", plan={"tracks": 1}, seed=3)`, by a mapping of dotted keys, or by strings `key=value`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from twin.errors import TwinError
+
+if TYPE_CHECKING:
+    from twin.app.look import ViewLayers
+    from twin.planning.summary import PlanSummary
+    from twin.recordings.replay import ReplayOptions, ReplayResult
+    from twin.report.run_result import RunResult
+    from twin.scenario.model import Scenario
+    from twin.studies.runner import StudyResult
+    from twin.studies.tuning import TuningResult
+
+Overrides = Sequence[str] | Mapping[str, Any]
+
+
+def load_scenario(
+    path: str | Path, overrides: Overrides = (), allow_plugins: bool = False, **sections: Any
+) -> Scenario:
+    """Returns the validated scenario of a file.
+
+    Args:
+        path: a TOML file, or the name of a scenario in scenes/.
+        overrides: values that replace those of the file: strings `key=value`, or a mapping of dotted keys.
+        allow_plugins: whether the file and the overrides may name a plug-in as module:Class, which runs code of any
+            module that can be imported; the names of installed entry points are always allowed.
+        sections: sections or top-level keys with their values, e.g. `plan={"tracks": 1}, seed=3`.
+
+    Raises:
+        ScenarioError: there is no such scenario, or a file or a value is invalid. The message lists the errors of
+            files as `FILE:LINE: key: problem (allowed: ...)` and those of overrides in lines that begin with `--set`.
+    """
+    from twin.scenario.file import load_scenario
+
+    return load_scenario(path, [*_texts(overrides), *_texts(sections)], allow_plugins)
+
+
+def run(
+    scene: str | Path | Scenario, out: str | Path | None = None, overrides: Overrides = (), **sections: Any
+) -> RunResult:
+    """Runs a survey and writes its run folder.
+
+    Args:
+        scene: the survey.
+        out: run folder to write, new or empty; default: the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new.
+        overrides, sections: values of keys, as in `load_scenario`.
+
+    Returns:
+        Status, metrics and run folder of the survey, its trajectories and maps as arrays.
+
+    Raises:
+        ScenarioError: the survey cannot be carried out as described; nothing was written.
+        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
+            world cannot be created.
+    """
+    from twin import survey
+    from twin.app.outputs import run_folder
+
+    scenario = _scenario(scene, overrides, sections)
+    return survey.run(scenario, Path(out) if out is not None else run_folder(scenario))
+
+
+def plan(
+    scene: str | Path | Scenario, picture: str | Path | None = None, overrides: Overrides = (), **sections: Any
+) -> PlanSummary:
+    """Returns the predicted properties of a survey's plan over its floor, without a simulation.
+
+    Args:
+        scene: the survey.
+        picture: PNG file to draw the plan into.
+        overrides, sections: values of keys, as in `load_scenario`.
+
+    Raises:
+        ScenarioError: the survey cannot be planned as described.
+        TwinError: the picture cannot be written.
+    """
+    from twin.app.outputs import writing
+    from twin.planning import drawing, summary
+    from twin.world.mission import prepare
+
+    plan = summary.summarise(prepare(_scenario(scene, overrides, sections)))
+    if picture is not None:
+        with writing(Path(picture)):
+            drawing.draw(plan, Path(picture))
+    return plan
+
+
+def look(
+    scene: str | Path | Scenario,
+    at_m: tuple[float, float, float] | None = None,
+    sheet: str | Path | None = None,
+    overrides: Overrides = (),
+    **sections: Any,
+) -> ViewLayers:
+    """Returns the stereo pair at one position, and every layer of light in its left image.
+
+    Args:
+        scene: the survey.
+        at_m: position of the left camera in the world [m]; default: the centre of the survey area, at its altitude.
+        sheet: PNG file to draw all layers into.
+        overrides, sections: values of keys, as in `load_scenario`.
+
+    Raises:
+        ScenarioError: the survey cannot be prepared as described.
+        TwinError: the position is outside of the terrain or below it, or this machine cannot render.
+    """
+    from twin.app import look as viewing
+    from twin.app import look_sheet
+    from twin.app.outputs import writing
+    from twin.world.mission import prepare
+
+    mission = prepare(_scenario(scene, overrides, sections))
+    view = viewing.render_view(mission, at_m)
+    if sheet is not None:
+        with writing(Path(sheet)):
+            look_sheet.draw(mission.scenario, view, Path(sheet))
+    return view
+
+
+def load_run(folder: str | Path) -> RunResult:
+    """Returns a finished survey from its run folder.
+
+    Raises:
+        TwinError: it is not a run folder, a file is damaged, or the survey has not finished.
+    """
+    from twin.report.run_result import RunResult
+
+    return RunResult.of_folder(folder)
+
+
+def compare(*runs: str | Path | RunResult) -> dict[str, Any]:
+    """Returns the metrics of several runs side by side and the keys in which their scenarios differ.
+
+    Raises:
+        TwinError: a folder is not that of a run, or a run has no metrics.
+    """
+    from twin.report import comparison
+
+    return comparison.as_json(comparison.load_runs([_folder(run) for run in runs]))
+
+
+def export(run: str | Path | RunResult, formats: str | Sequence[str], out: str | Path | None = None) -> dict[str, Any]:
+    """Writes a run in the formats of other programs; returns the written files of each format.
+
+    Args:
+        run: a run or its folder.
+        formats: names of formats, as `twin export --list` prints them.
+        out: folder to write; default: the folder `export` in the run folder.
+
+    Raises:
+        TwinError: a format is unknown, the run lacks contents that it needs, or a file cannot be written.
+    """
+    from twin.exports import command
+
+    folder = _folder(run)
+    names = [formats] if isinstance(formats, str) else list(formats)
+    return command.export(folder, names, Path(out) if out is not None else folder / "export")
+
+
+def study(file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False) -> StudyResult:
+    """Runs the surveys of a study file and returns their analysis; the folder has tables, figures and a report.
+
+    Args:
+        file: study file, or the name of a study in scenes/studies/.
+        out: folder to write.
+        jobs: number of surveys that run at once; default: one per core.
+        resume: run only the surveys whose results are missing in the folder.
+
+    Raises:
+        TwinError: the study is invalid, or the folder has other contents or cannot be written.
+    """
+    from twin.app.study_command import open_engine
+    from twin.studies.progress import study_progress
+    from twin.studies.runner import run_study
+    from twin.studies.study_file import load_study
+
+    with open_engine(jobs) as engine, study_progress(False) as progress:
+        return run_study(load_study(str(file)), Path(out).absolute(), resume, engine, progress)
+
+
+def tune(file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False) -> TuningResult:
+    """Searches the plan that a study file asks for; the arguments and errors are those of `study`."""
+    from twin.app.study_command import open_engine
+    from twin.studies import tuning
+    from twin.studies.progress import study_progress
+    from twin.studies.study_file import load_study
+
+    with open_engine(jobs) as engine, study_progress(False) as progress:
+        return tuning.tune(load_study(str(file)), Path(out).absolute(), resume, engine, progress)
+
+
+def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None = None) -> ReplayResult:
+    """Runs the estimators on a recorded stereo data set and writes a run folder; see docs/replay.md.
+
+    Args:
+        dataset: folder or ROS 2 bag of the data set.
+        out: run folder to write, new or empty.
+        options: calibration, truth, alignment and settings (`twin.recordings.replay.ReplayOptions`).
+
+    Returns:
+        Status, metrics and run folder of the replay, the trajectories and the map.
+
+    Raises:
+        TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder is not
+            empty, is written by another process, or cannot be written.
+    """
+    from twin.recordings import replay as recorded
+
+    return recorded.replay(Path(dataset), Path(out), options)
+
+
+def _scenario(scene: str | Path | Scenario, overrides: Overrides, sections: Mapping[str, Any]) -> Scenario:
+    """Returns a scenario as it is, or loads it with values set.
+
+    Raises:
+        TwinError: values are given for a `Scenario`, which is complete.
+    """
+    if isinstance(scene, str | Path):
+        return load_scenario(scene, overrides, **sections)
+    if overrides or sections:
+        raise TwinError("scene", "is a Scenario, whose keys are set already", "values with a name or a file only")
+    return scene
+
+
+def _folder(run: str | Path | RunResult) -> Path:
+    return Path(run) if isinstance(run, str | Path) else run.folder
+
+
+def _texts(values: Overrides) -> Iterator[str]:
+    """Yields values as strings `key=value` with TOML values; arrays and paths become lists and strings."""
+    if not isinstance(values, Mapping):
+        yield from values
+        return
+    for key, value in values.items():
+        if isinstance(value, Mapping) and key != "require":
+            yield from _texts({f"{key}.{name}": inner for name, inner in value.items()})
+        elif value is not None:
+            yield f"{key}={_toml(value).as_string()}"
+
+
+def _toml(value: Any) -> Any:
+    """Returns a value as a TOML value on one line."""
+    import tomlkit
+
+    if hasattr(value, "tolist"):
+        return _toml(value.tolist())
+    if isinstance(value, Mapping):
+        table = tomlkit.inline_table()
+        table.update({str(key): _toml(inner) for key, inner in value.items()})
+        return table
+    if isinstance(value, list | tuple):
+        items = tomlkit.array()
+        items.extend(_toml(inner) for inner in value)
+        return items
+    return tomlkit.item(str(value) if isinstance(value, Path) else value)

@@ -1,0 +1,107 @@
+"""A finished survey: its metrics, and its trajectories and maps, which are read from the run folder when needed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core.optional_packages import optional
+from twin.core.records import Trajectory
+from twin.errors import TwinError
+from twin.report.run_folder import Raster, Run, load_run
+
+if TYPE_CHECKING:
+    import pandas
+
+_KEY_FIGURES = (
+    ("final position error (RMSE)", "trajectory", "final", "ate_rmse_m"),
+    ("map error (LE90)", "map", "le90_m"),
+    ("map error of the asked area (LE90)", "map", "le90_area_m"),
+)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """Outcome of a survey.
+
+    Args:
+        status: "complete", "degraded" or "aborted".
+        metrics: contents of metrics.json.
+        folder: the run folder.
+    """
+
+    status: str
+    metrics: dict[str, Any]
+    folder: Path
+
+    @classmethod
+    def of_folder(cls, folder: str | Path) -> RunResult:
+        """Returns the outcome of the survey in a run folder.
+
+        Raises:
+            TwinError: it is not a run folder, a file is damaged, or the survey has not finished.
+        """
+        run = load_run(folder)
+        if run.metrics is None:
+            raise TwinError(str(folder), "has no metrics.json: the survey has not finished", "a finished run")
+        result = cls(run.metrics["status"], run.metrics, run.folder)
+        vars(result)["contents"] = run
+        return result
+
+    @cached_property
+    def contents(self) -> Run:
+        """Returns all contents of the run folder."""
+        return load_run(self.folder)
+
+    @property
+    def trajectories(self) -> dict[str, Trajectory]:
+        """Returns the camera's trajectories in the world: truth, f2f, online, final, reference."""
+        return self.contents.trajectories
+
+    @property
+    def maps(self) -> dict[str, Raster]:
+        """Returns the maps dem, dem_sigma, dem_truth, dem_error [m] and mosaic; row 0 is the northernmost."""
+        return self.contents.rasters
+
+    @property
+    def errors_m(self) -> NDArray[np.float64]:
+        """Returns the errors (n, 3) [m] of the final camera positions in the world, for the frames of the survey."""
+        final, truth = self.trajectories["final"], self.trajectories["truth"]
+        rows = np.searchsorted(truth.times_s, final.times_s)
+        return final.positions - truth.positions[np.minimum(rows, len(truth) - 1)]
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Returns a row for each frame: time, true, online and final positions [m], and the final position error [m].
+
+        Raises:
+            TwinError: the package pandas is not installed.
+        """
+        pandas = optional("pandas", "notebook", "to_dataframe")
+        table = pandas.DataFrame({"time_s": self.trajectories["final"].times_s})
+        for name in ("truth", "online", "final"):
+            for axis, values in zip("xyz", self.trajectories[name].positions.T, strict=True):
+                table[f"{name}_{axis}_m"] = pandas.Series(values)
+        table["error_m"] = np.linalg.norm(self.errors_m, axis=1)
+        return table
+
+    def _repr_html_(self) -> str:
+        """Returns name, status, key figures, warnings and the link to the report, for notebooks."""
+        rows = "".join(f"<tr><td>{name}</td><td>{_in_mm(self.metrics, path)}</td></tr>" for name, *path in _KEY_FIGURES)
+        warnings = "".join(f"<li>{escape(text)}</li>" for text in self.metrics.get("warnings", ()))
+        report = (self.folder / "report.html").absolute()
+        link = f'<a href="{report.as_uri()}">report</a>' if report.exists() else ""
+        title = f"{escape(self.metrics['name'])}, seed {self.metrics['seed']}: {self.status}"
+        return f"<b>{title}</b> {link}<table>{rows}</table><ul>{warnings}</ul>"
+
+
+def _in_mm(metrics: dict[str, Any], path: list[str]) -> str:
+    value: Any = metrics
+    for key in path:
+        value = value.get(key) if isinstance(value, dict) else None
+    return "unknown" if value is None else f"{1000 * value:.2f} mm"
