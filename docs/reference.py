@@ -1,4 +1,4 @@
-"""Writes the reference of all scenario keys from the model: `python docs/reference.py docs/reference/scenario.md`."""
+"""Writes the reference of all keys of scenarios and studies from their models: `python docs/reference.py FOLDER`."""
 
 import json
 import re
@@ -7,13 +7,19 @@ from pathlib import Path
 from typing import Any
 
 from twin.scenario.model import Scenario
+from twin.studies.study_file import Study
 
-HEAD = """# Scenario keys
+HEAD = """# {}
 
-Written by `python docs/reference.py docs/reference/scenario.md` from the model of the scenario; `twin schema` prints
-the same as a JSON schema for editors. How the keys work together is in the [scenario guide](../guide/scenario.md).
+Written by `python docs/reference.py docs/reference` from the model of {}. {}
+
 """
-_TITLES = {"lamps": "[[lamps]]", "beacons": "[[beacons]]", "objects": "[[objects]]"}
+SCENARIO_NOTE = (
+    "`twin schema` prints the same as a JSON schema for editors. How the keys work together is in the\n"
+    "[scenario guide](../guide/scenario.md)."
+)
+STUDY_NOTE = "What studies and tunings do with them is in\n[studies and tuning](../guide/studies.md)."
+_TITLES = {"lamps": "[[lamps]]", "beacons": "[[beacons]]", "objects": "[[objects]]", "together": "[[together]]"}
 _UNIT = re.compile(r"\s*\[([^\[\],]+)\](?=$|;)")
 _BOUNDS = {
     "minimum": ">= {}", "exclusiveMinimum": "> {}", "maximum": "<= {}", "exclusiveMaximum": "< {}",
@@ -21,15 +27,25 @@ _BOUNDS = {
 }  # fmt: skip
 
 
-def page() -> str:
-    """Returns the reference as Markdown: one table for the top level and one for each section."""
-    schema = Scenario.model_json_schema()
+def pages() -> dict[str, str]:
+    """Returns the pages as Markdown, by the name of their file."""
+    return {
+        "scenario.md": HEAD.format("Scenario keys", "a scenario", SCENARIO_NOTE)
+        + _tables(Scenario.model_json_schema()),
+        "study.md": HEAD.format("Study keys", "a study", STUDY_NOTE)
+        + _tables(Study.model_json_schema(), "Distribution"),
+    }
+
+
+def _tables(schema: dict[str, Any], *definitions: str) -> str:
+    """Returns one table for the top level, one for each section, and one for each of the definitions."""
     sections = {name: found for name, key in schema["properties"].items() if (found := _section(schema, key))}
     top = {name: key for name, key in schema["properties"].items() if name not in sections}
-    parts = [HEAD, "## Top level\n\n" + _table(top)]
-    for name, section in sections.items():
-        text = " ".join(section["description"].split())
-        parts.append(f"## `{_TITLES.get(name, f'[{name}]')}`\n\n{text}\n\n" + _table(section["properties"]))
+    titled = {f"`{_TITLES.get(name, f'[{name}]')}`": section for name, section in sections.items()}
+    titled |= {name: schema["$defs"][name] for name in definitions}
+    parts = ["## Top level\n\n" + _table(top)]
+    for title, section in titled.items():
+        parts.append(f"## {title}\n\n{' '.join(section['description'].split())}\n\n{_table(section['properties'])}")
     return "\n".join(parts)
 
 
@@ -69,4 +85,5 @@ def _allowed(key: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(page(), encoding="utf-8")
+    for name, text in pages().items():
+        (Path(sys.argv[1]) / name).write_text(text, encoding="utf-8")

@@ -26,12 +26,14 @@ def anchor(heading):
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
-def test_the_reference_of_scenario_keys_is_that_of_the_model():
-    page = runpy.run_path(str(DOCS / "reference.py"))["page"]()
-    assert page == (DOCS / "reference" / "scenario.md").read_text(), (
-        "run: python docs/reference.py docs/reference/scenario.md"
+def test_the_reference_of_keys_is_that_of_the_models():
+    pages = runpy.run_path(str(DOCS / "reference.py"))["pages"]()
+    for name, page in pages.items():
+        assert page == (DOCS / "reference" / name).read_text(), "run: python docs/reference.py docs/reference"
+    assert (
+        "| `baseline_m` | `0.15` | m | number, > 0.005, <= 3 | distance between the cameras |" in pages["scenario.md"]
     )
-    assert "| `baseline_m` | `0.15` | m | number, > 0.005, <= 3 | distance between the cameras |" in page
+    assert "| `log_uniform` |" in pages["study.md"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
