@@ -173,3 +173,14 @@ def test_matches_at_the_border_are_biased_inwards_and_well_inside_excludes_them(
     bound = [3 * error.std() / np.sqrt(len(error)) for error in (border, inside)]
     assert border.mean() > bound[0] and abs(inside.mean()) < bound[1]
     assert stereo.well_inside(np.array([[6.0, 50.0], [9.0, 50.0]]), rig, PATCH_PX).tolist() == [False, True]
+
+
+def test_a_patch_at_the_border_reads_no_pixel_outside_of_the_image():
+    """The uppermost position of the patch, rounded to single precision, lies 5e-7 px above the first row of knots."""
+    target = np.random.default_rng(3).normal(size=(60, 80)).astype(np.float32)
+    warp = np.array([[1.0, 0.0], [-0.0012883614637495544, 1.000395122060182]])
+    row, values = 6.008417462653595, np.empty(121, np.float32)
+    assert row >= 5 * abs(warp[1]).sum() + 1
+    spline = patches.spline_coefficients([target])[0]
+    patches._sample.py_func(spline, 40.0, row, warp, 5, values)
+    assert np.abs(values).max() < 2 * np.abs(target).max()

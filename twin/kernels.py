@@ -49,7 +49,7 @@ def kernel(function: Any = None, /, **options: Any) -> Any:
     if function is None:
         return lambda decorated: kernel(decorated, **options)
     dispatcher: Any = numba.njit(nogil=True, **options)(function)
-    if _cache_folder(Path(function.__code__.co_filename).resolve()) is not None:
+    if _cache_folder(Path(function.__code__.co_filename).resolve(), function.__module__) is not None:
         _enable_caching(dispatcher)
     return dispatcher
 
@@ -63,7 +63,7 @@ class KernelLocator:
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelLocator | None:
         """Returns the locator of a function, None where no folder can be written."""
-        folder = _cache_folder(Path(file).resolve())
+        folder = _cache_folder(Path(file).resolve(), function.__module__)
         return cls(folder, function.__code__.co_firstlineno) if folder is not None else None
 
     def ensure_cache_path(self) -> None:
@@ -97,9 +97,12 @@ def source_hash(file: Path) -> str:
 
 
 @cache
-def _cache_folder(file: Path) -> Path | None:
-    """Returns the folder of one module's compiled code, or None where no folder can be written."""
-    module = cache_root() / _module_name(file)
+def _cache_folder(file: Path, name: str) -> Path | None:
+    """Returns the folder of one module's compiled code, or None where no folder can be written.
+
+    The compiled code refers to the module by its name, which may differ between checkouts of the same sources.
+    """
+    module = cache_root() / name
     folder = module / source_hash(file)
     try:
         is_new = not folder.exists()

@@ -294,12 +294,16 @@ def _sample(spline, u0, v0, warp, half, values):
     column, row = np.int32(u0), np.int32(v0)
     u_fraction, v_fraction = np.float32(u0 - column), np.float32(v0 - row)
     one, two, three, down = np.uint32(1), np.uint32(2), np.uint32(3), np.uint32(width)
+    first_u, last_u = np.int32(1 - column), np.int32(width - 3 - column)
+    first_v, last_v = np.int32(1 - row), np.int32(spline.shape[0] - 3 - row)
     for i in range(side):
         y = np.float32(i - half)
         for j in range(side):
             x = np.float32(j - half)
             u, v = u_fraction + uu * x + uv * y, v_fraction + vu * x + vv * y
-            iu, iv = np.int32(np.floor(u)), np.int32(np.floor(v))
+            # in single precision, a position at the border of the image may be rounded to the other side
+            iu = min(max(np.int32(np.floor(u)), first_u), last_u)
+            iv = min(max(np.int32(np.floor(v)), first_v), last_v)
             a0, a1, a2, a3 = bspline_weights(u - np.float32(iu))
             b0, b1, b2, b3 = bspline_weights(v - np.float32(iv))
             r0 = np.uint32((row + iv - 1) * width + column + iu - 1)
