@@ -44,6 +44,7 @@ _COARSE_CONVERGED_PX = 0.1  # convergence limit at the coarse levels, whose resu
 _MAX_SHIFT_PX = 3.0
 _MIN_CORRELATION = 0.7  # patches of different floor rarely correlate by more than 0.5
 _NOISE_LOSS = 1.2  # 2 / (1 + 2/3): interpolation removes a third of the target's noise variance from the residual
+_BORDER_PX, _ROUNDING_PX = 1e-5, 4e-6  # width of the border of an image where rounding errors matter, and their bound
 _REASSOCIATE = {"reassoc", "contract", "nsz"}  # fastmath flags that let sums be vectorised
 _NUISANCES = 6  # brightness, contrast, and the linear gradients of both in column and row
 
@@ -294,16 +295,17 @@ def _sample(spline, u0, v0, warp, half, values):
     column, row = np.int32(u0), np.int32(v0)
     u_fraction, v_fraction = np.float32(u0 - column), np.float32(v0 - row)
     one, two, three, down = np.uint32(1), np.uint32(2), np.uint32(3), np.uint32(width)
-    first_u, last_u = np.int32(1 - column), np.int32(width - 3 - column)
-    first_v, last_v = np.int32(1 - row), np.int32(spline.shape[0] - 3 - row)
+    # positions at the border of the image are moved inwards, by more than the rounding errors of single precision
+    if u0 - half * (abs(warp[0, 0]) + abs(warp[0, 1])) < 1.0 + _BORDER_PX:
+        u_fraction += np.float32(_ROUNDING_PX)
+    if v0 - half * (abs(warp[1, 0]) + abs(warp[1, 1])) < 1.0 + _BORDER_PX:
+        v_fraction += np.float32(_ROUNDING_PX)
     for i in range(side):
         y = np.float32(i - half)
         for j in range(side):
             x = np.float32(j - half)
             u, v = u_fraction + uu * x + uv * y, v_fraction + vu * x + vv * y
-            # in single precision, a position at the border of the image may be rounded to the other side
-            iu = min(max(np.int32(np.floor(u)), first_u), last_u)
-            iv = min(max(np.int32(np.floor(v)), first_v), last_v)
+            iu, iv = np.int32(np.floor(u)), np.int32(np.floor(v))
             a0, a1, a2, a3 = bspline_weights(u - np.float32(iu))
             b0, b1, b2, b3 = bspline_weights(v - np.float32(iv))
             r0 = np.uint32((row + iv - 1) * width + column + iu - 1)
@@ -352,7 +354,8 @@ def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance
         converged, similarity, noise = False, -1.0, 0.0
         for _ in range(_ITERATIONS):
             converged = False
-            if not (extent_u + 1 <= u < width - 2 - extent_u and extent_v + 1 <= v < height - 2 - extent_v):
+            right, bottom = width - 2 - extent_u - _BORDER_PX, height - 2 - extent_v - _BORDER_PX
+            if not (extent_u + 1 <= u < right and extent_v + 1 <= v < bottom):
                 break
             _sample(spline, u, v, warp, half, values)
             total, power, fitted = 0.0, _dot(values, values), 0.0
