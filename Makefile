@@ -3,7 +3,7 @@ BIN := .venv/bin
 READY := .venv/ready
 PARALLEL := -n logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
-.PHONY: env demo test long slow agreement
+.PHONY: env demo test long slow docs agreement
 
 env: $(READY) ## set up: a virtual environment with exact versions
 
@@ -29,6 +29,10 @@ long: env ## small surveys, their reports and Monte Carlo references: tests of s
 
 slow: env ## whole surveys and benchmarks
 	$(BIN)/python -m pytest -m slow
+
+docs: env ## the documentation as a site, in site/
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 agreement: env ## the gate of the surrogate: 64 rendered surveys, then docs/agreement.md and its figure
 	$(BIN)/twin study agreement --out runs/study-agreement --resume; status=$$?; \

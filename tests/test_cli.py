@@ -13,7 +13,7 @@ import pytest
 
 import twin
 from twin import cli
-from twin.app import console, doctor
+from twin.app import console, doctor, outputs
 from twin.errors import TwinError
 from twin.scenes.gl import INSTALL_LINE
 
@@ -152,18 +152,18 @@ def test_run_folders_of_the_same_name_and_seed_are_numbered(tmp_path, monkeypatc
     scenario = types.SimpleNamespace(name="reef", seed=3)
     folders = []
     for _ in range(3):
-        folders.append(cli._new_folder(scenario, None))
+        folders.append(outputs.run_folder(scenario))
         folders[-1].mkdir(parents=True)
         (folders[-1] / "log.jsonl").touch()
     assert [str(f) for f in folders] == ["runs/reef-3", "runs/reef-3-2", "runs/reef-3-3"]
 
 
 def test_an_empty_folder_is_accepted_and_any_other_path_is_not(tmp_path):
-    assert cli._new_folder(None, tmp_path) == tmp_path
+    assert outputs.new_folder(tmp_path) == tmp_path
     (tmp_path / "file").touch()
     for taken in (tmp_path, tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(TwinError, match="--out"):
-            cli._new_folder(None, taken)
+            outputs.new_folder(taken)
 
 
 def test_the_schema_describes_every_section(twin_command):

@@ -1,4 +1,4 @@
-"""Index page, results file and README chapter of `twin reproduce all`, and the errors of the commands."""
+"""Index page, results file and chapter of `twin reproduce all`, and the errors of the commands."""
 
 import json
 from pathlib import Path
@@ -10,7 +10,7 @@ from twin.cli import app
 from twin.errors import TwinError
 from twin.reproduce import catalogue
 from twin.reproduce.exhibit import Exhibit, Figure, make_table
-from twin.reproduce.readme_chapter import BEGIN, END, SHOWN, chapter, with_chapter
+from twin.reproduce.page_chapter import BEGIN, END, SHOWN, chapter, with_chapter
 from twin.reproduce.tank import TABLES
 
 ROOT = Path(__file__).parent.parent
@@ -55,9 +55,9 @@ def test_an_unknown_experiment_is_refused_before_any_is_run(tmp_path):
 
 
 def test_the_chapter_replaces_what_is_between_the_markers_and_nothing_else():
-    readme = f"# A\n\n{BEGIN}\nold\n{END}\n\n## B\n"
+    page = f"# A\n\n{BEGIN}\nold\n{END}\n\n## B\n"
     text = chapter([EXHIBIT], quick=False)
-    new = with_chapter(readme, text)
+    new = with_chapter(page, text)
     assert (
         new.startswith(f"# A\n\n{BEGIN}\n## How true is it?") and new.endswith(f"{END}\n\n## B\n") and "old" not in new
     )
@@ -65,17 +65,17 @@ def test_the_chapter_replaces_what_is_between_the_markers_and_nothing_else():
     assert "| error < 1 | 0.30 m | 8 \\| 9 mm |" in new and "--quick" not in new
 
 
-@pytest.mark.parametrize("readme", ["# A\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n", BEGIN])
-def test_a_readme_without_the_markers_is_refused(readme):
-    with pytest.raises(TwinError, match="README: does not have the markers of the chapter once"):
-        with_chapter(readme, "text")
+@pytest.mark.parametrize("page", ["# A\n", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n", BEGIN])
+def test_a_page_without_the_markers_is_refused(page):
+    with pytest.raises(TwinError, match="page: does not have the markers of the chapter once"):
+        with_chapter(page, "text")
 
 
-def test_the_chapter_of_the_readme_is_that_of_its_data_file():
+def test_the_chapter_of_the_page_is_that_of_its_data_file():
     exhibits, quick = catalogue.read_all(ROOT / "docs" / "reproduction.json")
-    readme = (ROOT / "README.md").read_text()
-    command = "twin reproduce chapter docs/reproduction.json --readme README.md"
-    assert with_chapter(readme, chapter(exhibits, quick)) == readme, f"run: {command}"
+    page = (ROOT / "docs" / "paper.md").read_text()
+    command = "twin reproduce chapter docs/reproduction.json --page docs/paper.md"
+    assert with_chapter(page, chapter(exhibits, quick)) == page, f"run: {command}"
 
 
 def test_the_chapter_shows_only_tables_that_the_experiments_have():
@@ -121,8 +121,8 @@ def test_a_command_prints_the_tables_or_json(tmp_path, monkeypatch):
 
 def test_the_chapter_is_printed_or_written(tmp_path):
     catalogue.write_all([EXHIBIT], tmp_path, quick=False)
-    readme = tmp_path / "README.md"
-    readme.write_text(f"{BEGIN}\n{END}\n")
+    page = tmp_path / "paper.md"
+    page.write_text(f"{BEGIN}\n{END}\n")
     shown = CliRunner().invoke(app, ["reproduce", "chapter", str(tmp_path / "results.json")]).stdout
-    CliRunner().invoke(app, ["reproduce", "chapter", str(tmp_path / "results.json"), "--readme", str(readme)])
-    assert readme.read_text() == shown
+    CliRunner().invoke(app, ["reproduce", "chapter", str(tmp_path / "results.json"), "--page", str(page)])
+    assert page.read_text() == shown

@@ -63,7 +63,7 @@ PhaseOption = Annotated[
     typer.Option("--phase", help="Phase function for lamps, in model and reference: a value of water.phase_function."),
 ]
 ResultsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="results.json of `twin reproduce all`.")]
-ReadmeOption = Annotated[Path | None, typer.Option("--readme", help="README whose chapter is replaced.")]
+ChapterPageOption = Annotated[Path | None, typer.Option("--page", help="Markdown page whose chapter is replaced.")]
 TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
 AtOption = Annotated[
     str | None,
@@ -425,16 +425,16 @@ def all_experiments(out: TurbidityOutOption = Path("runs/reproduce"), quick: Qui
 
 
 @reproductions.command()
-def chapter(file: ResultsArgument, readme: ReadmeOption = None) -> None:
-    """Print the chapter for the README that shows the results of `twin reproduce all`, or replace it in a README."""
-    from twin.reproduce import catalogue, readme_chapter
+def chapter(file: ResultsArgument, page: ChapterPageOption = None) -> None:
+    """Print the chapter of docs/paper.md that shows the results of `twin reproduce all`, or replace it in a page."""
+    from twin.reproduce import catalogue, page_chapter
 
     exhibits, quick = catalogue.read_all(file)
-    if readme is None:
-        print(readme_chapter.chapter(exhibits, quick))
+    if page is None:
+        print(page_chapter.chapter(exhibits, quick))
         return
-    with outputs.writing(readme, "--readme"):
-        readme_chapter.update(readme, exhibits, quick)
+    with outputs.writing(page, "--page"):
+        page_chapter.update(page, exhibits, quick)
 
 
 @app.command("fit-surrogate")

@@ -1,4 +1,4 @@
-"""Results of one experiment as tables and figures, the contents of the index page and of the README chapter."""
+"""Results of one experiment as tables and figures, for the index page and the chapter of docs/paper.md."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The chapter "How true is it?" of the README, generated from the results of `twin reproduce all`."""
+"""The chapter "How true is it?" of docs/paper.md, generated from the results of `twin reproduce all`."""
 
 from __future__ import annotations
 
@@ -51,29 +51,29 @@ def _line(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |".replace("|  |", "| |")
 
 
-def with_chapter(readme: str, text: str, name: str = "README") -> str:
-    """Returns a README in which the markers and the text between them are replaced by the chapter.
+def with_chapter(page: str, text: str, name: str = "page") -> str:
+    """Returns a page in which the markers and the text between them are replaced by the chapter.
 
     Args:
-        readme: contents of the README.
+        page: contents of the page.
         text: the chapter, including its markers.
-        name: name of the README in the error.
+        name: name of the page in the error.
 
     Raises:
-        TwinError: the README does not contain each marker exactly once, the begin marker first.
+        TwinError: the page does not contain each marker exactly once, the begin marker first.
     """
-    first, last = readme.find(BEGIN), readme.find(END)
-    if min(first, last) < 0 or last < first or readme.count(BEGIN) != 1 or readme.count(END) != 1:
+    first, last = page.find(BEGIN), page.find(END)
+    if min(first, last) < 0 or last < first or page.count(BEGIN) != 1 or page.count(END) != 1:
         raise TwinError(name, "does not have the markers of the chapter once", f"the lines {BEGIN} and {END}")
-    return readme[:first] + text + readme[last + len(END) :]
+    return page[:first] + text + page[last + len(END) :]
 
 
-def update(readme: Path, exhibits: Sequence[Exhibit], quick: bool) -> None:
-    """Replaces the chapter in a README file.
+def update(page: Path, exhibits: Sequence[Exhibit], quick: bool) -> None:
+    """Replaces the chapter in a Markdown file.
 
     Raises:
         TwinError: the file cannot be read, or does not contain each marker exactly once.
         OSError: the file cannot be written.
     """
-    text = read_text(readme, "", "a Markdown file")
-    readme.write_text(with_chapter(text, chapter(exhibits, quick), str(readme)), encoding="utf-8")
+    text = read_text(page, "", "a Markdown file")
+    page.write_text(with_chapter(text, chapter(exhibits, quick), str(page)), encoding="utf-8")
