@@ -25,12 +25,18 @@ def sea(absorption, scattering, scatterer=PETZOLD):
     return Medium(np.full(3, absorption), np.full(3, scattering), (scatterer,) * 3)
 
 
+def backscatter_fraction(scatterer):
+    """Returns the fraction of the scattered light that is scattered by more than 90 deg."""
+    cumulative = table_of(scatterer).cumulative
+    return 1 - np.interp(0.5**0.25, np.linspace(0.0, 1.0, len(cumulative)), cumulative)
+
+
 @pytest.mark.parametrize("scatterer", [HG, PETZOLD])
 def test_light_of_an_even_floor_is_lost_only_by_scattering_backwards(scatterer):
     """Without absorption, light scattered by less than 90 deg reaches the camera: exp(-b_b r) of it arrives."""
     sigmas = tuple(level_sigma_px(level) / 277 for level in range(9))
     ranges_m = (0.3, 1.0, 3.0)
-    backwards = table_of(scatterer).backscatter_fraction
+    backwards = backscatter_fraction(scatterer)
     for b in (0.05, 1.0):
         thickness = b * np.array(ranges_m)
         arrives = np.exp(-thickness) + camera_mixture(Absorbed(0.0, b, scatterer), ranges_m, sigmas).sum(1)
@@ -109,7 +115,7 @@ def test_the_image_of_a_point_has_the_kernel_and_its_energy():
     ones = np.ones((*blur.surroundings.shape, 3), np.float32)
     place = np.full(blur.surroundings.shape, place_of(np.float64(2.0)), np.float32)
     even = blur.spread(np.ones((*SHAPE, 3), np.float32), np.full(SHAPE, 2.0), (ones, place)) + np.exp(-0.8)
-    np.testing.assert_allclose(even, np.exp(-0.8 * table_of(PETZOLD).backscatter_fraction), rtol=0.01)
+    np.testing.assert_allclose(even, np.exp(-0.8 * backscatter_fraction(PETZOLD)), rtol=0.01)
 
 
 def test_off_the_axis_the_kernel_covers_more_pixels_and_keeps_its_light():

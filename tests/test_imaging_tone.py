@@ -103,7 +103,7 @@ def test_a_water_preset_makes_a_floor_at_the_planned_altitude_grey():
 def test_without_scattering_a_water_preset_compensates_the_absorption_over_the_path(lamps, light):
     keys = {"sensor": {"white_balance": "water"}, "imaging": {"scattering": "none"}, "lamps": lamps}
     here = Scenario.model_validate(keys)
-    absorption, _, _ = water_spectrum(here.water.jerlov, here.water.source)
+    absorption, _ = water_spectrum(here.water.jerlov, here.water.source)
     left = band_weights(spectrum_of(light)) @ np.exp(-2 * here.plan.altitude_m * absorption)
     factors = WhiteBalance(here, np.ones(3)).factors(np.ones(3), 0.0)
     np.testing.assert_allclose(factors, left.max() / left, rtol=1e-9)

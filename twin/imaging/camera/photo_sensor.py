@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import TypeAlias
 
 import cv2
 import numpy as np
@@ -20,26 +20,6 @@ from twin.kernels import kernel
 from twin.scenario.model import Scenario, SensorConfig
 
 BLACK_SHARE = 1 / 64  # black level as a fraction of the number of levels, so that dark noise is not clipped at zero
-
-
-class Sensor(Protocol):
-    """Interface of the sensor model that both cameras share."""
-
-    @property
-    def setting(self) -> ExposureSetting | None: ...
-
-    def meter(self, light: Radiance) -> ExposureSetting: ...
-
-    def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None: ...
-
-    def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image: ...
-
-    def signal_per_cd(self, setting: ExposureSetting) -> Exposure: ...
-
-
-def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
-    """Returns a scenario's sensor in its initial state; `raw_rig` see `PhotoSensor`."""
-    return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
 
 class PhotoSensor:
@@ -139,6 +119,15 @@ class PhotoSensor:
         """Returns the tone table (3, 2^bits): the 8-bit value of each digital number in each band."""
         signal = (np.arange(self._top_dn + 1) - self._black_dn) / (self._top_dn - self._black_dn)
         return np.clip(255 * tone(white[:, None] * signal, self._sensor.tone_curve) + 0.5, 0, 255).astype(np.uint8)
+
+
+#: Sensor model that both cameras share.
+Sensor: TypeAlias = PlainSensor | PhotoSensor
+
+
+def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
+    """Returns a scenario's sensor in its initial state; `raw_rig` see `PhotoSensor`."""
+    return PlainSensor(scenario) if scenario.sensor is None else PhotoSensor(scenario, scenario.sensor, raw_rig)
 
 
 @kernel(fastmath={"contract", "reassoc"})
