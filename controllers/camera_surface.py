@@ -67,7 +67,6 @@ def surface_above_floor(
         height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
         spacing_m: distance between the nodes of `height_m`.
         corner_m: position (x, y) of node (0, 0).
-        altitude_m: height above the smoothed floor.
         footprint_m: extent of an image on the floor along x and y.
         max_slope: greatest slope (rise over run) of the surface along x, y and the diagonals.
     """

@@ -59,7 +59,6 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     With the disparity d = f b / Z, the standard deviation of depth is sigma_Z = Z^2 / (f b) sigma_d.
 
     Args:
-        plan: the survey plan.
         baseline_m: stereo baseline b [m].
         disparity_sigma_px: standard deviation sigma_d of the disparity [px].
     """
@@ -105,7 +104,6 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     """Returns the clearance of a level path above the highest floor within the image footprints and between the swaths.
 
     Args:
-        plan: the survey plan.
         height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain. The terrain must
             be a rectangle: the path is taken to lie inside if all its waypoints do.
         sample_m: sampling distance of the heights. It is increased if there would be more than

@@ -69,7 +69,6 @@ def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
     """Converts the reference of the camera to that of the level body; velocity and acceleration stay the same.
 
     Args:
-        camera: reference of the camera.
         lever_arm_m: (3,) position of the camera in the body.
     """
     return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), lever_arm_m))

@@ -73,9 +73,6 @@ def build(
     The model contains gravity; `twin.simulate` adds buoyancy, drag and thrust.
 
     Args:
-        terrain: the seafloor.
-        cameras: the stereo rig.
-        timestep_s: physics timestep.
         lamp_positions_m: (n, 3) positions of the lamps in the body.
     """
     spec = _empty_model(cameras.width_px, cameras.height_px, timestep_s)

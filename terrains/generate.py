@@ -36,8 +36,6 @@ def generate(
         kind: a key of KINDS.
         size_m: extent along x and y; rounded up to whole cells.
         relief_m: difference between the greatest and the least height.
-        base_m: least height.
-        grid_m: distance between grid nodes.
         texture: side of a texel, cover and texture of walls of the floor; its files are not used.
         seed: seed of the heights and the texture.
     Raises:
@@ -67,7 +65,6 @@ def generate_from(
         heights: function that returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the grid nodes [m], given
             a random generator.
         size_m: extent along x and y; rounded up to whole cells.
-        grid_m: distance between grid nodes.
         texture: side of a texel; its files are not used.
         cover: a key of `ground_cover.COVERS`.
         seed: seed of the heights and the texture.

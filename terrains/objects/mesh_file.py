@@ -128,11 +128,7 @@ def _part(part: Any) -> _Part:
 
 
 def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> list[Any]:
-    """Returns the result of `convert` for the trimesh meshes of a file, whose size is checked first.
-
-    Raises:
-        TwinError: the file is missing, unreadable or too large, or a material or texture file that it names is.
-    """
+    """Returns the result of `convert` for the trimesh meshes of a file, whose size is checked first."""
     with reading(file, field, FORMATS, MAX_BYTES):
         if (n_faces := face_count(file)) > MAX_FACES:
             raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
@@ -166,11 +162,7 @@ _Z_FROM_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
 
 
 def _loaded(file: Path, field: str) -> Any:
-    """Returns the trimesh scene or mesh of a file.
-
-    Raises:
-        TwinError: a material or texture file that it names is missing, or a texture is not an image.
-    """
+    """Returns the trimesh scene or mesh of a file."""
     import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
     from PIL import Image
     from trimesh.resolvers import FilePathResolver
@@ -273,11 +265,7 @@ def _base_colour(part: Any) -> tuple[int, ...] | None:
 
 
 def _texture_of(part: Any) -> tuple[Any, Any] | None:
-    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either.
-
-    Raises:
-        ValueError: the image is of another format than IMAGE_FORMATS, or too large. Pillow decodes it later.
-    """
+    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either."""
     material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or uv is None or len(uv) != len(part.vertices):

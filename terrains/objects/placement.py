@@ -64,11 +64,8 @@ def place(
 
     Args:
         number: number of the entry, from 0.
-        group: the entry.
         models: shapes, of which each object has one.
-        terrain: the floor.
         taken: objects of other entries, which scattered objects do not overlap.
-        seed: seed of the scenario.
     Raises:
         TwinError: an object with a given position reaches beyond the terrain; there would be no scattered object or too
             many, or they do not fit.
@@ -100,11 +97,7 @@ def _scattered(
     number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
     rng: np.random.Generator,
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns objects at random positions that do not overlap each other or the objects in `taken`.
-
-    Raises:
-        TwinError: there would be none or too many, or they do not fit into the area without overlap.
-    """
+    """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
     field = f"objects.{number}.per_m2"
     low, high = _region(group, terrain)
     n = _count(group, terrain, low, high, field)
@@ -137,7 +130,8 @@ def _region(group: Group, terrain: Terrain) -> tuple[Array, Array]:
 def _count(group: Group, terrain: Terrain, low: Array, high: Array, field: str) -> int:
     """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
 
-    Raises TwinError if there are none or too many."""
+    Raises TwinError if there are none or too many.
+    """
     assert group.per_m2 is not None
     side = np.maximum(high - low, 0)
     steps = [np.linspace(a, b, 201)[:-1] + (b - a) / 400 for a, b in zip(low, high, strict=True)]

@@ -25,7 +25,6 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
 
     Args:
         natural_frequency_radps: natural frequency of the closed loop in position.
-        frame_rate_hz: number of frames per second.
     """
     hull = trimmed_hull(VehicleConfig.model_validate({}))
     model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)

@@ -63,7 +63,6 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
 
     Args:
-        hull: parameters of the hull.
         world_from_body: (3, 3) rotation from the body to the world.
         twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
         current_mps: (3,) velocity of the steady current in the world.
@@ -137,7 +136,6 @@ def mechanical_energy(hull: Hull, world_from_body: Array, position_m: Array, twi
     """Returns the mechanical energy in still water [J]: potential energy, and kinetic energy including added mass.
 
     Args:
-        hull: parameters of the hull.
         world_from_body: (3, 3) rotation from the body to the world.
         position_m: (3,) position of the centre of gravity in the world.
         twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].

@@ -124,12 +124,6 @@ def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Arra
 
     With A and B the matrices of its controllable canonical form in continuous time, the first n rows of
     exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
-
-    Args:
-        denominator: (n + 1,) polynomial coefficients from the highest power down; the first one is 1.
-        timestep_s: dt [s].
-    Returns:
-        Transition matrix (n, n) and input matrix (n, 1).
     """
     n = len(denominator) - 1
     rates = np.zeros((n + 1, n + 1))

@@ -334,11 +334,6 @@ def _check_speed(scenario: Scenario, plan: SurveyPlan | None) -> None:
     """Raises TwinError if the cruise speed exceeds the top speed: forwards or, for loops, in the slowest direction.
 
     A kinematic vehicle is not checked.
-
-    Args:
-        scenario: the vehicle, and `plan.speed_mps`.
-        plan: the planned survey, whose cruise speed is below `plan.speed_mps` on tight loops; None: it could not be
-            planned.
     """
     if scenario.vehicle.dynamics == "kinematic":
         return
@@ -380,11 +375,7 @@ def _check_current(scenario: Scenario) -> None:
 
 
 def _illumination(scenario: Scenario) -> Illumination:
-    """Returns the optical properties of the water and the daylight.
-
-    Raises:
-        TwinError: water, daylight or the beam of a lamp is invalid.
-    """
+    """Returns the optical properties of the water and the daylight."""
     illumination = illumination_of(scenario)
     light_sources_in_camera(scenario.believed_rig(), scenario.lamps, illumination.daylight, 0)
     return illumination
@@ -505,11 +496,7 @@ def _check_over_heights(field: str, terrain: terrains.Terrain, plan: SurveyPlan)
 
 
 def _grid(scenario: Scenario, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
-    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m.
-
-    Raises:
-        TwinError: the grid has more cells than `limits.MAX_MAP_CELLS`.
-    """
+    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
     corners = plan.outline()[:, :2]
     margin = np.array(_half_extent_m(plan)) * _widest(plan, terrain) + 0.5
     cell = scenario.map.cell_m

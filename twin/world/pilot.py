@@ -44,8 +44,6 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     unchanged if its motion was measured or a DVL reading is available.
 
     Args:
-        estimate: estimate of a frame.
-        reference: reference of the same frame.
         readings: readings of the navigation sensors at the frame.
     """
     if estimate.status == "ok" or readings.dvl_mps is not None:
@@ -114,7 +112,6 @@ def steer(state, world_from_camera, camera_velocity, position, velocity, acceler
     """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`.
 
     Args:
-        state: state of the pilot.
         world_from_camera: (4, 4) estimated pose of the left camera.
         camera_velocity: (6,) estimated twist of the left camera in camera axes [rad/s, m/s].
         position, velocity, acceleration: (3,) reference of the left camera in the world [m, m/s, m/s2].

@@ -44,11 +44,7 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
 
 
 def _centre(plan: PlanConfig, terrain: Terrain) -> Corner:
-    """Returns the centre of the area in the scene [m].
-
-    Raises:
-        TwinError: the centre lies outside the terrain, is given twice, or needs coordinates that the terrain lacks.
-    """
+    """Returns the centre of the area in the scene [m]."""
     if plan.centre_crs is None:
         _check_inside("plan.centre_m", np.array([plan.centre_m]), terrain)
         return plan.centre_m
@@ -116,11 +112,7 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
 
 
 def _ring(tree: Any, file: Path) -> list[Any]:
-    """Returns the outer ring of the only polygon of a GeoJSON object: geometry, feature or feature collection.
-
-    Raises:
-        TwinError: the object does not contain exactly one polygon without holes.
-    """
+    """Returns the outer ring of the only polygon of a GeoJSON object: geometry, feature or feature collection."""
     if isinstance(tree, dict) and tree.get("type") == "FeatureCollection" and len(tree.get("features", [])) == 1:
         tree = tree["features"][0]
     if isinstance(tree, dict) and tree.get("type") == "Feature":
@@ -151,11 +143,7 @@ def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeferenc
 
 
 def _projected(corners: Array, crs: str, origin: Georeference) -> Array:
-    """Returns corners (n, 2) transformed from the named CRS to that of the DEM.
-
-    Raises:
-        TwinError: the CRS is unknown, or the coordinates cannot be transformed.
-    """
+    """Returns corners (n, 2) transformed from the named CRS to that of the DEM."""
     from rasterio.crs import CRS  # imported here: it takes 20 MB, and few plans need it
     from rasterio.errors import RasterioError
     from rasterio.warp import transform

@@ -48,8 +48,7 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     They are not adapted if the path leaves the terrain, nor the spacing if it meets the floor, which `prepare` reports.
 
     Args:
-        scenario: description of the survey.
-        terrain: its floor; None: the survey is planned over the reference plane.
+        terrain: the floor; None: the survey is planned over the reference plane.
 
     Raises:
         TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `limits.check_plan_size`.
@@ -73,8 +72,7 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
     """Returns the requirements of the survey of a scenario.
 
     Args:
-        scenario: description of the survey.
-        terrain: its floor, in which the area is placed; None: the area lies at the origin.
+        terrain: the floor, in which the area is placed; None: the area lies at the origin.
 
     Raises:
         TwinError: the area cannot be placed, or the vehicle cannot turn on the spot.
@@ -101,11 +99,7 @@ def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
 
 
 def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> CameraSurface:
-    """Returns the surface that the camera follows, at `plan.altitude_m` above the smoothed floor.
-
-    Raises:
-        TwinError: the vehicle is kinematic, or the terrain has fewer than 4 x 4 nodes.
-    """
+    """Returns the surface that the camera follows, at `plan.altitude_m` above the smoothed floor."""
     if scenario.vehicle.dynamics == "kinematic":
         raise TwinError("plan.height", "'floor': a kinematic vehicle moves in a horizontal plane", '"plane"')
     if min(terrain.height_m.shape) < 4:
@@ -126,10 +120,6 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     least the smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT of the pairs have over
     the reference plane in the plan with scales of 1 at constant height. The scales start at 1 and are repeatedly
     multiplied by the factors of `_reduction`. On a floor at the reference plane they stay 1.
-
-    Raises:
-        TwinError: no spacing with scales of at least `_LEAST_SCALE` was found that gives enough overlap, or the pattern
-            cannot be planned with the reduced spacing.
     """
     make = _PATTERNS[pattern]
     whole = request._replace(tracks=0) if _n_whole(request, pattern) <= _MOST_TRACKS else request
@@ -171,10 +161,6 @@ def _reduction(found: float, allowed: float, unchanged: int) -> float:
 
     The numbers of frames per keyframe and of tracks are integers, so a small step may leave them unchanged. The least
     step of 1 % is therefore doubled after each of the last `unchanged` steps without effect.
-
-    Args:
-        found, allowed: 1 - overlap of the plan along or across (`NonOverlap`), and its limit.
-        unchanged: number of consecutive steps that did not change the spacing.
     """
     if found <= allowed * (1 + _TOLERANCE):
         return 1.0
