@@ -26,11 +26,6 @@ class ThrustAllocation(NamedTuple):
     command_table: Array
     thrust_table_n: Array
 
-    @property
-    def range_n(self) -> tuple[float, float]:
-        """Returns the greatest reverse (negative) and forward thrust of one thruster [N]."""
-        return float(self.thrust_table_n[0]), float(self.thrust_table_n[-1])
-
     def commands(self, wrench: Array) -> tuple[Array, float]:
         """Computes thruster commands for a wrench.
 

@@ -65,15 +65,6 @@ def pole_placement_gains(natural_frequency_radps: float) -> Gains:
     return Gains(proportional=w**2 + 2 * w * a, derivative=2 * w + a, integral=a * w**2)
 
 
-def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
-    """Converts the reference of the camera to that of the level body; velocity and acceleration stay the same.
-
-    Args:
-        lever_arm_m: (3,) position of the camera in the body.
-    """
-    return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), lever_arm_m))
-
-
 @kernel
 def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
     """Rotates a lever arm (3,) [m] from a level body at the given yaw [rad] to the world."""

@@ -83,11 +83,6 @@ def generate_from(
     return Terrain(height_m, grid_m, west_m, south_m, texels, texel_m, walls=walls)
 
 
-def default_cover(kind: str) -> str:
-    """Returns the cover used for a kind of floor (a key of `DEFAULT_COVERS`) when the scenario chooses none."""
-    return DEFAULT_COVERS[kind]
-
-
 def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights:
     """Scales heights (ny, nx) linearly to [base_m, base_m + relief_m]; if all are equal, they become base_m."""
     low, extent = float(heights.min()), float(np.ptp(heights))

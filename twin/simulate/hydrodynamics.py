@@ -130,16 +130,3 @@ def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
         for i in range(3):
             twist[3 + k] += world_from_body[i, k] * velocity[i]
     return twist
-
-
-def mechanical_energy(hull: Hull, world_from_body: Array, position_m: Array, twist: Array) -> float:
-    """Returns the mechanical energy in still water [J]: potential energy, and kinetic energy including added mass.
-
-    Args:
-        world_from_body: (3, 3) rotation from the body to the world.
-        position_m: (3,) position of the centre of gravity in the world.
-        twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
-    """
-    centre_z = position_m[2] + float(world_from_body[2] @ hull.centre_of_buoyancy_m)
-    kinetic = 0.5 * float((hull.inertia + hull.added_inertia) @ twist**2)
-    return kinetic + hull.weight_n * float(position_m[2]) - hull.buoyancy_n * centre_z

@@ -69,10 +69,6 @@ class LaggedThrusters:
         n, coefficients = configuration.shape[1], np.array(vehicle.thrust_coefficients, float)
         self.state = ThrusterState(a, b, c, configuration, coefficients, np.zeros((len(a), n)), np.zeros(n))
 
-    def thrust_n(self) -> Array:
-        """Returns the current thrust of each thruster (n,) [N]."""
-        return self.state.c @ self.state.lag_state
-
     def wrench(self) -> Array:
         """Returns the current total wrench of the thrusters (6,), [moment, force] in body axes [N m, N]."""
         return thruster_wrench(self.state)

@@ -29,13 +29,13 @@ from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig
 from twin.simulate.autopilot import top_speed_mps
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import imu_rate_hz
+from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.objects.model import PlacedObject
 from twin.world.clearance import path_points, planned_clearance
-from twin.world.limits import check_map_size
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import check_path, load_objects
 from twin.world.pace import SAME_TIME_S, Pace
-from twin.world.planning import plan_survey
+from twin.world.planning import check_map_size, plan_survey
 from twin.world.thrust_authority import check_thrust
 
 #: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
@@ -232,7 +232,7 @@ def prepare(scenario: Scenario) -> Mission:
     if terrain is not None and plan is not None:
         _attempt(lambda: _check_clearance(scenario, terrain, plan), source, errors)
         _attempt(lambda: check_path(objects, plan, scenario.plan.clearance_m), source, errors)
-        _attempt(lambda: check_thrust(scenario, plan), source, errors)
+        _attempt(lambda: check_thrust(scenario.vehicle, scenario.current.velocity_mps, plan), source, errors)
         for k in range(len(scenario.lamps)):
             _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, errors)
     grid = None
@@ -291,7 +291,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
         if (plugin := t.plugin) is not None:
             return terrains.generate_from(
                 lambda x_m, y_m, _: terrain_heights(plugin, x_m, y_m, scenario.seed),
-                t.size_m, t.grid_m, texture, t.cover or terrains.default_cover(t.kind), scenario.seed,
+                t.size_m, t.grid_m, texture, t.cover or DEFAULT_COVERS[t.kind], scenario.seed,
             )  # fmt: skip
         return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texture, scenario.seed)
     if t.plugin is not None:

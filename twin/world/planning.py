@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,10 @@ from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
 from twin.core.floor_rays import HeightField
-from twin.core.records import StereoRig
+from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.scenario.model import Scenario
 from twin.terrains import Terrain
-from twin.world.limits import check_plan_size
 from twin.world.placement import survey_area
 from twin.world.planned_images import floor_of, level_floor, overlaps, planned_keyframes, planned_pairs, thinned
 from twin.world.thrust_authority import climb_slope
@@ -31,6 +31,10 @@ _TOLERANCE = 0.005
 _LEAST_SCALE = 0.05
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
+
+#: Largest number of frames (18 hours at 30 Hz; about 1 kB of memory each), of keyframes, and of cells of the map
+#: (about 100 bytes of memory each).
+MAX_FRAMES, MAX_KEYFRAMES, MAX_MAP_CELLS = 2_000_000, 200_000, 25_000_000
 
 _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 
@@ -51,7 +55,7 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
         terrain: the floor; None: the survey is planned over the reference plane.
 
     Raises:
-        TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `limits.check_plan_size`.
+        TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `check_plan_size`.
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
     plan = _PATTERNS[pattern](request)
@@ -66,6 +70,31 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
         plan = _PATTERNS[pattern](request)
         check_plan_size(scenario, plan)
     return plan
+
+
+def check_plan_size(scenario: Scenario, plan: SurveyPlan) -> None:
+    """Raises TwinError if a plan has more than `MAX_FRAMES` frames or `MAX_KEYFRAMES` keyframes."""
+    duration_s = sum(plan.track_duration_s(track) for track in range(1, plan.n_tracks + 1))
+    hold_s = scenario.control.hold_s * plan.n_tracks
+    n_frames = (duration_s + hold_s) * plan.frame_rate_hz
+    _check_number(
+        "plan.area_m", n_frames, MAX_FRAMES, "frames", "fewer plan.tracks, a smaller area, less overlap, more speed"
+    )
+    n_keyframes = duration_s * plan.frame_rate_hz / plan.n_frames_per_keyframe
+    _check_number("plan.overlap_along", n_keyframes, MAX_KEYFRAMES, "keyframes", "less overlap, or fewer plan.tracks")
+
+
+def check_map_size(grid: MapGrid) -> None:
+    """Raises TwinError if a map has more than `MAX_MAP_CELLS` cells."""
+    n_cells = grid.rows * grid.cols
+    needed_m = grid.cell_m * math.sqrt(n_cells / MAX_MAP_CELLS)
+    _check_number("map.cell_m", n_cells, MAX_MAP_CELLS, "cells of the map", f"a cell of {needed_m:.2g} m")
+
+
+def _check_number(field: str, number: float, limit: int, items: str, remedy: str) -> None:
+    """Raises TwinError if a number of items exceeds its limit."""
+    if number > limit:
+        raise TwinError(field, f"{number:.4g} {items} are too many", f"up to {limit}: {remedy}")
 
 
 def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest:
@@ -108,7 +137,7 @@ def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> Ca
     across_m, along_m = request.footprint_m
     along_x = scenario.plan.pattern == "lawnmower" and not scenario.plan.heading_deg
     footprint_m = (along_m, across_m) if along_x else (across_m, across_m)
-    slope = climb_slope(scenario)
+    slope = climb_slope(scenario.vehicle, scenario.plan.speed_mps)
     corner_m = (terrain.west_m, terrain.south_m)
     return surface_above_floor(terrain.height_m, terrain.spacing_m, corner_m, request.altitude_m, footprint_m, slope)
 
