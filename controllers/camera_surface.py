@@ -10,9 +10,8 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter1d
 
 from twin.controllers.segments import Reference
+from twin.core.geometry import Array
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.survey_plan import SurveyPlan
-
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
 
 #: Largest number of floor heights that `least_clearance` samples.
 MAX_CLEARANCE_SAMPLES = 20_000_000

@@ -14,9 +14,9 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
 
-Array = NDArray[np.float64]
 Corner = tuple[float, float]
 MIN_SIZE_M = 1e-3  # smallest extent of a polygon along and across the legs
 MAX_CORNERS = 1000  # each leg of a plan, and each point of a map, is compared with all edges

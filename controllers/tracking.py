@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.allocation import ThrustAllocation, allocate_wrench
 from twin.controllers.segments import Reference
+from twin.core.geometry import Array
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 ATTITUDE_BANDWIDTH = 2.0  # ratio of attitude to position bandwidth: attitude, the inner loop, must be faster
 INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action divided by the natural frequency

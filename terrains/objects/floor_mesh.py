@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.terrains.objects.detail import cell_colours, level_of
 from twin.terrains.objects.mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.mesh_file import MAX_FACES, TexturedMesh
@@ -23,8 +24,6 @@ LONGEST_EDGE_M = 0.5  #: longer edges are halved; for a mesh larger than 200 m, 
 MAX_DIVIDED = 2 * MAX_FACES  #: largest number of triangles after long edges have been halved
 LARGEST_CELL_M = 0.1  #: largest side of the cells over which the colours of vertices are averaged
 NO_GROUP = -1  #: `PlacedObject.group` of a tile
-
-Array = NDArray[np.float64]
 
 
 class FloorTile(NamedTuple):

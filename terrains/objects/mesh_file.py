@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.user_files import IMAGE_FORMATS, reading
 from twin.errors import TwinError
 from twin.terrains.file_header import eight_bits
@@ -20,8 +21,6 @@ MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its le
 MAX_BYTES = 500_000_000  #: size of the largest file that is read
 MAX_TEXELS = 250_000_000  #: largest number of texels of all textures of a floor together
 TEXTURED_FACES = 200_000  #: largest number of triangles of a divided mesh, whose corners sample the texture
-
-Array = NDArray[np.float64]
 
 
 def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: bool = False) -> Mesh:
@@ -202,18 +201,12 @@ def _coloured(part: Any, albedo: tuple[float, float, float], most_faces: int) ->
 
     A textured mesh is divided into at most `most_faces` triangles, or not at all.
     """
-    from trimesh.visual import TextureVisuals
-
-    colours = np.broadcast_to(np.rint(np.asarray(albedo) * 255), (len(part.vertices), 3))
-    if isinstance(part.visual, TextureVisuals):
-        textured = _textured(part, most_faces)
-        if textured is not None:
-            return textured
-        if (factor := _base_colour(part)) is not None:
-            colours = np.broadcast_to(factor, (len(part.vertices), 3))
-    elif part.visual.defined:
-        colours = np.asarray(part.visual.vertex_colors)[:, :3]
-    return _mesh(part.vertices, part.faces, colours)
+    found = _part(part)
+    if found.image is not None:
+        return _textured(part, most_faces)
+    if found.coloured:
+        return found.mesh
+    return _mesh(part.vertices, part.faces, np.broadcast_to(np.rint(np.asarray(albedo) * 255), (len(part.vertices), 3)))
 
 
 def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
@@ -224,17 +217,15 @@ def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
     )
 
 
-def _textured(part: Any, most_faces: int) -> Mesh | None:
+def _textured(part: Any, most_faces: int) -> Mesh:
     """Returns a trimesh mesh with the colours of its texture at its vertices.
 
-    All triangles are divided into four, repeatedly, as long as this makes at most `most_faces`. Returns None if the
-    mesh has no texture image or no texture coordinates.
+    All triangles are divided into four, repeatedly, as long as this makes at most `most_faces`.
     """
     import trimesh
 
     texture = _texture_of(part)
-    if texture is None:
-        return None
+    assert texture is not None
     image, uv = texture
     divided: Any = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
     while 0 < len(divided[1]) * 4 <= most_faces:

@@ -8,11 +8,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.terrains.objects.model import ObjectModel, PlacedObject
 from twin.terrains.terrain import Terrain
-
-Array = NDArray[np.float64]
 
 STEEP_DEG = 15.0  #: a floor less steep than this counts as sand; about half the angle of repose of sand
 MAX_SCATTERED = 5000  #: largest number of objects of one entry

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
+
 Faces = NDArray[np.int64]
 #: Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from outside.
 Surface = tuple[Array, Faces]

@@ -7,17 +7,15 @@ scenario, which therefore act as model errors. The top speed includes the drag f
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.allocation import pseudo_inverse_allocation
 from twin.controllers.tracking import HullModel, PoseController, feedforward_wrench
+from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n
-
-Array = NDArray[np.float64]
 
 
 def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> PoseController:

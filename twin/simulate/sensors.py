@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.core.records import BeaconDetection, Readings, SensorNoise, StereoRig
 from twin.kernels import kernel
 from twin.scenario.model import NavigationConfig
 from twin.simulate.inertial_sensor import InertialSensor
 
-Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 _BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded

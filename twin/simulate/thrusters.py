@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.scenes.bluerov2 import VehicleParameters
 from twin.simulate.hydrodynamics import angular_first
-
-Array = NDArray[np.float64]
 
 
 @kernel
