@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.errors import TwinError
+from twin.scenario.model import ObjectConfig
 from twin.terrains.objects.model import ObjectModel, PlacedObject
 from twin.terrains.terrain import Terrain
 
@@ -17,35 +18,6 @@ STEEP_DEG = 15.0  #: a floor less steep than this counts as sand; about half the
 MAX_SCATTERED = 5000  #: largest number of objects of one entry
 SIZE_CUT_SIGMA = 2.0  #: random sizes are limited to this many standard deviations of their logarithm
 TRIES = (8, 64, 512)  #: sizes of the batches of random positions that are tried in turn for one object
-
-
-class Group(Protocol):
-    """Entry of `[[objects]]`: positions and sizes of its objects; see `twin.scenario.model.ObjectConfig`."""
-
-    @property
-    def size_m(self) -> float | None: ...
-    @property
-    def size_spread(self) -> float: ...
-    @property
-    def position_m(self) -> tuple[float, float] | None: ...
-    @property
-    def height_m(self) -> float | None: ...
-    @property
-    def heading_deg(self) -> float | None: ...
-    @property
-    def upright(self) -> bool: ...
-    @property
-    def sunk(self) -> float: ...
-    @property
-    def per_m2(self) -> float | None: ...
-    @property
-    def on(self) -> str: ...
-    @property
-    def area_m(self) -> tuple[float, float] | None: ...
-    @property
-    def centre_m(self) -> tuple[float, float]: ...
-    @property
-    def spacing_m(self) -> float: ...
 
 
 class Disc(NamedTuple):
@@ -57,7 +29,12 @@ class Disc(NamedTuple):
 
 
 def place(
-    number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject], seed: int
+    number: int,
+    group: ObjectConfig,
+    models: Sequence[ObjectModel],
+    terrain: Terrain,
+    taken: Sequence[PlacedObject],
+    seed: int,
 ) -> list[PlacedObject]:
     """Returns the objects of an entry of `[[objects]]`.
 
@@ -93,7 +70,7 @@ def slope_deg(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array
 
 
 def _scattered(
-    number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
+    number: int, group: ObjectConfig, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
     rng: np.random.Generator,
 ) -> list[PlacedObject]:  # fmt: skip
     """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
@@ -117,7 +94,7 @@ def _scattered(
     return items
 
 
-def _region(group: Group, terrain: Terrain) -> tuple[Array, Array]:
+def _region(group: ObjectConfig, terrain: Terrain) -> tuple[Array, Array]:
     """Returns the south-west and the north-east corner (2,) [m] of the area in which objects are scattered."""
     low, high = np.array([terrain.west_m, terrain.south_m]), np.array([terrain.east_m, terrain.north_m])
     if group.area_m is None:
@@ -126,7 +103,7 @@ def _region(group: Group, terrain: Terrain) -> tuple[Array, Array]:
     return np.maximum(low, centre - half), np.minimum(high, centre + half)
 
 
-def _count(group: Group, terrain: Terrain, low: Array, high: Array, field: str) -> int:
+def _count(group: ObjectConfig, terrain: Terrain, low: Array, high: Array, field: str) -> int:
     """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
 
     Raises TwinError if there are none or too many.
@@ -145,7 +122,7 @@ def _count(group: Group, terrain: Terrain, low: Array, high: Array, field: str) 
     return n
 
 
-def _on_ground(group: Group, terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
+def _on_ground(group: ObjectConfig, terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
     """Returns whether the slope of the floor at each point is one on which the objects of a group may stand."""
     if group.on == "anywhere":
         return np.isfinite(terrain.height_at(x_m, y_m))
@@ -154,7 +131,7 @@ def _on_ground(group: Group, terrain: Terrain, x_m: Array, y_m: Array, reach_m: 
 
 
 def _free_position(
-    group: Group, terrain: Terrain, corners: tuple[Array, Array], radius_m: float, around: Array,
+    group: ObjectConfig, terrain: Terrain, corners: tuple[Array, Array], radius_m: float, around: Array,
     rng: np.random.Generator,
 ) -> tuple[float, float] | None:  # fmt: skip
     """Returns a random position (x, y) [m] where an object may stand; None if none is found.
@@ -176,7 +153,7 @@ def _free_position(
     return None
 
 
-def _scales(group: Group, models: Sequence[ObjectModel], rng: np.random.Generator) -> Array:
+def _scales(group: ObjectConfig, models: Sequence[ObjectModel], rng: np.random.Generator) -> Array:
     """Returns the random scale (n,) of each object, its size divided by that of its model in `models` (n)."""
     z = rng.standard_normal(len(models))
     factor = np.exp(group.size_spread * np.clip(z, -SIZE_CUT_SIGMA, SIZE_CUT_SIGMA))
@@ -184,8 +161,8 @@ def _scales(group: Group, models: Sequence[ObjectModel], rng: np.random.Generato
 
 
 def _at(
-    number: int, group: Group, model: ObjectModel, scale: float, position_m: tuple[float, float], terrain: Terrain,
-    rng: np.random.Generator,
+    number: int, group: ObjectConfig, model: ObjectModel, scale: float, position_m: tuple[float, float],
+    terrain: Terrain, rng: np.random.Generator,
 ) -> PlacedObject:  # fmt: skip
     """Returns an object at a position (x, y) [m].
 

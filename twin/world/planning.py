@@ -59,7 +59,7 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
     plan = _PATTERNS[pattern](request)
-    check_plan_size(scenario, plan)
+    check_plan_size(plan, scenario.control.hold_s)
     if terrain is None or not _lies_over(plan, terrain):
         return plan
     if scenario.plan.height == "floor":
@@ -68,15 +68,14 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     if scenario.plan.overlap_reference == "floor" and _lies_above(plan, terrain):
         request = _keep_overlap(request, pattern, floor_of(terrain), scenario.believed_rig())
         plan = _PATTERNS[pattern](request)
-        check_plan_size(scenario, plan)
+        check_plan_size(plan, scenario.control.hold_s)
     return plan
 
 
-def check_plan_size(scenario: Scenario, plan: SurveyPlan) -> None:
+def check_plan_size(plan: SurveyPlan, hold_s: float) -> None:
     """Raises TwinError if a plan has more than `MAX_FRAMES` frames or `MAX_KEYFRAMES` keyframes."""
     duration_s = sum(plan.track_duration_s(track) for track in range(1, plan.n_tracks + 1))
-    hold_s = scenario.control.hold_s * plan.n_tracks
-    n_frames = (duration_s + hold_s) * plan.frame_rate_hz
+    n_frames = (duration_s + hold_s * plan.n_tracks) * plan.frame_rate_hz
     _check_number(
         "plan.area_m", n_frames, MAX_FRAMES, "frames", "fewer plan.tracks, a smaller area, less overlap, more speed"
     )
