@@ -142,6 +142,11 @@ def test_a_polygon_that_is_not_simple_is_rejected(corners, problem):
     assert caught.value.field == "plan.polygon" and caught.value.allowed
 
 
+def test_the_edges_and_a_repeated_corner_belong_to_a_polygon():
+    area = polygon_area([(0, 0), (2, 0), (2, 0), (2, 2), (0, 2)], 0.0)
+    assert area.contains([0, 1, 2, 2], [1, 0, 1, 2]).all() and not area.contains(2.001, 1)
+
+
 def test_an_edge_beyond_the_end_of_another_does_not_intersect_it():
     corners = [(0, 0), (2, 2), (1.2, 2.6), (1.5, 2.8), (3.2, 1.5), (3.2, 0)]  # the line of edge 1 crosses edge 4
     assert polygon_area(corners, 0.0).contains(2.2, 2.0)

@@ -135,6 +135,7 @@ def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_pat
         "7",
         '{"type": "Point"}',
         '{"type": "Polygon", "coordinates": [[[1]]]}',
+        '{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}',  # not closed
         '{"type": "Polygon", "coordinates": {"ring": []}}',
         '{"type": "FeatureCollection", "features": {"first": {}}}',
     ],
