@@ -6,11 +6,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 
 class ThrustAllocation(NamedTuple):

@@ -10,9 +10,8 @@ from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter1d
 
 from twin.controllers.segments import Reference
+from twin.core.geometry import Array
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -67,7 +66,6 @@ def surface_above_floor(
         height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
         spacing_m: distance between the nodes of `height_m`.
         corner_m: position (x, y) of node (0, 0).
-        altitude_m: height above the smoothed floor.
         footprint_m: extent of an image on the floor along x and y.
         max_slope: greatest slope (rise over run) of the surface along x, y and the diagonals.
     """

@@ -7,11 +7,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.survey_plan import SurveyPlan
-
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
 
 #: Largest number of floor heights that `least_clearance` samples.
 MAX_CLEARANCE_SAMPLES = 20_000_000
@@ -59,7 +57,6 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     With the disparity d = f b / Z, the standard deviation of depth is sigma_Z = Z^2 / (f b) sigma_d.
 
     Args:
-        plan: the survey plan.
         baseline_m: stereo baseline b [m].
         disparity_sigma_px: standard deviation sigma_d of the disparity [px].
     """
@@ -105,7 +102,6 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     """Returns the clearance of a level path above the highest floor within the image footprints and between the swaths.
 
     Args:
-        plan: the survey plan.
         height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain. The terrain must
             be a rectangle: the path is taken to lie inside if all its waypoints do.
         sample_m: sampling distance of the heights. It is increased if there would be more than

@@ -38,8 +38,6 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     two neighbouring legs are joined, the one that ends first is extended to the end of the other, so that the segment
     between them is perpendicular to both.
 
-    Args:
-        request: requirements of the survey.
     Raises:
         TwinError: a requirement is invalid or cannot be met.
     """

@@ -23,8 +23,6 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     reference plane (times `across_scale` of the request), because loops run in every direction. On small loops, the
     greatest acceleration limits the speed.
 
-    Args:
-        request: requirements of the survey.
     Raises:
         TwinError: a requirement is invalid or cannot be met.
     """

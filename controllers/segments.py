@@ -6,11 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.profile import SpeedProfile
+from twin.core.geometry import Array
 
-Array = NDArray[np.float64]
 Point = tuple[float, float, float]
 
 _CIRCLE_POINTS = 181  # one point every 2 degrees

@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
 
-Array = NDArray[np.float64]
 Corner = tuple[float, float]
 MIN_SIZE_M = 1e-3  # smallest extent of a polygon along and across the legs
-MAX_CORNERS = 1000  # time and memory of `_check_simple` grow with the square of the number of corners
+MAX_CORNERS = 1000  # each leg of a plan, and each point of a map, is compared with all edges
 _EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of rounding
 
 
@@ -62,10 +62,12 @@ class SurveyArea:
         return c * x + s * y, c * y - s * x
 
     def contains(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
-        """Returns whether each scene point lies in the area; the edges of a rectangle and a disc belong to it."""
+        """Returns whether each scene point lies in the area; its edges belong to it."""
         u, v = self.to_legs(x_m, y_m)
         if self.shape == "polygon":
-            return _in_polygon(u, v, self.corners)
+            polygon = self._polygon()
+            shapely.prepare(polygon)
+            return shapely.intersects_xy(polygon, u, v)
         if self.shape == "disc":
             return np.hypot(u, v) <= self.size_m[0] / 2 + _EDGE_M
         return (np.abs(u) <= self.size_m[0] / 2 + _EDGE_M) & (np.abs(v) <= self.size_m[1] / 2 + _EDGE_M)
@@ -84,9 +86,13 @@ class SurveyArea:
 
         u is the coordinate along the legs, v the one to the left of them.
         """
-        corners = self._corners()
-        found = [u for a, b in pairwise([*corners, corners[0]]) for u in _clipped(a, b, low_m, high_m)]
-        return min(found), max(found)
+        reach_m = 2 * self.size_m[0]
+        west_m, _, east_m, _ = self._polygon().intersection(shapely.box(-reach_m, low_m, reach_m, high_m)).bounds
+        return west_m, east_m
+
+    def _polygon(self) -> shapely.Polygon:
+        """Returns a rectangle or polygon in the axes of the legs."""
+        return shapely.Polygon(self._corners())
 
     def _corners(self) -> tuple[Corner, ...]:
         """Returns the corners of a rectangle or polygon in the axes of the legs."""
@@ -113,7 +119,9 @@ def polygon_area(corners_m: ArrayLike, heading: float) -> SurveyArea:
         raise TwinError("plan.polygon", f"{len(corners)} corners", f"3 to {MAX_CORNERS} corners")
     if not np.isfinite(corners).all():
         raise TwinError("plan.polygon", "a coordinate is not finite", "finite numbers")
-    _check_simple(corners)
+    if not (polygon := shapely.Polygon(corners)).is_valid:
+        problem = f"is not simple: {shapely.is_valid_reason(polygon)}"
+        raise TwinError("plan.polygon", problem, "a simple polygon: corners in order along its outline")
     u, v = SurveyArea("polygon", (0.0, 0.0), heading=heading).to_legs(*corners.T)
     size = float(np.ptp(u)), float(np.ptp(v))
     if min(size) < MIN_SIZE_M:
@@ -131,57 +139,3 @@ def _cos_sin(angle: float) -> tuple[float, float]:
     if abs(quarters - round(quarters)) < 1e-12:
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarters) % 4]
     return math.cos(angle), math.sin(angle)
-
-
-def _clipped(a: Corner, b: Corner, low_m: float, high_m: float) -> list[float]:
-    """Clips the edge from a to b to `low_m` <= v <= `high_m`; returns u [m] of both ends of the clipped edge.
-
-    Corners are pairs (u, v); for u and v see `extent_between`. Returns [] if the edge lies outside.
-    """
-    (ua, va), (ub, vb) = a, b
-    if max(va, vb) < low_m or min(va, vb) > high_m:
-        return []
-    if va == vb:
-        return [ua, ub]
-    shares = (min(max((v - va) / (vb - va), 0.0), 1.0) for v in (low_m, high_m))
-    return [ua + share * (ub - ua) for share in shares]
-
-
-def _in_polygon(u: Array, v: Array, corners: tuple[Corner, ...]) -> NDArray[np.bool_]:
-    """Returns whether each point lies in a polygon: a ray from it along +u then crosses an odd number of edges."""
-    inside = np.zeros(np.broadcast(u, v).shape, np.bool_)
-    for (ua, va), (ub, vb) in pairwise([*corners, corners[0]]):
-        if va != vb:
-            crossing = ua + (v - va) / (vb - va) * (ub - ua)
-            inside ^= ((va > v) != (vb > v)) & (u < crossing)
-    return inside
-
-
-def _check_simple(corners: Array) -> None:
-    """Raises TwinError if two edges of a polygon (n, 2) touch or cross, except neighbours at their common corner."""
-    n, ends = len(corners), np.roll(corners, -1, axis=0)
-    number = np.arange(n)
-    meet = _edges_meet(corners, ends)
-    meet[number, number] = meet[number, (number + 1) % n] = meet[(number + 1) % n, number] = False
-    back, ahead = np.roll(corners, 1, axis=0) - corners, ends - corners
-    folded = (_cross(back, ahead) == 0) & ((back * ahead).sum(axis=1) >= 0)  # the outline turns back on itself
-    meet[number, (number - 1) % n] |= folded
-    if meet.any():
-        i, j = sorted(np.argwhere(meet)[0] + 1)
-        problem = f"edges {i} and {j} intersect"
-        raise TwinError("plan.polygon", problem, "a simple polygon: corners in order along its outline")
-
-
-def _edges_meet(start: Array, end: Array) -> NDArray[np.bool_]:
-    """Returns for each pair (n, n) of line segments from `start` (n, 2) to `end` whether they have a common point."""
-    low, high = np.minimum(start, end), np.maximum(start, end)
-    near = (low[:, None] <= high[None]).all(axis=-1) & (low[None] <= high[:, None]).all(axis=-1)
-    along = (end - start)[:, None]
-    to_start, to_end = (_cross(along, points[None] - start[:, None]) for points in (start, end))
-    apart = to_start * to_end > 0  # [i, j]: both ends of segment j lie on the same side of segment i
-    return near & ~apart & ~apart.T
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """Returns the z component of the cross products of vectors (..., 2)."""
-    return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 from twin.controllers.camera_surface import CameraSurface
 from twin.controllers.segments import Circle, Reference, Segment, Turn
 from twin.controllers.survey_area import SurveyArea
+from twin.core.geometry import Array
 from twin.errors import TwinError
 
-Array = NDArray[np.float64]
 _EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of rounding
 TURN_RATE = math.radians(15)  # greatest rate of a turn on the spot [rad/s]: 0.5 deg between frames at 30 Hz
 TURN_ACCELERATION = math.radians(15)  # angular acceleration of a turn [rad/s2]

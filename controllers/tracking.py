@@ -5,13 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.allocation import ThrustAllocation, allocate_wrench
 from twin.controllers.segments import Reference
+from twin.core.geometry import Array
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 ATTITUDE_BANDWIDTH = 2.0  # ratio of attitude to position bandwidth: attitude, the inner loop, must be faster
 INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action divided by the natural frequency
@@ -63,16 +61,6 @@ def pole_placement_gains(natural_frequency_radps: float) -> Gains:
     w = natural_frequency_radps * np.array([ATTITUDE_BANDWIDTH] * 3 + [1.0] * 3)
     a = INTEGRAL_BANDWIDTH * w
     return Gains(proportional=w**2 + 2 * w * a, derivative=2 * w + a, integral=a * w**2)
-
-
-def body_reference(camera: Reference, lever_arm_m: Array) -> Reference:
-    """Converts the reference of the camera to that of the level body; velocity and acceleration stay the same.
-
-    Args:
-        camera: reference of the camera.
-        lever_arm_m: (3,) position of the camera in the body.
-    """
-    return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), lever_arm_m))
 
 
 @kernel

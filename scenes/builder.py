@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY, VehicleParameters
 from twin.scenes.floor import add_floor
 from twin.scenes.gl import MjModel, MjsBody, MjSpec, mujoco
 from twin.terrains import Terrain
 
-Array = NDArray[np.float64]
 VEHICLE_GROUP = 2  #: geom group of the vehicle, which the survey's cameras do not render
 CAMERAS = ("left", "right")
 
@@ -73,9 +73,6 @@ def build(
     The model contains gravity; `twin.simulate` adds buoyancy, drag and thrust.
 
     Args:
-        terrain: the seafloor.
-        cameras: the stereo rig.
-        timestep_s: physics timestep.
         lamp_positions_m: (n, 3) positions of the lamps in the body.
     """
     spec = _empty_model(cameras.width_px, cameras.height_px, timestep_s)

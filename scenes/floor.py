@@ -103,9 +103,6 @@ def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[n
     therefore reads the same texels on both sides of a border between tiles, and no seam is visible. The tile's texture
     starts and ends at multiples of 16 texels of the terrain's texture, which aligns the mip-map levels of adjacent
     tiles.
-
-    Returns:
-        (h, w, 3) uint8 texture; (nodes, 2) texture coordinates, 0 to 1, from the north-west corner of this texture.
     """
     ny, nx = terrain.height_m.shape
     h, w = terrain.texture.shape[:2]

@@ -20,9 +20,6 @@ def _configure_egl() -> str:
     """Selects EGL on Linux unless MUJOCO_GL is set, and patches old PyOpenGL versions; does nothing on other systems.
 
     MuJoCo needs the type EGLDeviceEXT, an opaque pointer. PyOpenGL 3.1.0, which pyrender pins, lacks this type.
-
-    Returns:
-        Reason why EGL cannot be loaded, after which rendering is disabled; "" if EGL was loaded or is not selected.
     """
     if sys.platform != "linux" or os.environ.setdefault("MUJOCO_GL", "egl").strip().lower() != "egl":
         return ""

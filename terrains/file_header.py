@@ -33,7 +33,6 @@ def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
     """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower 8, 10, 12 or 14 only.
 
     Args:
-        values: the pixels.
         brightest: greatest value of the whole image; white is the greatest value of the fewest bits that contain it.
     """
     white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)

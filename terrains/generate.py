@@ -36,8 +36,6 @@ def generate(
         kind: a key of KINDS.
         size_m: extent along x and y; rounded up to whole cells.
         relief_m: difference between the greatest and the least height.
-        base_m: least height.
-        grid_m: distance between grid nodes.
         texture: side of a texel, cover and texture of walls of the floor; its files are not used.
         seed: seed of the heights and the texture.
     Raises:
@@ -67,7 +65,6 @@ def generate_from(
         heights: function that returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the grid nodes [m], given
             a random generator.
         size_m: extent along x and y; rounded up to whole cells.
-        grid_m: distance between grid nodes.
         texture: side of a texel; its files are not used.
         cover: a key of `ground_cover.COVERS`.
         seed: seed of the heights and the texture.
@@ -84,11 +81,6 @@ def generate_from(
     texels = generate_texture(cover, height_m, shape, texel_m, texture_rng)
     walls = walls_of(height_m, grid_m, texture, cover, texel_m, texture_rng)
     return Terrain(height_m, grid_m, west_m, south_m, texels, texel_m, walls=walls)
-
-
-def default_cover(kind: str) -> str:
-    """Returns the cover used for a kind of floor (a key of `DEFAULT_COVERS`) when the scenario chooses none."""
-    return DEFAULT_COVERS[kind]
 
 
 def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights:

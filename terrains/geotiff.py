@@ -51,12 +51,7 @@ def read_geotiff(
 
 
 def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> tuple[Any, ...]:
-    """Returns heights, grid spacing, vertical axis and georeference of an open raster, as `read_geotiff` does.
-
-    Raises:
-        TwinError: the file is an image, has too many heights or an undeclared value for holes, or its grid or the unit
-            of its heights is not supported.
-    """
+    """Returns heights, grid spacing, vertical axis and georeference of an open raster, as `read_geotiff` does."""
     if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
         bands = f"{source.count} band(s) of {source.dtypes[0]}"
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} is an image, not heights: {bands}", HEIGHT_FORMATS)
@@ -76,11 +71,7 @@ def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -
 
 
 def _values(source: rasterio.DatasetReader, file: Path) -> NDArray[np.float64]:
-    """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes.
-
-    Raises:
-        TwinError: a second band is not a mask, holes have an undeclared value, or the scale is 0 or not finite.
-    """
+    """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes."""
     scale, offset = source.scales[0], source.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
         raise TwinError(HEIGHT_FIELD, f"{file.name!r} has the band scale {scale:g} and offset {offset:g}",
@@ -119,9 +110,6 @@ def _vertical_axis(
     """Returns the vertical axis that the vertical CRS, the band's unit and the tags describe.
 
     The unit of the band takes precedence over that of the vertical CRS; without either, heights are in metres.
-
-    Raises:
-        TwinError: the unit of the band is unknown, or is not stated in a CRS that is not in metres.
     """
     tags, file_tags = source.tags(1), source.tags()
     names = [source.descriptions[0] or "", *(tags.get(key, "") for key in _BAND_TAGS)]

@@ -81,9 +81,7 @@ def paint(
         material: (rows, cols) level that selects the material: its quarters belong to the four materials of the cover,
             with gradual transitions between them.
         tone: (rows, cols) pink noise with mean 128, see `noise.pink_noise`.
-        texel_m: side of a texel.
         cover: a key of COVERS.
-        rng: random generator of the structures.
     """
     covers = COVERS[cover]
     ramps = np.stack([_ramp(c) for c in covers])
@@ -139,14 +137,7 @@ def _paint(
 
 @kernel
 def _structure(kind: int, x: float, y: float, size: float, table: Table) -> float:  # pragma: no cover (compiled)
-    """Returns the change along the ramp, about -1 to 1, due to a structure at the point (x, y) [m].
-
-    Args:
-        kind: one of GRAINS to SHELLS.
-        x, y: position [m].
-        size: distance between the elements of the structure [m].
-        table: random numbers of the noise, see `lattice_table`.
-    """
+    """Returns the change along the ramp, about -1 to 1, due to a structure at the point (x, y) [m]."""
     if kind == GRAINS:
         return fractal_noise(x / size, y / size, 3, table, 0)
     if kind == BLADES:
@@ -181,7 +172,8 @@ def _structure(kind: int, x: float, y: float, size: float, table: Table) -> floa
 def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (compiled)
     """Returns the change along the ramp at (x, y) due to crossing blades of seagrass in three layers, dark in between.
 
-    x and y are in units of the width of a blade."""
+    x and y are in units of the width of a blade.
+    """
     x += 12.0 * fractal_noise(x / 45.0, y / 45.0, 2, table, 0)
     y += 12.0 * fractal_noise(x / 45.0, y / 45.0, 2, table, 1)
     tone = -1.0

@@ -26,8 +26,6 @@ def value_noise(x: float, y: float, table: Table, layer: int) -> float:  # pragm
     """Returns smooth noise, 0 to 1: the numbers at the points of the lattice, interpolated between the points.
 
     Args:
-        x, y: position in lattice spacings.
-        table: numbers of the lattice.
         layer: number of a layer; each layer is the same lattice with another shift.
     """
     i, j = int(np.floor(x)), int(np.floor(y))
@@ -48,8 +46,6 @@ def fractal_noise(x: float, y: float, octaves: int, table: Table, layer: int) ->
 
     Args:
         x, y: position in lattice spacings of the first octave.
-        octaves: number of octaves.
-        table: numbers of the lattice.
         layer: layer of the first octave, see `value_noise`.
     """
     # numba compiles a function once for each value of an `int` constant in a call, but not of an `np.int64`
@@ -72,10 +68,6 @@ def cells(x: float, y: float, table: Table, layer: int) -> tuple[float, float, f
 
     Each square of the lattice contains one point, at a random place.
 
-    Args:
-        x, y: position in lattice spacings.
-        table: numbers of the lattice.
-        layer: different layers have different points.
     Returns:
         Both distances in lattice spacings; a random number from 0 to 1 that belongs to the nearest point.
     """

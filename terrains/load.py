@@ -54,7 +54,6 @@ def load(
     Args:
         height_file: file of heights, row 0 = north. A height belongs to the centre of its raster cell, so the terrain
             is one cell smaller than the raster in both directions.
-        texture: source of the texture.
         height_spacing_m: grid spacing if the file does not contain one (PNG, .npy, TIFF without georeference).
         height_range_m: height difference between white and black in a PNG.
         seed: seed of the texture if it is generated.
@@ -129,11 +128,7 @@ def _check_plausible(height_m: NDArray[np.float64], file: Path) -> None:
 
 
 def _read_png(file: Path) -> NDArray[np.float64]:
-    """Reads the heights of a 16-bit PNG as fractions of the height range, 0 to 1.
-
-    Raises:
-        TwinError: the file is not a PNG with one band of 16 bits, or has too many pixels.
-    """
+    """Reads the heights of a 16-bit PNG as fractions of the height range, 0 to 1."""
     check_height_count(*image_size(file, HEIGHT_FIELD, HEIGHT_FORMATS), file)
     data = read_bytes(file, HEIGHT_FIELD, HEIGHT_FORMATS, MOST_IMAGE_BYTES)
     with reading(file, HEIGHT_FIELD, HEIGHT_FORMATS):
@@ -147,12 +142,7 @@ def _read_png(file: Path) -> NDArray[np.float64]:
 
 
 def _read_npy(file: Path) -> NDArray[np.float64]:
-    """Reads the heights (rows, cols) of a .npy file [m].
-
-    Raises:
-        TwinError: the file cannot be read, is too large, or is not a two-dimensional array of real numbers other than
-            uint8.
-    """
+    """Reads the heights (rows, cols) of a .npy file [m]."""
     with reading(file, HEIGHT_FIELD, HEIGHT_FORMATS):
         array = np.load(file, mmap_mode="r", allow_pickle=False)  # only the header is read
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu" or array.dtype == np.uint8:

@@ -18,7 +18,6 @@ def fractal_field(
         shape: (rows, cols) of the field.
         coarsest_px: distance between the random values of the coarsest octave [cells]; below 2, it is 2.
         gain: amplitude ratio of successive octaves, 2^-H for a Hurst exponent H.
-        rng: random generator.
     Returns:
         (rows, cols) float32 field with zero mean and unit standard deviation.
     """
@@ -51,7 +50,6 @@ def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.ra
         shape: (rows, cols) of the result.
         octaves: number of octaves; the finest one has one random value per cell of the result.
         contrast: standard deviation of the random values of an octave, before interpolation [grey levels].
-        rng: random generator.
     Returns:
         (rows, cols) uint8 with a mean of about 128.
     """

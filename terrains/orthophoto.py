@@ -35,7 +35,6 @@ def lay_orthophoto(
 
     Args:
         texture: (rows, cols, 3) uint8 RGB, row 0 = north, changed in place.
-        file: the orthophoto.
         extent_m: extent of the floor along x and y; its centre is the origin of the scene.
         georeference: position of the scene in the CRS of the DEM; None if the DEM has no coordinates.
     Returns:
@@ -72,12 +71,7 @@ def _read(
     shape: tuple[int, ...],
     georeference: Georeference,
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Returns the colours (rows, cols, 3) of an orthophoto at the texels, and whether it covers each texel.
-
-    Raises:
-        TwinError: the bands are not those of an orthophoto, the DEM names no CRS although the orthophoto has one, they
-            do not overlap, or the orthophoto is too large.
-    """
+    """Returns the colours (rows, cols, 3) of an orthophoto at the texels, and whether it covers each texel."""
     bands = _colour_bands(source, file)
     floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
     if source.crs is not None and floor_crs is None:
@@ -111,9 +105,6 @@ def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:
     """Returns the number of the grey band, or the numbers of the bands of red, green and blue, from 1.
 
     Three bands that are not marked as red, green and blue are taken to be red, green and blue in the order of the file.
-
-    Raises:
-        TwinError: the bands are indices into a palette, or their count or type is not that of an orthophoto.
     """
     if ColorInterp.palette in source.colorinterp:
         raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has a palette in place of colours", _NO_PALETTE)

@@ -93,16 +93,7 @@ def _lay(
     places: NDArray[np.int64],
     draws: NDArray[np.float64],
 ) -> None:  # pragma: no cover (compiled)
-    """Fills a texture with blocks, in rows from the north-west corner.
-
-    Args:
-        texture: (n_rows * step + overlap, n_cols * step + overlap, 3) result, step = side - overlap.
-        photo: (h, w, 3) source.
-        side: rows and columns of a block.
-        overlap: rows or columns that neighbouring blocks share.
-        places: (n_rows, n_cols, k, 2) row and column of the upper left corner of the k candidates of each block.
-        draws: (n_rows, n_cols) uniform random numbers, 0 to 1, that choose among the acceptable candidates.
-    """
+    """Fills a texture with blocks, in rows from the north-west corner."""
     step = side - overlap
     n_rows, n_cols, n_places = places.shape[:3]
     difference = np.empty(n_places, np.float64)

@@ -124,8 +124,6 @@ def texture_shape(height_shape: tuple[int, ...], spacing_m: float, texture_px_m:
 
     Args:
         height_shape: (ny, nx) of the height grid.
-        spacing_m: distance between grid nodes.
-        texture_px_m: side of a texel.
     Raises:
         TwinError: more than MAX_NODES nodes or MAX_TEXELS texels.
     """

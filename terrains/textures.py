@@ -67,8 +67,6 @@ def generate_texture(
         cover: a key of `ground_cover.COVERS`.
         height_m: (ny, nx) heights, row 0 = south.
         shape: (rows, cols) of the texture.
-        texel_m: side of a texel.
-        rng: random generator.
     Returns:
         (rows, cols, 3) uint8 RGB, row 0 = north.
     Raises:
@@ -89,9 +87,7 @@ def generate_wall_texture(
     Args:
         cover: a key of `ground_cover.COVERS`.
         shape: (rows, cols) of the texture; rows run down from the highest to the lowest point of the floor.
-        extent_m: extent along columns and rows.
         spacing_m: distance between the nodes of the height grid of the floor.
-        rng: random generator.
     Returns:
         (rows, cols, 3) uint8 RGB.
     """
@@ -128,13 +124,7 @@ def _material_level(
 def _level(
     height: NDArray[np.float32], slope: NDArray[np.float32] | np.float32, patches: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Returns the level of the material at nodes, not limited to 0 to 255.
-
-    Args:
-        height: height above the lowest point of the floor, as a fraction of the relief.
-        slope: rise over run.
-        patches: random field with unit standard deviation.
-    """
+    """Returns the level of the material at nodes, not limited to 0 to 255."""
     return 40 + 110 * height + 60 * np.clip(slope, 0, _STEEP) + 26 * patches
 
 
@@ -217,13 +207,6 @@ def tile_image(
 
 
 def _tiled_index(n: int, extent_m: float, image_px_m: float, period: int) -> NDArray[np.int64]:
-    """Returns the image row or column (n,) at each of n texel centres along one axis.
-
-    Args:
-        n: number of texels.
-        extent_m: extent of the texture.
-        image_px_m: side of an image pixel on the floor.
-        period: number of rows or columns of the image.
-    """
+    """Returns the image row or column (n,) at each of n texel centres along one axis."""
     centres_m = (np.arange(n) + 0.5) * (extent_m / n)
     return np.floor(centres_m / image_px_m).astype(np.int64) % period

@@ -24,12 +24,10 @@ def walls_of(
 
     Args:
         height_m: (ny, nx) heights, row 0 = south.
-        spacing_m: distance between nodes.
         source: source of the texture of the floor.
         cover: a key of `ground_cover.COVERS`, for a floor without photo.
         texel_m: side of the texels of the floor; those of the walls have the same side, or a larger one if there would
             be more than WALL_TEXELS.
-        rng: random generator of a generated texture.
         draped: (rows, cols) texels, row 0 = north, that an orthophoto covers. It shows no walls, and the scene has its
             colours wherever it has any: there are no walls here.
     """

@@ -65,7 +65,6 @@ def wall_weights(
 
     Args:
         height_m: (ny, nx) heights, row 0 = south.
-        spacing_m: distance between nodes.
         draped: (rows, cols) texels, row 0 = north, that an orthophoto covers; cells with such texels have no weights.
     """
     allowed = np.ones((height_m.shape[0] - 1, height_m.shape[1] - 1), np.bool_)
@@ -100,12 +99,7 @@ def _cell_normals(height_m: NDArray[np.float32], spacing_m: float) -> NDArray[np
 def _weights(
     normals: NDArray[np.float32], allowed: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:  # pragma: no cover (compiled)
-    """Returns `number` and `weights` of `Walls`.
-
-    Args:
-        normals: (rows, cols, 3) unit normals of the cells.
-        allowed: (rows, cols), whether each cell may have weights.
-    """
+    """Returns `number` and `weights` of `Walls`."""
     rows, cols, _ = normals.shape
     number = np.full((rows, cols), -1, np.int32)
     weights = np.zeros((16, 2, 2, 2), np.float32)
@@ -133,14 +127,7 @@ def _weights(
 def _corner_weights(
     normals: NDArray[np.float32], r: int, c: int, i: int, j: int, weight: NDArray[np.float32]
 ) -> None:  # pragma: no cover (compiled)
-    """Computes the signed weights (2,) of the projections along x and y at a corner of cell (r, c).
-
-    Args:
-        normals: (rows, cols, 3) unit normals of the cells.
-        r, c: the cell.
-        i, j: the corner: 0 south, 1 north; 0 west, 1 east.
-        weight: result.
-    """
+    """Computes the signed weights (2,) of the projections along x and y at a corner of cell (r, c)."""
     rows, cols, _ = normals.shape
     own = normals[r, c]
     x, y, z = 0.0, 0.0, 0.0

@@ -127,11 +127,10 @@ def test_the_area_of_a_polygon_is_that_of_the_shoelace_formula():
 @pytest.mark.parametrize(
     ("corners", "problem"),
     [
-        ([(0, 0), (1, 1), (1, 0), (0, 1)], "edges 1 and 3 intersect"),
-        ([(0, 0), (2, 0), (1, 0), (1, 1)], "intersect"),  # turns back on itself
-        ([(0, 0), (2, 2), (1, 1)], "intersect"),  # without an area
-        ([(0, 0), (1, 0), (1, 0), (0, 1)], "intersect"),  # a corner twice
-        ([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)], "intersect"),  # touches an edge
+        ([(0, 0), (1, 1), (1, 0), (0, 1)], r"Self-intersection\[0.5 0.5\]"),
+        ([(0, 0), (2, 0), (1, 0), (1, 1)], "is not simple"),  # turns back on itself
+        ([(0, 0), (2, 2), (1, 1)], "is not simple"),  # without an area
+        ([(0, 0), (2, 0), (2, 2), (1, 0), (0, 2)], "is not simple"),  # touches an edge
         ([(0, 0), (1, 0), (0, 0)], "2 corners"),
         ([(0, 0), (1, 0), (1, 1e-5)], "is 1 x 1e-05 m large"),
         ([(0, 0), (1, 0), (np.inf, 1)], "not finite"),
@@ -141,6 +140,11 @@ def test_a_polygon_that_is_not_simple_is_rejected(corners, problem):
     with pytest.raises(TwinError, match=problem) as caught:
         polygon_area(corners, 0.0)
     assert caught.value.field == "plan.polygon" and caught.value.allowed
+
+
+def test_the_edges_and_a_repeated_corner_belong_to_a_polygon():
+    area = polygon_area([(0, 0), (2, 0), (2, 0), (2, 2), (0, 2)], 0.0)
+    assert area.contains([0, 1, 2, 2], [1, 0, 1, 2]).all() and not area.contains(2.001, 1)
 
 
 def test_an_edge_beyond_the_end_of_another_does_not_intersect_it():

@@ -10,7 +10,7 @@ from twin.controllers.allocation import pseudo_inverse_allocation
 from twin.controllers.lawnmower import plan
 from twin.controllers.segments import Reference
 from twin.controllers.survey_plan import SurveyRequest
-from twin.controllers.tracking import body_reference, commanded_velocity
+from twin.controllers.tracking import commanded_velocity, rotate_lever_arm
 from twin.core import geometry
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
@@ -33,11 +33,16 @@ def thrust_of(command):
 ALLOCATION = pseudo_inverse_allocation(CONFIGURATION, thrust_of)
 
 
+def body_reference(camera):
+    """Returns the reference of the level body for that of the camera."""
+    return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), LEVER_M))
+
+
 def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors):
     """Flies a small survey with noisy state estimates; returns RMS position errors [m] and greatest tilts [deg]."""
     rng = np.random.default_rng(seed)
     p = plan(SurveyRequest((5.0, 0.9), 2.2, speed_mps, 0.9, 0.8, 0, 320, 240, 277.0, RATE_HZ))
-    start = body_reference(p.reference(1, 0.0), LEVER_M).position
+    start = body_reference(p.reference(1, 0.0)).position
     section = VehicleConfig(**factors)
     rov = MujocoVehicle(bare_model(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
     controller = nominal_controller(1.2, RATE_HZ)
@@ -45,7 +50,7 @@ def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors
     for track in range(1, p.n_tracks + 1):
         duration = p.track_duration_s(track)
         for t in np.arange(0, duration + hold_s, 1 / RATE_HZ):
-            reference = body_reference(p.reference(track, t), LEVER_M)
+            reference = body_reference(p.reference(track, t))
             pose = rov.world_from_body
             rows.append(
                 [
@@ -134,7 +139,7 @@ def test_a_greater_weight_reduces_a_thrust_and_the_weighted_effort_is_minimal():
 
 def test_body_and_camera_references_differ_by_the_lever_arm_rotated_by_yaw():
     camera = Reference(np.array([1.0, 2.0, 3.0]), np.zeros(3), 0.7, np.zeros(3))
-    body = body_reference(camera, LEVER_M)
+    body = body_reference(camera)
     pose = geometry.pose(geometry.rotation_from_rpy(0.0, 0.0, 0.7), body.position)
     np.testing.assert_allclose(geometry.transform(pose, LEVER_M[None])[0], camera.position, atol=1e-12)
 

@@ -24,7 +24,7 @@ from twin.report.survey_page import write_report
 from twin.scenario.file import load_scenario
 from twin.scenario.toml_lines import key_lines
 from twin.studies.study_file import load_study
-from twin.world import limits
+from twin.world import planning
 
 LIMIT_S = 15.0
 
@@ -81,7 +81,7 @@ def test_a_size_beyond_its_limit_is_refused_before_anything_is_allocated(tmp_pat
 def test_the_limits_are_stated_with_the_number_and_the_remedy(tmp_path):
     file, _ = write_case(tmp_path, [])
     outcome = attempt(file, ["map.cell_m=0.0011", "plan.altitude_m=20.0"])
-    assert f"cells of the map are too many (allowed: up to {limits.MAX_MAP_CELLS}: a cell of" in outcome
+    assert f"cells of the map are too many (allowed: up to {planning.MAX_MAP_CELLS}: a cell of" in outcome
 
 
 def test_lines_of_keys_are_found_in_a_text_too_long_for_tomlkit():

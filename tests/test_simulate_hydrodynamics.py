@@ -10,7 +10,7 @@ from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
-from twin.simulate.hydrodynamics import acceleration, angular_first, mechanical_energy
+from twin.simulate.hydrodynamics import acceleration, angular_first
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 
 STEP_S = 1 / 120
@@ -18,9 +18,11 @@ HULL = trimmed_hull(VehicleConfig(buoyancy_n=0.0))
 
 
 def energy(v, hull=HULL):
-    """Returns the mechanical energy of a vehicle [J]."""
+    """Returns the mechanical energy of a vehicle in still water [J], kinetic energy including added mass."""
     pose = v.world_from_body
-    return mechanical_energy(hull, pose[:3, :3], pose[:3, 3], v.twist_body)
+    buoyancy_z = pose[2, 3] + pose[2, :3] @ hull.centre_of_buoyancy_m
+    kinetic = 0.5 * (hull.inertia + hull.added_inertia) @ v.twist_body**2
+    return kinetic + hull.weight_n * pose[2, 3] - hull.buoyancy_n * buoyancy_z
 
 
 def dense_acceleration(hull, rotation, twist, current, wrench):

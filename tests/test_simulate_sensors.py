@@ -31,7 +31,7 @@ def test_a_command_step_gives_the_step_response_of_the_published_lag():
     thrusters.command(command)
     history = []
     for _ in range(120):
-        history.append(thrusters.thrust_n())
+        history.append(thrusters.state.c @ thrusters.state.lag_state)
         thrusters.step()
     _, expected = signal.step(ROV.thruster_lag, T=np.arange(120) * step_s)
     steady = steady_thrust_n(command, ROV.thrust_coefficients)

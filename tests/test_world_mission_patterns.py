@@ -121,7 +121,7 @@ def test_the_speed_limit_of_loops_is_that_of_the_slowest_direction_at_the_speed_
     mission = prepare(load_scenario("reef", [*LOOPS, "plan.speed_mps=0.7"]))
     assert mission.plan.speed_mps < 0.3  # of loops with a diameter of 0.8 m
     with pytest.raises(TwinError, match=r"0.7: too fast for the thrusters \(allowed: up to 0.63\)"):
-        _check_speed(mission.scenario, dataclasses.replace(mission.plan, speed_mps=0.7))
+        _check_speed(mission.scenario.vehicle, mission.scenario.plan, dataclasses.replace(mission.plan, speed_mps=0.7))
 
 
 def test_the_speed_limit_is_that_of_the_bow_and_a_kinematic_vehicle_has_none():

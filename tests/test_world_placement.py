@@ -76,7 +76,7 @@ def test_the_area_lies_at_its_coordinates_in_the_dem(dem):
         (["plan.centre_m=[3.7, 0.0]"], "plan.area_m: the path leaves the terrain"),
         (["plan.area_m=[7.9, 2.0]", "plan.heading_deg=20"], "plan.area_m: 7.9 x 2 m at a heading of 20 deg is larger"),
         (["plan.polygon=[[0, 0], [9, 0], [0, 9]]"], "plan.polygon: (9.00, 0.00) lies outside the terrain"),
-        (["plan.polygon=[[0, 0], [1, 1], [1, 0], [0, 1]]"], "plan.polygon: edges 1 and 3 intersect"),
+        (["plan.polygon=[[0, 0], [1, 1], [1, 0], [0, 1]]"], "plan.polygon: is not simple: Self-intersection[0.5 0.5]"),
         (["plan.polygon=[[0, 0], [1, 0], [1, 1]]", "plan.centre_m=[1, 0]"], "plan.centre_m: (1.0, 0.0) has no effect"),
         (["plan.polygon=[[0, 0], [1, 0], [1, 1]]", "plan.pattern=loops"], "plan.pattern: 'loops' has no effect with"),
         (["plan.polygon=none.geojson"], "plan.polygon: no such file"),
@@ -135,6 +135,7 @@ def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_pat
         "7",
         '{"type": "Point"}',
         '{"type": "Polygon", "coordinates": [[[1]]]}',
+        '{"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 1]]]}',  # not closed
         '{"type": "Polygon", "coordinates": {"ring": []}}',
         '{"type": "FeatureCollection", "features": {"first": {}}}',
     ],

@@ -148,7 +148,10 @@ def test_a_path_over_the_floor_keeps_its_altitude_and_the_slope_limit(monkeypatc
     assert spreads[1].maximum - spreads[1].minimum < 0.7 * (spreads[0].maximum - spreads[0].minimum)
     reference = following.planned_frames(1).reference
     speed = np.linalg.norm(reference.velocity[:, :2], axis=1)
-    assert (np.abs(reference.velocity[:, 2]) <= climb_slope(following.scenario) * speed + 1e-6).all()
+    assert (
+        np.abs(reference.velocity[:, 2])
+        <= climb_slope(following.scenario.vehicle, following.scenario.plan.speed_mps) * speed + 1e-6
+    ).all()
     corner, opposite = following.grid, level.grid
     assert corner.cols >= opposite.cols and corner.rows >= opposite.rows
 
@@ -236,7 +239,7 @@ def test_a_current_beyond_the_thrusters_is_rejected_with_the_greatest_allowed_va
 
 def test_without_a_current_a_level_plan_needs_no_check():
     mission = prepare(scenario())
-    check_thrust(mission.scenario, mission.plan)
+    check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, mission.plan)
     hopeless = dataclasses.replace(mission.plan, speed_mps=9.0)
-    check_thrust(mission.scenario, hopeless)  # that is `_check_speed`'s
+    check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, hopeless)  # that is `_check_speed`'s
     assert survey_request(mission.scenario, mission.terrain).along_scale == 1

@@ -92,11 +92,5 @@ def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _means(values: NDArray[np.floating | np.integer], group: NDArray[np.int64], count: NDArray[np.int64]):
-    """Returns the mean (k, 3) of the values (n, 3) of each group.
-
-    Args:
-        values: (n, 3) values.
-        group: (n,) number of the group of each value, from 0.
-        count: (k,) number of values in each group.
-    """
+    """Returns the mean (k, 3) of the values (n, 3) of each group."""
     return np.stack([np.bincount(group, column, len(count)) / count for column in values.T.astype(np.float64)], axis=1)

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.terrains.objects.detail import cell_colours, level_of
 from twin.terrains.objects.mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.mesh_file import MAX_FACES, TexturedMesh
@@ -23,8 +24,6 @@ LONGEST_EDGE_M = 0.5  #: longer edges are halved; for a mesh larger than 200 m, 
 MAX_DIVIDED = 2 * MAX_FACES  #: largest number of triangles after long edges have been halved
 LARGEST_CELL_M = 0.1  #: largest side of the cells over which the colours of vertices are averaged
 NO_GROUP = -1  #: `PlacedObject.group` of a tile
-
-Array = NDArray[np.float64]
 
 
 class FloorTile(NamedTuple):
@@ -56,7 +55,6 @@ def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
 
     Args:
         read: the mesh as read from a file.
-        scale: metres per unit of the file.
     """
     vertices, faces = read.mesh.vertices_m.astype(np.float64) * scale, read.mesh.faces
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
@@ -169,15 +167,7 @@ def _tile(
     mesh: Mesh, part: NDArray[np.int64], uv: NDArray[np.float32], colours: list[tuple[NDArray[np.uint8], float]],
     texture: int,
 ) -> FloorTile:  # fmt: skip
-    """Returns the tile of the triangles with the numbers `part`.
-
-    Args:
-        mesh: the whole floor.
-        part: (k,) numbers of triangles.
-        uv: (n, 3) see `FloorTile.uv`, of all vertices.
-        colours: pairs of colours (n, 3) of all vertices and side of the cells [m], see `_colour_levels`.
-        texture: number of the texture.
-    """
+    """Returns the tile of the triangles with the numbers `part`."""
     used, faces = np.unique(mesh.faces[part], return_inverse=True)
     vertices, faces = mesh.vertices_m[used], np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
     kept = colours if texture < 0 else colours[:1]

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.user_files import IMAGE_FORMATS, reading
 from twin.errors import TwinError
 from twin.terrains.file_header import eight_bits
@@ -20,8 +21,6 @@ MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its le
 MAX_BYTES = 500_000_000  #: size of the largest file that is read
 MAX_TEXELS = 250_000_000  #: largest number of texels of all textures of a floor together
 TEXTURED_FACES = 200_000  #: largest number of triangles of a divided mesh, whose corners sample the texture
-
-Array = NDArray[np.float64]
 
 
 def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: bool = False) -> Mesh:
@@ -128,11 +127,7 @@ def _part(part: Any) -> _Part:
 
 
 def _read(file: Path, field: str, convert: Callable[[list[Any]], list[Any]]) -> list[Any]:
-    """Returns the result of `convert` for the trimesh meshes of a file, whose size is checked first.
-
-    Raises:
-        TwinError: the file is missing, unreadable or too large, or a material or texture file that it names is.
-    """
+    """Returns the result of `convert` for the trimesh meshes of a file, whose size is checked first."""
     with reading(file, field, FORMATS, MAX_BYTES):
         if (n_faces := face_count(file)) > MAX_FACES:
             raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
@@ -166,11 +161,7 @@ _Z_FROM_Y_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], np.float32)
 
 
 def _loaded(file: Path, field: str) -> Any:
-    """Returns the trimesh scene or mesh of a file.
-
-    Raises:
-        TwinError: a material or texture file that it names is missing, or a texture is not an image.
-    """
+    """Returns the trimesh scene or mesh of a file."""
     import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
     from PIL import Image
     from trimesh.resolvers import FilePathResolver
@@ -210,18 +201,12 @@ def _coloured(part: Any, albedo: tuple[float, float, float], most_faces: int) ->
 
     A textured mesh is divided into at most `most_faces` triangles, or not at all.
     """
-    from trimesh.visual import TextureVisuals
-
-    colours = np.broadcast_to(np.rint(np.asarray(albedo) * 255), (len(part.vertices), 3))
-    if isinstance(part.visual, TextureVisuals):
-        textured = _textured(part, most_faces)
-        if textured is not None:
-            return textured
-        if (factor := _base_colour(part)) is not None:
-            colours = np.broadcast_to(factor, (len(part.vertices), 3))
-    elif part.visual.defined:
-        colours = np.asarray(part.visual.vertex_colors)[:, :3]
-    return _mesh(part.vertices, part.faces, colours)
+    found = _part(part)
+    if found.image is not None:
+        return _textured(part, most_faces)
+    if found.coloured:
+        return found.mesh
+    return _mesh(part.vertices, part.faces, np.broadcast_to(np.rint(np.asarray(albedo) * 255), (len(part.vertices), 3)))
 
 
 def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
@@ -232,17 +217,15 @@ def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
     )
 
 
-def _textured(part: Any, most_faces: int) -> Mesh | None:
+def _textured(part: Any, most_faces: int) -> Mesh:
     """Returns a trimesh mesh with the colours of its texture at its vertices.
 
-    All triangles are divided into four, repeatedly, as long as this makes at most `most_faces`. Returns None if the
-    mesh has no texture image or no texture coordinates.
+    All triangles are divided into four, repeatedly, as long as this makes at most `most_faces`.
     """
     import trimesh
 
     texture = _texture_of(part)
-    if texture is None:
-        return None
+    assert texture is not None
     image, uv = texture
     divided: Any = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
     while 0 < len(divided[1]) * 4 <= most_faces:
@@ -273,11 +256,7 @@ def _base_colour(part: Any) -> tuple[int, ...] | None:
 
 
 def _texture_of(part: Any) -> tuple[Any, Any] | None:
-    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either.
-
-    Raises:
-        ValueError: the image is of another format than IMAGE_FORMATS, or too large. Pillow decodes it later.
-    """
+    """Returns PIL image and texture coordinates (n, 2) of a trimesh mesh; None if it lacks either."""
     material, uv = getattr(part.visual, "material", None), getattr(part.visual, "uv", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
     if image is None or uv is None or len(uv) != len(part.vertices):

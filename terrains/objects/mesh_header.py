@@ -53,9 +53,6 @@ def _glb_faces(file: Path) -> int:
     """Returns the number of triangles of a binary glTF file, from the accessors of its meshes.
 
     A mesh counts once for each node that places it; a mesh that no node places counts once, because it is loaded too.
-
-    Raises:
-        ValueError: the file has no GLB header, or its description is too long or invalid.
     """
     with file.open("rb") as stream:
         start = stream.read(20)

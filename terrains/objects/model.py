@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.terrains.objects.detail import Level, levels_of
 from twin.terrains.objects.mesh import Mesh, extent, is_closed, standing
-
-Array = NDArray[np.float64]
 
 
 class ObjectModel(NamedTuple):

@@ -9,12 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.terrains.objects.mesh import Mesh
-
-Array = NDArray[np.float64]
 
 PART_FACES = 128  #: triangles in a part; the last part may have fewer
 THIN = 1e-6  #: a triangle with a smaller ratio of height to length has no reliable normal

@@ -3,50 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
+from twin.scenario.model import ObjectConfig
 from twin.terrains.objects.model import ObjectModel, PlacedObject
 from twin.terrains.terrain import Terrain
-
-Array = NDArray[np.float64]
 
 STEEP_DEG = 15.0  #: a floor less steep than this counts as sand; about half the angle of repose of sand
 MAX_SCATTERED = 5000  #: largest number of objects of one entry
 SIZE_CUT_SIGMA = 2.0  #: random sizes are limited to this many standard deviations of their logarithm
 TRIES = (8, 64, 512)  #: sizes of the batches of random positions that are tried in turn for one object
-
-
-class Group(Protocol):
-    """Entry of `[[objects]]`: positions and sizes of its objects; see `twin.scenario.model.ObjectConfig`."""
-
-    @property
-    def size_m(self) -> float | None: ...
-    @property
-    def size_spread(self) -> float: ...
-    @property
-    def position_m(self) -> tuple[float, float] | None: ...
-    @property
-    def height_m(self) -> float | None: ...
-    @property
-    def heading_deg(self) -> float | None: ...
-    @property
-    def upright(self) -> bool: ...
-    @property
-    def sunk(self) -> float: ...
-    @property
-    def per_m2(self) -> float | None: ...
-    @property
-    def on(self) -> str: ...
-    @property
-    def area_m(self) -> tuple[float, float] | None: ...
-    @property
-    def centre_m(self) -> tuple[float, float]: ...
-    @property
-    def spacing_m(self) -> float: ...
 
 
 class Disc(NamedTuple):
@@ -58,17 +29,19 @@ class Disc(NamedTuple):
 
 
 def place(
-    number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject], seed: int
+    number: int,
+    group: ObjectConfig,
+    models: Sequence[ObjectModel],
+    terrain: Terrain,
+    taken: Sequence[PlacedObject],
+    seed: int,
 ) -> list[PlacedObject]:
     """Returns the objects of an entry of `[[objects]]`.
 
     Args:
         number: number of the entry, from 0.
-        group: the entry.
         models: shapes, of which each object has one.
-        terrain: the floor.
         taken: objects of other entries, which scattered objects do not overlap.
-        seed: seed of the scenario.
     Raises:
         TwinError: an object with a given position reaches beyond the terrain; there would be no scattered object or too
             many, or they do not fit.
@@ -97,14 +70,10 @@ def slope_deg(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array
 
 
 def _scattered(
-    number: int, group: Group, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
+    number: int, group: ObjectConfig, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
     rng: np.random.Generator,
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns objects at random positions that do not overlap each other or the objects in `taken`.
-
-    Raises:
-        TwinError: there would be none or too many, or they do not fit into the area without overlap.
-    """
+    """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
     field = f"objects.{number}.per_m2"
     low, high = _region(group, terrain)
     n = _count(group, terrain, low, high, field)
@@ -125,7 +94,7 @@ def _scattered(
     return items
 
 
-def _region(group: Group, terrain: Terrain) -> tuple[Array, Array]:
+def _region(group: ObjectConfig, terrain: Terrain) -> tuple[Array, Array]:
     """Returns the south-west and the north-east corner (2,) [m] of the area in which objects are scattered."""
     low, high = np.array([terrain.west_m, terrain.south_m]), np.array([terrain.east_m, terrain.north_m])
     if group.area_m is None:
@@ -134,10 +103,11 @@ def _region(group: Group, terrain: Terrain) -> tuple[Array, Array]:
     return np.maximum(low, centre - half), np.minimum(high, centre + half)
 
 
-def _count(group: Group, terrain: Terrain, low: Array, high: Array, field: str) -> int:
+def _count(group: ObjectConfig, terrain: Terrain, low: Array, high: Array, field: str) -> int:
     """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
 
-    Raises TwinError if there are none or too many."""
+    Raises TwinError if there are none or too many.
+    """
     assert group.per_m2 is not None
     side = np.maximum(high - low, 0)
     steps = [np.linspace(a, b, 201)[:-1] + (b - a) / 400 for a, b in zip(low, high, strict=True)]
@@ -152,7 +122,7 @@ def _count(group: Group, terrain: Terrain, low: Array, high: Array, field: str) 
     return n
 
 
-def _on_ground(group: Group, terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
+def _on_ground(group: ObjectConfig, terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
     """Returns whether the slope of the floor at each point is one on which the objects of a group may stand."""
     if group.on == "anywhere":
         return np.isfinite(terrain.height_at(x_m, y_m))
@@ -161,7 +131,7 @@ def _on_ground(group: Group, terrain: Terrain, x_m: Array, y_m: Array, reach_m: 
 
 
 def _free_position(
-    group: Group, terrain: Terrain, corners: tuple[Array, Array], radius_m: float, around: Array,
+    group: ObjectConfig, terrain: Terrain, corners: tuple[Array, Array], radius_m: float, around: Array,
     rng: np.random.Generator,
 ) -> tuple[float, float] | None:  # fmt: skip
     """Returns a random position (x, y) [m] where an object may stand; None if none is found.
@@ -183,7 +153,7 @@ def _free_position(
     return None
 
 
-def _scales(group: Group, models: Sequence[ObjectModel], rng: np.random.Generator) -> Array:
+def _scales(group: ObjectConfig, models: Sequence[ObjectModel], rng: np.random.Generator) -> Array:
     """Returns the random scale (n,) of each object, its size divided by that of its model in `models` (n)."""
     z = rng.standard_normal(len(models))
     factor = np.exp(group.size_spread * np.clip(z, -SIZE_CUT_SIGMA, SIZE_CUT_SIGMA))
@@ -191,8 +161,8 @@ def _scales(group: Group, models: Sequence[ObjectModel], rng: np.random.Generato
 
 
 def _at(
-    number: int, group: Group, model: ObjectModel, scale: float, position_m: tuple[float, float], terrain: Terrain,
-    rng: np.random.Generator,
+    number: int, group: ObjectConfig, model: ObjectModel, scale: float, position_m: tuple[float, float],
+    terrain: Terrain, rng: np.random.Generator,
 ) -> PlacedObject:  # fmt: skip
     """Returns an object at a position (x, y) [m].
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
+
 Faces = NDArray[np.int64]
 #: Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from outside.
 Surface = tuple[Array, Faces]
@@ -27,7 +28,6 @@ def tube(path: Array, radius: Array, n_sides: int) -> Surface:
     Args:
         path: (k, 3) points of the axis, no two consecutive ones equal.
         radius: (k,) radius at each point.
-        n_sides: number of sides.
     """
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -56,7 +56,8 @@ def tube(path: Array, radius: Array, n_sides: int) -> Surface:
 def ring_faces(n_rings: int, n_sides: int, closed: bool = False) -> Faces:
     """Returns the triangles (m, 3) between consecutive rings of vertices, which are numbered ring by ring.
 
-    With `closed`, there are triangles between the last and the first ring too."""
+    With `closed`, there are triangles between the last and the first ring too.
+    """
     ring = np.arange(n_rings * n_sides).reshape(n_rings, n_sides)
     upper = np.roll(ring, -1, axis=0) if closed else ring[1:]
     lower = ring if closed else ring[:-1]
@@ -70,7 +71,6 @@ def turned(profile: Array, n_sides: int) -> Surface:
     Args:
         profile: (k, 2) radius and height along a closed outline, counter-clockwise with the radius to the right, all
             radii positive.
-        n_sides: number of sides.
     """
     angle = 2 * np.pi * np.arange(n_sides) / n_sides
     radius, height = profile[:, :1], profile[:, 1:]
@@ -132,6 +132,7 @@ WAVES = 20  #: plane waves per octave of noise
 def mottled(albedo: Array, points: Array, contrast: float, rng: np.random.Generator) -> Array:
     """Returns a random albedo (n, 3) at points (n, 3).
 
-    Its mean is `albedo`, (3,) or (n, 3), and its relative standard deviation about `contrast`."""
+    Its mean is `albedo`, (3,) or (n, 3), and its relative standard deviation about `contrast`.
+    """
     values = 0.7 * noise(points, 0.25, 4, rng, gain=0.8) + 0.7 * rng.standard_normal(len(points))
     return albedo * np.exp(contrast * values - contrast**2 / 2)[:, None]

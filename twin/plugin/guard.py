@@ -60,8 +60,6 @@ class GuardedPlugin:
 
         Args:
             method: name of the method, for the message.
-            value: the returned value.
-            shape: shape that the array must have.
 
         Raises:
             PluginFailed: the value is not an array of this shape, or a number is not finite.
@@ -133,7 +131,6 @@ def terrain_heights(name: str, x_m: Array, y_m: Array, seed: int) -> Array:
         name: "module:Class", or the name of an entry point.
         x_m: (cols,) x of the grid nodes, ascending [m].
         y_m: (rows,) y of the grid nodes, ascending [m].
-        seed: seed of the scenario.
 
     Raises:
         TwinError: the plug-in cannot be loaded, raised an exception, or returned an unusable value.

@@ -72,8 +72,6 @@ def attempt(key: str, name: str, function: Callable[[], T]) -> T:
 
     Args:
         key: key of the scenario or group of entry points that refers to the plug-in.
-        name: name of the plug-in.
-        function: the code to run.
 
     Raises:
         TwinError: the function raised an exception; the message names the plug-in and the exception.

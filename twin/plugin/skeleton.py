@@ -65,7 +65,6 @@ def write(kind: Kind, folder: Path) -> list[Path]:
     """Writes a package with a working plug-in and its test into a folder, and returns its files.
 
     Args:
-        kind: kind of plug-in.
         folder: new or empty folder; its name becomes the name of the package and of the entry point.
 
     Raises:

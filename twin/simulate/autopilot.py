@@ -7,17 +7,15 @@ scenario, which therefore act as model errors. The top speed includes the drag f
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.controllers.allocation import pseudo_inverse_allocation
 from twin.controllers.tracking import HullModel, PoseController, feedforward_wrench
+from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.thrusters import steady_thrust_n
-
-Array = NDArray[np.float64]
 
 
 def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> PoseController:
@@ -25,7 +23,6 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
 
     Args:
         natural_frequency_radps: natural frequency of the closed loop in position.
-        frame_rate_hz: number of frames per second.
     """
     hull = trimmed_hull(VehicleConfig.model_validate({}))
     model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
@@ -27,8 +28,6 @@ from twin.simulate.thrusters import (
     step_thrusters,
     thruster_wrench,
 )
-
-Array = NDArray[np.float64]
 
 
 class RigidBodyState(NamedTuple):

@@ -17,11 +17,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 
 class Hull(NamedTuple):
@@ -63,7 +61,6 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
 
     Args:
-        hull: parameters of the hull.
         world_from_body: (3, 3) rotation from the body to the world.
         twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
         current_mps: (3,) velocity of the steady current in the world.
@@ -131,17 +128,3 @@ def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
         for i in range(3):
             twist[3 + k] += world_from_body[i, k] * velocity[i]
     return twist
-
-
-def mechanical_energy(hull: Hull, world_from_body: Array, position_m: Array, twist: Array) -> float:
-    """Returns the mechanical energy in still water [J]: potential energy, and kinetic energy including added mass.
-
-    Args:
-        hull: parameters of the hull.
-        world_from_body: (3, 3) rotation from the body to the world.
-        position_m: (3,) position of the centre of gravity in the world.
-        twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
-    """
-    centre_z = position_m[2] + float(world_from_body[2] @ hull.centre_of_buoyancy_m)
-    kinetic = 0.5 * float((hull.inertia + hull.added_inertia) @ twist**2)
-    return kinetic + hull.weight_n * float(position_m[2]) - hull.buoyancy_n * centre_z

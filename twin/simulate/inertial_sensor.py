@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.records import ImuReadings
 from twin.errors import TwinError
 from twin.scenario.model import ImuConfig
 from twin.simulate.hull import GRAVITY_MPS2
-
-Array = NDArray[np.float64]
 
 
 def inertial_quantities(rotation: Array, rate_radps: Array, acceleration_mps2: Array) -> Array:

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.simulate.contact import contact_error
 from twin.simulate.inertial_sensor import inertial_quantities
-
-Array = NDArray[np.float64]
 
 
 class KinematicVehicle:

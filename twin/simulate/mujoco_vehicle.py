@@ -6,9 +6,9 @@ from collections import deque
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
@@ -18,8 +18,6 @@ from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, 
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.inertial_sensor import inertial_quantities
 from twin.simulate.thrusters import LaggedThrusters
-
-Array = NDArray[np.float64]
 
 
 class MujocoVehicle:

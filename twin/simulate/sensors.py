@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.core.records import BeaconDetection, Readings, SensorNoise, StereoRig
 from twin.kernels import kernel
 from twin.scenario.model import NavigationConfig
 from twin.simulate.inertial_sensor import InertialSensor
 
-Array = NDArray[np.float64]
 Depth = NDArray[np.float32]
 
 _BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded
@@ -55,7 +55,6 @@ class NavigationSensors:
         """Returns simulated readings of one frame; acoustic fixes and beacons are read at keyframes only.
 
         Args:
-            time_s: time of the frame.
             world_from_body: (4, 4) true pose.
             twist_body: (6,) true [angular, linear] velocity in body axes [rad/s, m/s].
             depth_m: function that returns the true depth (height, width) of the left image along the optical axis [m];
@@ -159,7 +158,6 @@ def read_pressure_and_attitude(
 
     Args:
         world_from_body, body_from_camera: (4, 4) true pose of the body, and pose of the left camera in the body.
-        noise: standard deviations of the sensor errors.
         aiding: names of the sensors used for aiding; the readings of the others are None.
         rng: random generator of these two sensors only.
     """
@@ -223,7 +221,6 @@ class AcousticPositioning:
         """Returns the measured position (3,) at a keyframe; None if the interval since the last fix has not elapsed.
 
         Args:
-            time_s: time of the keyframe.
             position_m: (3,) true position of the left camera in the world.
         """
         if time_s < self._next_s - 1e-9:
@@ -248,7 +245,6 @@ def detect_beacons(
         depth_m: (height, width) true depth of the left image along the optical axis [m].
         project: projects points (n, 3) in left camera axes to pixels (n, 2).
         noise: standard deviation of column and row of a detected beacon, and surveyed positions of the beacons.
-        rng: random generator of this sensor only.
     """
     beacons = np.array(noise.beacons_m).reshape(-1, 3)
     errors_px = noise.beacon_px * rng.standard_normal((len(beacons), 2))
@@ -259,13 +255,7 @@ def detect_beacons(
 
 
 def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
-    """Returns whether a point is inside the image and less than `_BEACON_HEIGHT_M` behind the surface in the image.
-
-    Args:
-        pixel: (2,) column and row of the point [px]; NaN if the point is behind the camera.
-        distance_m: depth of the point along the optical axis [m].
-        depth_m: (height, width) depth of the surface, floor or object, along the optical axis [m].
-    """
+    """Returns whether a point is inside the image and less than `_BEACON_HEIGHT_M` behind the surface in the image."""
     rows, columns = depth_m.shape
     if not (0 <= pixel[0] <= columns - 1 and 0 <= pixel[1] <= rows - 1):  # also true for NaN
         return False

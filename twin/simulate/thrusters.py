@@ -5,15 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.scenes.bluerov2 import VehicleParameters
 from twin.simulate.hydrodynamics import angular_first
-
-Array = NDArray[np.float64]
 
 
 @kernel
@@ -69,10 +67,6 @@ class LaggedThrusters:
         n, coefficients = configuration.shape[1], np.array(vehicle.thrust_coefficients, float)
         self.state = ThrusterState(a, b, c, configuration, coefficients, np.zeros((len(a), n)), np.zeros(n))
 
-    def thrust_n(self) -> Array:
-        """Returns the current thrust of each thruster (n,) [N]."""
-        return self.state.c @ self.state.lag_state
-
     def wrench(self) -> Array:
         """Returns the current total wrench of the thrusters (6,), [moment, force] in body axes [N m, N]."""
         return thruster_wrench(self.state)
@@ -124,12 +118,6 @@ def _zero_order_hold(denominator: Array, timestep_s: float) -> tuple[Array, Arra
 
     With A and B the matrices of its controllable canonical form in continuous time, the first n rows of
     exp([[A, B], [0, 0]] dt) are the discrete matrices (Van Loan 1978).
-
-    Args:
-        denominator: (n + 1,) polynomial coefficients from the highest power down; the first one is 1.
-        timestep_s: dt [s].
-    Returns:
-        Transition matrix (n, n) and input matrix (n, 1).
     """
     n = len(denominator) - 1
     rates = np.zeros((n + 1, n + 1))

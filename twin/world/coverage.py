@@ -58,7 +58,6 @@ def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> N
     """Returns the true height of the floor at the cell centres (rows, cols) [m].
 
     Args:
-        grid: grid of the map.
         height_at: returns the heights [m] at arrays x and y [m] of equal shape.
     """
     x, y = grid.centres()

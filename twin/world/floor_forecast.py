@@ -85,7 +85,6 @@ def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedO
     """Returns the median overlaps forecast for the planned path, to compare with those of the flown survey.
 
     Args:
-        mission: the survey.
         most_pairs: largest number of pairs that are evaluated along, and across, the swaths, chosen at equal intervals.
     """
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)

@@ -104,11 +104,7 @@ def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
 
 
 def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
-    """Returns the mesh with its long edges divided.
-
-    Raises:
-        TwinError: the division needs too many triangles, or the extent of the mesh is not finite.
-    """
+    """Returns the mesh with its long edges divided."""
     if not np.isfinite(extent(whole.mesh)).all():
         raise TwinError(FIELD, f"{file.name!r} is too large", "a mesh that covers the planned area")
     try:
@@ -148,14 +144,7 @@ def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
 
 
 def _depth(meshes: Sequence[Mesh], grid: MapGrid, axes: Array) -> Layer:
-    """Returns the depth (rows, cols) at which vertical rays through the cell centres first meet meshes; inf: never.
-
-    Args:
-        meshes: meshes in world axes.
-        grid: the grid.
-        axes: FROM_ABOVE, so that the depth is the negative height of the highest surface, or FROM_BELOW, so that it is
-            the height of the lowest surface.
-    """
+    """Returns the depth (rows, cols) at which vertical rays through the cell centres first meet meshes; inf: never."""
     depth = np.full((grid.rows, grid.cols), np.inf, np.float32)
     draw_meshes([DrawnMesh(mesh, axes) for mesh in meshes], _projection(grid, 0), Target(depth))
     return depth
@@ -187,13 +176,7 @@ def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.
 
 
 def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArray[np.bool_]]:
-    """Returns the colours (rows, cols, 3) of the mesh from above, and whether each cell (rows, cols) shows the mesh.
-
-    Args:
-        drawn: the tiles of the mesh.
-        grid: the cells, whose width is `grid.cell_m`.
-        row_m: extent of the cells along y, nearly equal to their width.
-    """
+    """Returns the colours (rows, cols, 3) of the mesh from above, and whether each cell (rows, cols) shows the mesh."""
     stretch = grid.cell_m / row_m
     axes = np.diag([1.0, stretch, 1.0, 1.0]) @ FROM_ABOVE
     colours, seen = np.zeros((grid.rows, grid.cols, 3), np.uint8), np.zeros((grid.rows, grid.cols), np.bool_)
@@ -219,14 +202,7 @@ def _borders(view: Projection, shape: tuple[int, int]) -> Array:
 
 
 def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) -> Image:
-    """Returns the texture (h, w, 3) of the highest surface, between the outermost nodes of the height grid.
-
-    Args:
-        drawn: the tiles of the mesh.
-        grid: grid of the nodes.
-        colours: (rows, cols, 3) colours of the nodes, which fill holes.
-        scenario: the scenario, which determines the size of the texels.
-    """
+    """Returns the texture (h, w, 3) of the highest surface, between the outermost nodes of the height grid."""
     t, ny, nx = scenario.terrain, grid.rows, grid.cols
     size_m = (nx - 1) * grid.cell_m, (ny - 1) * grid.cell_m
     texel_m = terrains.TextureSource(scenario.texel_m, coarsen=t.texture_px_m is None).texel_m(size_m)

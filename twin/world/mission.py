@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -25,17 +26,29 @@ from twin.imaging.scene.object_view import Objects
 from twin.judge.metrics import check_require
 from twin.plugin.guard import check_loadable, terrain_heights
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
-from twin.scenario.model import BeaconConfig, Scenario, SensorConfig, SnowConfig, Source, TerrainConfig
+from twin.scenario.model import (
+    BeaconConfig,
+    CurrentConfig,
+    LensConfig,
+    NavigationConfig,
+    PlanConfig,
+    Scenario,
+    SensorConfig,
+    SnowConfig,
+    Source,
+    TerrainConfig,
+    VehicleConfig,
+)
 from twin.simulate.autopilot import top_speed_mps
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import imu_rate_hz
+from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.objects.model import PlacedObject
 from twin.world.clearance import path_points, planned_clearance
-from twin.world.limits import check_map_size
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import check_path, load_objects
 from twin.world.pace import SAME_TIME_S, Pace
-from twin.world.planning import plan_survey
+from twin.world.planning import check_map_size, plan_survey
 from twin.world.thrust_authority import check_thrust
 
 #: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
@@ -209,35 +222,35 @@ def prepare(scenario: Scenario) -> Mission:
         terrain = _attempt(lambda: load_terrain(scenario), source, errors)
     plan = _attempt(lambda: plan_survey(scenario, terrain), source, errors)
     _attempt(lambda: _check_plugins(scenario), source, errors)
-    _attempt(lambda: _check_speed(scenario, plan), source, errors)
-    _attempt(lambda: _check_current(scenario), source, errors)
+    _attempt(lambda: _check_speed(scenario.vehicle, scenario.plan, plan), source, errors)
+    _attempt(lambda: _check_current(scenario.vehicle, scenario.current), source, errors)
     if (sensor := scenario.sensor) is not None:
         _attempt(lambda: _check_exposure(sensor), source, errors)
         for key, time_ms in (("exposure_max_ms", sensor.exposure_max_ms), ("readout_ms", sensor.readout_ms)):
             _attempt(lambda k=key, t=time_ms: _check_in_frame(k, t, scenario.rig.frame_rate_hz), source, errors)
         _attempt(lambda: _check_white_balance(sensor), source, errors)
-    _attempt(lambda: _check_lens_blur(scenario), source, errors)
+    _attempt(lambda: _check_lens_blur(scenario.lens, scenario.sensor), source, errors)
     _attempt(lambda: _check_snow(scenario.snow), source, errors)
     if (imu := scenario.imu) is not None:
         _attempt(lambda: imu_rate_hz(imu, motion_rate_hz(scenario)), source, errors)
     true_cameras = _attempt(lambda: make_true_cameras(scenario), source, errors)
     illumination = _attempt(lambda: _illumination(scenario), source, errors)
     _attempt(lambda: check_require(scenario.require), source, errors)
-    _attempt(lambda: _check_beacons_listed(scenario), source, errors)
+    _attempt(lambda: _check_beacons_listed(scenario.navigation, scenario.beacons), source, errors)
     objects: tuple[PlacedObject, ...] = ()
     if terrain is not None:
         objects = load_objects(scenario, terrain, lambda build: _attempt(build, source, errors))
         for k, beacon in enumerate(scenario.beacons):
             _attempt(lambda k=k, beacon=beacon: _check_beacon(k, beacon, terrain), source, errors)
     if terrain is not None and plan is not None:
-        _attempt(lambda: _check_clearance(scenario, terrain, plan), source, errors)
+        _attempt(lambda: _check_clearance(scenario.plan, terrain, plan), source, errors)
         _attempt(lambda: check_path(objects, plan, scenario.plan.clearance_m), source, errors)
-        _attempt(lambda: check_thrust(scenario, plan), source, errors)
+        _attempt(lambda: check_thrust(scenario.vehicle, scenario.current.velocity_mps, plan), source, errors)
         for k in range(len(scenario.lamps)):
             _attempt(lambda k=k: _check_lamp(k, scenario, terrain, plan), source, errors)
     grid = None
     if terrain is not None and plan is not None:
-        grid = _attempt(lambda: _grid(scenario, plan, terrain), source, errors)
+        grid = _attempt(lambda: _grid(scenario.map.cell_m, plan, terrain), source, errors)
     if errors or terrain is None or plan is None or grid is None or true_cameras is None or illumination is None:
         raise ScenarioError(errors)
     return Mission(
@@ -291,7 +304,7 @@ def load_terrain(scenario: Scenario) -> terrains.Terrain:
         if (plugin := t.plugin) is not None:
             return terrains.generate_from(
                 lambda x_m, y_m, _: terrain_heights(plugin, x_m, y_m, scenario.seed),
-                t.size_m, t.grid_m, texture, t.cover or terrains.default_cover(t.kind), scenario.seed,
+                t.size_m, t.grid_m, texture, t.cover or DEFAULT_COVERS[t.kind], scenario.seed,
             )  # fmt: skip
         return terrains.generate(t.kind, t.size_m, t.relief_m, t.base_m, t.grid_m, texture, scenario.seed)
     if t.plugin is not None:
@@ -330,30 +343,23 @@ def _check_plugins(scenario: Scenario) -> None:
         raise TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
 
 
-def _check_speed(scenario: Scenario, plan: SurveyPlan | None) -> None:
+def _check_speed(vehicle: VehicleConfig, asked: PlanConfig, plan: SurveyPlan | None) -> None:
     """Raises TwinError if the cruise speed exceeds the top speed: forwards or, for loops, in the slowest direction.
 
     A kinematic vehicle is not checked.
-
-    Args:
-        scenario: the vehicle, and `plan.speed_mps`.
-        plan: the planned survey, whose cruise speed is below `plan.speed_mps` on tight loops; None: it could not be
-            planned.
     """
-    if scenario.vehicle.dynamics == "kinematic":
+    if vehicle.dynamics == "kinematic":
         return
-    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if scenario.plan.pattern == "loops" else np.zeros(1)
+    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if asked.pattern == "loops" else np.zeros(1)
     directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
-    reach = min(top_speed_mps(scenario.vehicle, direction) for direction in directions)
-    if (scenario.plan.speed_mps if plan is None else plan.speed_mps) > reach:
-        raise TwinError(
-            "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
-        )
+    reach = min(top_speed_mps(vehicle, direction) for direction in directions)
+    if (asked.speed_mps if plan is None else plan.speed_mps) > reach:
+        raise TwinError("plan.speed_mps", f"{asked.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}")
 
 
-def _check_beacons_listed(scenario: Scenario) -> None:
+def _check_beacons_listed(navigation: NavigationConfig, beacons: Sequence[BeaconConfig]) -> None:
     """Raises TwinError if beacons are used for aiding and the scenario defines none."""
-    if "beacons" in scenario.navigation.aiding and not scenario.beacons:
+    if "beacons" in navigation.aiding and not beacons:
         raise TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
 
 
@@ -371,20 +377,16 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
         raise TwinError(f"beacons.{number}.position_m", f"z {z:g} is below the floor", f"above {floor_m:.3f} m")
 
 
-def _check_current(scenario: Scenario) -> None:
+def _check_current(vehicle: VehicleConfig, current: CurrentConfig) -> None:
     """Raises TwinError if the scenario combines a current with a kinematic vehicle, on which it has no effect."""
-    if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
+    if vehicle.dynamics == "kinematic" and any(current.velocity_mps):
         raise TwinError(
             "current.velocity_mps", "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
         )
 
 
 def _illumination(scenario: Scenario) -> Illumination:
-    """Returns the optical properties of the water and the daylight.
-
-    Raises:
-        TwinError: water, daylight or the beam of a lamp is invalid.
-    """
+    """Returns the optical properties of the water and the daylight."""
     illumination = illumination_of(scenario)
     light_sources_in_camera(scenario.believed_rig(), scenario.lamps, illumination.daylight, 0)
     return illumination
@@ -428,11 +430,10 @@ def _check_white_balance(sensor: SensorConfig) -> None:
             )  # fmt: skip
 
 
-def _check_lens_blur(scenario: Scenario) -> None:
+def _check_lens_blur(lens: LensConfig, sensor: SensorConfig | None) -> None:
     """Raises TwinError if [sensor] is missing although the blur of the lens needs it, or if the focus is too near."""
-    lens = scenario.lens
     for key, used in (("diffraction", lens.diffraction), ("focus_m", lens.focus_m > 0)):
-        if used and scenario.sensor is None:
+        if used and sensor is None:
             raise TwinError(f"lens.{key}", "needs the f-number and the pixel size of the sensor", "with [sensor]")
     if 0 < lens.focus_m < NEAREST_FOCUS_M:
         raise TwinError("lens.focus_m", f"{lens.focus_m:g}: too near", f"0, or {NEAREST_FOCUS_M:g} or more")
@@ -460,27 +461,27 @@ def _check_in_frame(key: str, time_ms: float, frame_rate_hz: float) -> None:
         )  # fmt: skip
 
 
-def _check_clearance(scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
+def _check_clearance(asked: PlanConfig, terrain: terrains.Terrain, plan: SurveyPlan) -> None:
     """Raises TwinError if the area exceeds the terrain, or the path leaves the terrain or is too near the floor."""
     size, outline = terrain.size_m, plan.area.outline()
     extent = f"{size[0]:.2f} x {size[1]:.2f} m"
     # a tolerance: rotation rounds the corners of an area as large as the terrain
     if (np.ptp(outline, axis=0) > np.array(size) + 1e-9).any():
-        shown = " x ".join(f"{a:g}" for a in scenario.plan.area_m)
-        turned = f" at a heading of {scenario.plan.heading_deg:g} deg" if scenario.plan.heading_deg else ""
+        shown = " x ".join(f"{a:g}" for a in asked.area_m)
+        turned = f" at a heading of {asked.heading_deg:g} deg" if asked.heading_deg else ""
         raise TwinError("plan.area_m", f"{shown} m{turned} is larger than the terrain", f"up to {extent}")
     clearance = planned_clearance(plan, terrain)
-    field = "plan.area_m" if scenario.plan.polygon is None else "plan.polygon"
+    field = "plan.area_m" if asked.polygon is None else "plan.polygon"
     if not clearance.inside:
         raise TwinError(field, "the path leaves the terrain", f"a path inside {extent}")
     _check_over_heights(field, terrain, plan)
-    if clearance.least_m < scenario.plan.clearance_m:
-        needed = scenario.plan.altitude_m - clearance.least_m + scenario.plan.clearance_m
+    if clearance.least_m < asked.clearance_m:
+        needed = asked.altitude_m - clearance.least_m + asked.clearance_m
         raise TwinError(
             "plan.altitude_m",
-            f"{scenario.plan.altitude_m:g}: the cameras come within {clearance.least_m:.2f} m of the floor"
+            f"{asked.altitude_m:g}: the cameras come within {clearance.least_m:.2f} m of the floor"
             f" at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
-            f"at least {needed:.2f} for {scenario.plan.clearance_m:g} m of clearance",
+            f"at least {needed:.2f} for {asked.clearance_m:g} m of clearance",
         )
 
 
@@ -504,18 +505,13 @@ def _check_over_heights(field: str, terrain: terrains.Terrain, plan: SurveyPlan)
         )  # fmt: skip
 
 
-def _grid(scenario: Scenario, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
-    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m.
-
-    Raises:
-        TwinError: the grid has more cells than `limits.MAX_MAP_CELLS`.
-    """
+def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
+    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
     corners = plan.outline()[:, :2]
     margin = np.array(_half_extent_m(plan)) * _widest(plan, terrain) + 0.5
-    cell = scenario.map.cell_m
-    west, south = np.floor((corners.min(axis=0) - margin) / cell) * cell
-    east, north = np.ceil((corners.max(axis=0) + margin) / cell) * cell
-    grid = MapGrid(float(west), float(north), cell, round((north - south) / cell), round((east - west) / cell))
+    west, south = np.floor((corners.min(axis=0) - margin) / cell_m) * cell_m
+    east, north = np.ceil((corners.max(axis=0) + margin) / cell_m) * cell_m
+    grid = MapGrid(float(west), float(north), cell_m, round((north - south) / cell_m), round((east - west) / cell_m))
     check_map_size(grid)
     return grid
 

@@ -31,8 +31,6 @@ def load_objects(scenario: Scenario, terrain: terrains.Terrain, attempt: Attempt
     """Returns the objects of a scenario; objects with equal shapes share one model.
 
     Args:
-        scenario: the scenario.
-        terrain: the floor.
         attempt: calls a function and collects its TwinError, see `mission.prepare`; entries with errors are left out.
     """
     models: dict[str, tuple[ObjectModel, ...]] = {}
@@ -48,18 +46,7 @@ def _entry(
     number: int, config: ObjectConfig, models: dict[str, tuple[ObjectModel, ...]], found: list[PlacedObject],
     world: tuple[terrains.Terrain, int],
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns the objects of one entry of `[[objects]]` and adds its models to `models` if they are not there yet.
-
-    Args:
-        number: number of the entry, from 0.
-        config: the entry.
-        models: models built so far, by shape, mesh file and its upward axis, colour, width of a pipe, and variant.
-        found: objects placed so far, which scattered objects do not overlap.
-        world: terrain, and seed of the scenario.
-
-    Raises:
-        TwinError: the entry is invalid, or there are more triangles or objects than `MAX_FACES` or `MAX_OBJECTS`.
-    """
+    """Returns the objects of one entry of `[[objects]]` and adds its models to `models` if they are not there yet."""
     _check_keys(number, config)
     terrain, seed = world
     variant = None if config.position_m is None or config.shape == "mesh" else number % SHAPES[config.shape].variants
@@ -79,11 +66,7 @@ def _entry(
 
 
 def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -> tuple[ObjectModel, ...]:
-    """Returns the models of an entry: that of its mesh file, or the given variant of a built-in shape (None: all).
-
-    Raises:
-        TwinError: the mesh file cannot be read.
-    """
+    """Returns the models of an entry: that of its mesh file, or the given variant of a built-in shape (None: all)."""
     if config.shape == "mesh":
         assert config.mesh_file is not None
         file = Path(config.mesh_file)

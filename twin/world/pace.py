@@ -33,7 +33,6 @@ class Pace(NamedTuple):
         Args:
             last_s: path time of the last frame flown.
             end_s: path time of the last frame of the track, which is always flown.
-            interval_s: time between frames.
         """
         n_full = int(np.ceil((end_s - last_s - SAME_TIME_S) / interval_s))
         n = min(n_full, 1) if self != FULL else n_full

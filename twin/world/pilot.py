@@ -13,9 +13,11 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Readings
 from twin.kernels import kernel
+from twin.plugin.guard import GuardedPlugin
+from twin.plugin.loading import CONTROLLERS
+from twin.plugin.protocols import ControllerSetup
 from twin.simulate.autopilot import nominal_controller
 from twin.world.mission import Mission
-from twin.world.plugin_pilot import PluginPilot
 
 _VELOCITY_SMOOTHING_S = 0.1  # time constant of the filter: velocity from F2F is noisy, the true velocity varies slowly
 
@@ -44,8 +46,6 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     unchanged if its motion was measured or a DVL reading is available.
 
     Args:
-        estimate: estimate of a frame.
-        reference: reference of the same frame.
         readings: readings of the navigation sensors at the frame.
     """
     if estimate.status == "ok" or readings.dvl_mps is not None:
@@ -56,6 +56,29 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     pose[:n, 3], velocity[:n] = reference.position[:n], reference.velocity[:n]
     twist[3:] = pose[:3, :3].T @ velocity
     return estimate._replace(world_from_camera=pose, camera_velocity=twist)
+
+
+class PluginPilot:
+    """Pilot that returns the checked commands of a plug-in.
+
+    Args:
+        mission: the survey to fly.
+        name: value of `control.plugin`.
+
+    Raises:
+        TwinError: the plug-in cannot be loaded.
+    """
+
+    def __init__(self, mission: Mission, name: str):
+        scenario, rig = mission.scenario, mission.rig
+        nominal = nominal_controller(scenario.control.natural_frequency_radps, rig.frame_rate_hz).state
+        self._n = 8 if scenario.vehicle.dynamics == "rigid" else 3
+        setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, self._n)
+        self._plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
+
+    def __call__(self, estimate: Estimate, reference: Reference) -> Array:
+        """Returns the command of the plug-in; raises PluginFailed if the plug-in fails or its command is unusable."""
+        return self._plugin.numbers("command", self._plugin.call("command", estimate, reference), (self._n,))
 
 
 def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
@@ -114,7 +137,6 @@ def steer(state, world_from_camera, camera_velocity, position, velocity, acceler
     """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`.
 
     Args:
-        state: state of the pilot.
         world_from_camera: (4, 4) estimated pose of the left camera.
         camera_velocity: (6,) estimated twist of the left camera in camera axes [rad/s, m/s].
         position, velocity, acceleration: (3,) reference of the left camera in the world [m, m/s, m/s2].

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 
 from twin.controllers.survey_area import Corner, SurveyArea, polygon_area
 from twin.core.georeference import Georeference
 from twin.core.records import Array
-from twin.core.user_files import read_json, reading
+from twin.core.user_files import read_json
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig
 from twin.terrains import Terrain
@@ -44,11 +46,7 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
 
 
 def _centre(plan: PlanConfig, terrain: Terrain) -> Corner:
-    """Returns the centre of the area in the scene [m].
-
-    Raises:
-        TwinError: the centre lies outside the terrain, is given twice, or needs coordinates that the terrain lacks.
-    """
+    """Returns the centre of the area in the scene [m]."""
     if plan.centre_crs is None:
         _check_inside("plan.centre_m", np.array([plan.centre_m]), terrain)
         return plan.centre_m
@@ -102,8 +100,7 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
             be transformed, or the terrain has no coordinates.
     """
     tree = read_json(file, "plan.polygon", _ONE_POLYGON, _MAX_GEOJSON_BYTES)
-    with reading(file, "plan.polygon", _ONE_POLYGON):
-        corners = np.array(_ring(tree, file), np.float64)[:, :2]
+    corners = shapely.get_coordinates(_polygon(tree, file).exterior)
     if not np.isfinite(corners).all():
         raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _ONE_POLYGON)
     origin = _georeference("plan.polygon", terrain)
@@ -115,24 +112,17 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
     return np.column_stack(origin.to_scene(*corners.T))
 
 
-def _ring(tree: Any, file: Path) -> list[Any]:
-    """Returns the outer ring of the only polygon of a GeoJSON object: geometry, feature or feature collection.
-
-    Raises:
-        TwinError: the object does not contain exactly one polygon without holes.
-    """
-    if isinstance(tree, dict) and tree.get("type") == "FeatureCollection" and len(tree.get("features", [])) == 1:
-        tree = tree["features"][0]
-    if isinstance(tree, dict) and tree.get("type") == "Feature":
-        tree = tree.get("geometry")
-    polygon = tree.get("coordinates", []) if isinstance(tree, dict) else []
-    if isinstance(tree, dict) and tree.get("type") == "MultiPolygon" and len(polygon) == 1:
-        polygon = polygon[0]
-    elif not isinstance(tree, dict) or tree.get("type") != "Polygon":
+def _polygon(tree: Any, file: Path) -> shapely.Polygon:
+    """Returns the only polygon of a GeoJSON object: geometry, feature or feature collection."""
+    try:
+        parts = shapely.get_parts(shapely.get_parts(shapely.from_geojson(json.dumps(tree))))
+    except shapely.errors.ShapelyError:
+        raise TwinError("plan.polygon", f"{file.name!r} is not valid GeoJSON", _ONE_POLYGON) from None
+    if len(parts) != 1 or not isinstance(parts[0], shapely.Polygon):
         raise TwinError("plan.polygon", f"{file.name!r} does not hold exactly one polygon", _ONE_POLYGON)
-    if len(polygon) != 1 or len(polygon[0]) < 4:
+    if parts[0].is_empty or len(parts[0].interiors):
         raise TwinError("plan.polygon", f"{file.name!r} has a polygon with holes or without corners", _ONE_POLYGON)
-    return polygon[0]
+    return parts[0]
 
 
 def _named_crs(tree: Any) -> str | None:
@@ -151,11 +141,7 @@ def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeferenc
 
 
 def _projected(corners: Array, crs: str, origin: Georeference) -> Array:
-    """Returns corners (n, 2) transformed from the named CRS to that of the DEM.
-
-    Raises:
-        TwinError: the CRS is unknown, or the coordinates cannot be transformed.
-    """
+    """Returns corners (n, 2) transformed from the named CRS to that of the DEM."""
     from rasterio.crs import CRS  # imported here: it takes 20 MB, and few plans need it
     from rasterio.errors import RasterioError
     from rasterio.warp import transform

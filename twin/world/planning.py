@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +11,10 @@ from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
 from twin.core.floor_rays import HeightField
-from twin.core.records import StereoRig
+from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.scenario.model import Scenario
 from twin.terrains import Terrain
-from twin.world.limits import check_plan_size
 from twin.world.placement import survey_area
 from twin.world.planned_images import floor_of, level_floor, overlaps, planned_keyframes, planned_pairs, thinned
 from twin.world.thrust_authority import climb_slope
@@ -32,6 +32,10 @@ _LEAST_SCALE = 0.05
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
 
+#: Largest number of frames (18 hours at 30 Hz; about 1 kB of memory each), of keyframes, and of cells of the map
+#: (about 100 bytes of memory each).
+MAX_FRAMES, MAX_KEYFRAMES, MAX_MAP_CELLS = 2_000_000, 200_000, 25_000_000
+
 _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 
 
@@ -48,15 +52,14 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     They are not adapted if the path leaves the terrain, nor the spacing if it meets the floor, which `prepare` reports.
 
     Args:
-        scenario: description of the survey.
-        terrain: its floor; None: the survey is planned over the reference plane.
+        terrain: the floor; None: the survey is planned over the reference plane.
 
     Raises:
-        TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `limits.check_plan_size`.
+        TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `check_plan_size`.
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
     plan = _PATTERNS[pattern](request)
-    check_plan_size(scenario, plan)
+    check_plan_size(plan, scenario.control.hold_s)
     if terrain is None or not _lies_over(plan, terrain):
         return plan
     if scenario.plan.height == "floor":
@@ -65,16 +68,39 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     if scenario.plan.overlap_reference == "floor" and _lies_above(plan, terrain):
         request = _keep_overlap(request, pattern, floor_of(terrain), scenario.believed_rig())
         plan = _PATTERNS[pattern](request)
-        check_plan_size(scenario, plan)
+        check_plan_size(plan, scenario.control.hold_s)
     return plan
+
+
+def check_plan_size(plan: SurveyPlan, hold_s: float) -> None:
+    """Raises TwinError if a plan has more than `MAX_FRAMES` frames or `MAX_KEYFRAMES` keyframes."""
+    duration_s = sum(plan.track_duration_s(track) for track in range(1, plan.n_tracks + 1))
+    n_frames = (duration_s + hold_s * plan.n_tracks) * plan.frame_rate_hz
+    _check_number(
+        "plan.area_m", n_frames, MAX_FRAMES, "frames", "fewer plan.tracks, a smaller area, less overlap, more speed"
+    )
+    n_keyframes = duration_s * plan.frame_rate_hz / plan.n_frames_per_keyframe
+    _check_number("plan.overlap_along", n_keyframes, MAX_KEYFRAMES, "keyframes", "less overlap, or fewer plan.tracks")
+
+
+def check_map_size(grid: MapGrid) -> None:
+    """Raises TwinError if a map has more than `MAX_MAP_CELLS` cells."""
+    n_cells = grid.rows * grid.cols
+    needed_m = grid.cell_m * math.sqrt(n_cells / MAX_MAP_CELLS)
+    _check_number("map.cell_m", n_cells, MAX_MAP_CELLS, "cells of the map", f"a cell of {needed_m:.2g} m")
+
+
+def _check_number(field: str, number: float, limit: int, items: str, remedy: str) -> None:
+    """Raises TwinError if a number of items exceeds its limit."""
+    if number > limit:
+        raise TwinError(field, f"{number:.4g} {items} are too many", f"up to {limit}: {remedy}")
 
 
 def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest:
     """Returns the requirements of the survey of a scenario.
 
     Args:
-        scenario: description of the survey.
-        terrain: its floor, in which the area is placed; None: the area lies at the origin.
+        terrain: the floor, in which the area is placed; None: the area lies at the origin.
 
     Raises:
         TwinError: the area cannot be placed, or the vehicle cannot turn on the spot.
@@ -101,11 +127,7 @@ def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
 
 
 def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> CameraSurface:
-    """Returns the surface that the camera follows, at `plan.altitude_m` above the smoothed floor.
-
-    Raises:
-        TwinError: the vehicle is kinematic, or the terrain has fewer than 4 x 4 nodes.
-    """
+    """Returns the surface that the camera follows, at `plan.altitude_m` above the smoothed floor."""
     if scenario.vehicle.dynamics == "kinematic":
         raise TwinError("plan.height", "'floor': a kinematic vehicle moves in a horizontal plane", '"plane"')
     if min(terrain.height_m.shape) < 4:
@@ -114,7 +136,7 @@ def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> Ca
     across_m, along_m = request.footprint_m
     along_x = scenario.plan.pattern == "lawnmower" and not scenario.plan.heading_deg
     footprint_m = (along_m, across_m) if along_x else (across_m, across_m)
-    slope = climb_slope(scenario)
+    slope = climb_slope(scenario.vehicle, scenario.plan.speed_mps)
     corner_m = (terrain.west_m, terrain.south_m)
     return surface_above_floor(terrain.height_m, terrain.spacing_m, corner_m, request.altitude_m, footprint_m, slope)
 
@@ -126,10 +148,6 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     least the smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT of the pairs have over
     the reference plane in the plan with scales of 1 at constant height. The scales start at 1 and are repeatedly
     multiplied by the factors of `_reduction`. On a floor at the reference plane they stay 1.
-
-    Raises:
-        TwinError: no spacing with scales of at least `_LEAST_SCALE` was found that gives enough overlap, or the pattern
-            cannot be planned with the reduced spacing.
     """
     make = _PATTERNS[pattern]
     whole = request._replace(tracks=0) if _n_whole(request, pattern) <= _MOST_TRACKS else request
@@ -171,10 +189,6 @@ def _reduction(found: float, allowed: float, unchanged: int) -> float:
 
     The numbers of frames per keyframe and of tracks are integers, so a small step may leave them unchanged. The least
     step of 1 % is therefore doubled after each of the last `unchanged` steps without effect.
-
-    Args:
-        found, allowed: 1 - overlap of the plan along or across (`NonOverlap`), and its limit.
-        unchanged: number of consecutive steps that did not change the spacing.
     """
     if found <= allowed * (1 + _TOLERANCE):
         return 1.0

@@ -10,7 +10,7 @@ from scipy.optimize import root_scalar
 from twin.controllers.survey_plan import SurveyPlan
 from twin.core.geometry import Array
 from twin.errors import TwinError
-from twin.scenario.model import Scenario
+from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import thrust_loads
 
 #: A path over the floor may climb and descend at this share of the greatest vertical speed at cruise speed; the rest is
@@ -20,7 +20,7 @@ _CLIMB_SHARE = 0.5
 _MAX_SLOPE = 0.6
 
 
-def check_thrust(scenario: Scenario, plan: SurveyPlan) -> None:
+def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float], plan: SurveyPlan) -> None:
     """Checks that the thrusters hold station in the current, and reach the planned velocities against it.
 
     A kinematic vehicle, and a path at constant height without current, are not checked.
@@ -28,30 +28,29 @@ def check_thrust(scenario: Scenario, plan: SurveyPlan) -> None:
     Raises:
         TwinError: a thruster saturates; the message gives the greatest allowed current or cruise speed.
     """
-    current = np.array(scenario.current.velocity_mps)
-    if scenario.vehicle.dynamics == "kinematic" or not (current.any() or plan.surface is not None):
+    current = np.array(current_mps)
+    if vehicle.dynamics == "kinematic" or not (current.any() or plan.surface is not None):
         return
     yaw, velocity = _planned_velocities(plan)
     hold = _body_velocities(yaw, -np.tile(current, (len(yaw), 1)))
-    _check_station_keeping(scenario, hold)
+    _check_station_keeping(vehicle, float(np.linalg.norm(current)), hold)
     through_water = lambda factor: _body_velocities(yaw, factor * velocity - current)  # noqa: E731
-    if _load(scenario, through_water(1.0)) > 1:
-        factor = _root(lambda k: _load(scenario, through_water(k)) - 1, 1.0)
+    if _load(vehicle, through_water(1.0)) > 1:
+        factor = _root(lambda k: _load(vehicle, through_water(k)) - 1, 1.0)
         against = f" in a current of {np.linalg.norm(current):.2f} m/s" if current.any() else " up the slopes"
         raise TwinError(
-            "plan.speed_mps", f"{scenario.plan.speed_mps:g}: too fast for the thrusters{against}",
+            "plan.speed_mps", f"{plan.speed_mps:g}: too fast for the thrusters{against}",
             f"up to {np.floor(1000 * factor * plan.speed_mps) / 1000:.3f}",
         )  # fmt: skip
 
 
-def climb_slope(scenario: Scenario) -> float:
+def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
     """Returns the greatest slope of a path: half the slope that saturates a thruster at cruise speed, at most 0.6.
 
     It is 0.6 if the cruise speed alone saturates a thruster.
     """
-    speed_mps = scenario.plan.speed_mps
     ahead = np.array([speed_mps, 0.0, 0.0])
-    excess = lambda climb: _load(scenario, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
+    excess = lambda climb: _load(vehicle, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
     if excess(0.0) >= 0:
         return _MAX_SLOPE  # `prepare` reports that the speed is too high
     high = _MAX_SLOPE / _CLIMB_SHARE * speed_mps
@@ -59,12 +58,11 @@ def climb_slope(scenario: Scenario) -> float:
     return _CLIMB_SHARE * climb / speed_mps
 
 
-def _check_station_keeping(scenario: Scenario, hold: Array) -> None:
+def _check_station_keeping(vehicle: VehicleConfig, speed_mps: float, hold: Array) -> None:
     """Raises TwinError if station keeping, at body velocities through the water (n, 3), saturates a thruster."""
-    if _load(scenario, hold) <= 1:
+    if _load(vehicle, hold) <= 1:
         return
-    factor = _root(lambda k: _load(scenario, k * hold) - 1, 1.0)
-    speed_mps = float(np.linalg.norm(scenario.current.velocity_mps))
+    factor = _root(lambda k: _load(vehicle, k * hold) - 1, 1.0)
     raise TwinError(
         "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
         f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
@@ -76,9 +74,9 @@ def _root(function: Callable[[float], float], high: float) -> float:
     return float(root_scalar(function, bracket=(0.0, high), method="brentq", xtol=1e-4).root)
 
 
-def _load(scenario: Scenario, velocities: Array) -> float:
+def _load(vehicle: VehicleConfig, velocities: Array) -> float:
     """Returns the greatest thrust of any thruster at body velocities (n, 3) through the water; 1 is full thrust."""
-    return float(thrust_loads(scenario.vehicle, velocities).max(initial=0.0))
+    return float(thrust_loads(vehicle, velocities).max(initial=0.0))
 
 
 def _planned_velocities(plan: SurveyPlan) -> tuple[Array, Array]:

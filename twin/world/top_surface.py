@@ -39,7 +39,6 @@ def top_surface(grid: MapGrid, floor_m: NDArray[np.float32], objects: Sequence[P
     """Returns the surface of floor and objects as seen from above.
 
     Args:
-        grid: grid of the map.
         floor_m: (rows, cols) height of the floor at the cell centres [m].
         objects: the objects; at most 65,535.
     """

@@ -59,7 +59,6 @@ def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | 
         albedo: (rows, cols, 3) albedo of the floor on `grid`.
         grid: grid of the albedo, within `map_grid`.
         objects: 1 + number of the object at the top of each cell of `map_grid`, 0 for the floor; None without objects.
-        map_grid: grid of the map.
     """
     if objects is None:
         return albedo

@@ -156,10 +156,6 @@ class World(ABC):
         """Returns a function that simulates frames between keyframes quickly, without images.
 
         In this base class, the returned function simulates no frames; `SurrogateWorld` overrides the method.
-
-        Args:
-            navigator: the estimator in the loop.
-            pilot: the controller in the loop.
         """
         return lambda sequence, k: k
 
