@@ -208,7 +208,7 @@ def test_the_lamp_share_decreases_with_sunlight():
     assert shares[1] / (1 - shares[1]) == pytest.approx(10 * shares[2] / (1 - shares[2]), rel=0.01)
     assert share(1000, "lamps=[]") == 0
     dark = mission("sun.illuminance_lx=1000", lamps, "water.turbidity=100")
-    plan = dark.scenario.plan.model_copy(update={"altitude_m": 1000.0})
+    plan = dark.scenario.plan.model_copy(update={"altitude_m": 100.0})
     high = dark.scenario.model_copy(update={"plan": plan})
     assert lamp_share(FloorImages(high, dark.illumination)) == 1  # no light returns
 

@@ -151,7 +151,7 @@ class CandidateSurveys:
         """
         sampling, config = self.study.sampling, self.config
         update: dict[str, Any] = {"seed": sampling.seed + _RENDER_SEEDS, "paired": False, "seeds": 1}
-        update["seeds" if sampling.samples is None else "samples"] = config.verify
+        update["seeds" if sampling.samples is None else "samples"] = max(config.verify, 1)  # with 0, none is flown
         if sampling.method in _POWER_OF_2:
             update["method"] = "lhs"
         changes = {
