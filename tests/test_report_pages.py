@@ -24,10 +24,10 @@ from twin.recordings.replay import ReplayOptions
 from twin.report import comparison, survey_page
 from twin.reproduce import catalogue
 from twin.studies.analysis import StudyAnalysis
-from twin.tuning.candidates import tuning_config
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
 from twin.studies.surveys import survey_keys, surveys
+from twin.tuning.candidates import tuning_config
 from twin.tuning.tuning_report import write_tuning_report
 
 pytestmark = pytest.mark.long

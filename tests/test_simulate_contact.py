@@ -107,7 +107,7 @@ class Diver:
 @pytest.mark.parametrize("more", [[], SURROGATE])
 def test_a_controller_that_dives_ends_the_survey_by_contact(tmp_path, more):
     plugin = [f"control.plugin={Diver.__module__}:Diver"]
-    result = survey.run(load_scenario("reef", [*SMALL, *more, *plugin]), tmp_path, outputs=None)
+    result = survey.run(load_scenario("reef", [*SMALL, *more, *plugin], allow_plugins=True), tmp_path, outputs=None)
     assert result.status == "aborted" and "contact of the hull with the floor at" in result.metrics["reason"]
 
 

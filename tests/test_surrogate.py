@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import BaseModel
 
 from twin import scenes, survey
 from twin.core import geometry
@@ -208,8 +209,8 @@ def test_the_lamp_share_decreases_with_sunlight():
     assert shares[1] / (1 - shares[1]) == pytest.approx(10 * shares[2] / (1 - shares[2]), rel=0.01)
     assert share(1000, "lamps=[]") == 0
     dark = mission("sun.illuminance_lx=1000", lamps, "water.turbidity=100")
-    plan = dark.scenario.plan.model_copy(update={"altitude_m": 100.0})
-    high = dark.scenario.model_copy(update={"plan": plan})
+    plan = BaseModel.model_copy(dark.scenario.plan, update={"altitude_m": 1000.0})  # beyond the limits of the key
+    high = BaseModel.model_copy(dark.scenario, update={"plan": plan})
     assert lamp_share(FloorImages(high, dark.illumination)) == 1  # no light returns
 
 

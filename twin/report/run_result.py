@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from twin.core.optional_packages import optional
 from twin.core.records import Trajectory
 from twin.errors import TwinError
-from twin.report.run_folder import Raster, Run, load_run
 
 if TYPE_CHECKING:
     import pandas
+
+    from twin.report.run_folder import Raster, Run
 
 _KEY_FIGURES = (
     ("final position error (RMSE)", "trajectory", "final", "ate_rmse_m"),
@@ -47,6 +48,8 @@ class RunResult:
         Raises:
             TwinError: it is not a run folder, a file is damaged, or the survey has not finished.
         """
+        from twin.report.run_folder import load_run  # imported here: it needs rasterio
+
         run = load_run(folder)
         if run.metrics is None:
             raise TwinError(str(folder), "has no metrics.json: the survey has not finished", "a finished run")
@@ -57,6 +60,8 @@ class RunResult:
     @cached_property
     def contents(self) -> Run:
         """Returns all contents of the run folder."""
+        from twin.report.run_folder import load_run
+
         return load_run(self.folder)
 
     @property
