@@ -18,18 +18,14 @@ class HeightField(NamedTuple):
 
     Each cell is split along the diagonal from node (r, c) to (r + 1, c + 1), as in `terrains.Terrain`. There is no
     floor in cells with a NaN corner and outside the grid.
-
-    Args:
-        height_m: (ny, nx) heights of the nodes, row 0 = south, column 0 = west.
-        spacing_m: distance between neighbouring nodes.
-        west_m, south_m: position of node (0, 0).
-        lowest_m, highest_m: height of the lowest and of the highest node.
     """
 
-    height_m: Array
-    spacing_m: float
+    height_m: Array  #: (ny, nx) heights of the nodes, row 0 = south, column 0 = west
+    spacing_m: float  #: distance between neighbouring nodes
+    #: west_m, south_m: position of node (0, 0).
     west_m: float
     south_m: float
+    #: lowest_m, highest_m: height of the lowest and of the highest node.
     lowest_m: float
     highest_m: float
 
@@ -62,7 +58,6 @@ def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array)
     The depth is inf where the ray of a pixel does not meet the floor, see `cast_ray`.
 
     Args:
-        field: the floor.
         poses: (n, 4, 4) world_from_camera.
         rig: calibration of the camera.
         pixels: (m, 2) column and row [px].

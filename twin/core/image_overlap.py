@@ -26,7 +26,6 @@ def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRi
     altitude, the result is exactly the overlap of their footprints.
 
     Args:
-        field: the floor.
         first, second: (n, 4, 4) world_from_camera of the images of each pair.
         rig: calibration of the camera that takes both images.
 
@@ -64,7 +63,6 @@ def _share_seen(field, pose, camera, cell, x, y, z, depth):
     """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
 
     Args:
-        field: the floor.
         pose: (4, 4) world_from_camera of the second camera.
         camera: fx, fy, cx, cy, width and height [px].
         cell: width and height of a cell in the first image [px].

@@ -29,7 +29,6 @@ def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left,
     Meanwhile, `in_row_bands` does not split images.
 
     Args:
-        left: computes the left image.
         right: computes the right image; it must not modify data that `left` uses, and vice versa.
 
     Raises:
@@ -61,7 +60,6 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: in
 
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.
-        n_rows: number of rows.
         rows_per_row: number of image rows that each processed row represents.
 
     Raises:

@@ -26,7 +26,6 @@ def reading(file: Path, key: str = "", allowed: str = "", most_bytes: int = _MOS
     """Checks a file; within the context, any exception of its reader becomes a TwinError.
 
     Args:
-        file: the file.
         key: key of the scenario that names the file; "": the error names the file itself.
         allowed: the files that are allowed, for the error.
         most_bytes: largest size of the file.
