@@ -33,24 +33,17 @@ _HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
 class AlignmentResult(NamedTuple):
-    """Result of a global alignment.
+    """Result of a global alignment."""
 
-    Args:
-        poses: (n, 4, 4) aligned world_from_camera of the nodes.
-        covs: (n, 6, 6) marginal covariances of the poses, [rotation, translation] (rad, m) in camera axes; zeros for
-            nodes whose covariance was not requested.
-        dropped: links that were removed as outliers.
-        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links.
-        converged: false if the iterations ended before the minimum was reached.
-        independent_errors: number of independent position errors to which those of all nodes are equivalent
-            (`_independent_errors`); None unless the covariances of all nodes were requested.
-    """
-
-    poses: Array
+    poses: Array  #: (n, 4, 4) aligned world_from_camera of the nodes
+    #: (n, 6, 6) marginal covariances of the poses, [rotation, translation] (rad, m) in camera axes; zeros for nodes
+    #: whose covariance was not requested.
     covs: Array
-    dropped: list[Link]
-    link_chi2: float
-    converged: bool
+    dropped: list[Link]  #: links that were removed as outliers
+    link_chi2: float  #: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links
+    converged: bool  #: false if the iterations ended before the minimum was reached
+    #: number of independent position errors to which those of all nodes are equivalent (`_independent_errors`); None
+    #: unless the covariances of all nodes were requested.
     independent_errors: float | None = None
 
 
@@ -69,8 +62,6 @@ def align(
         links: motions between nodes of the window.
         anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
             prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
-        rig: believed calibration of the stereo camera.
-        noise: believed noise of the navigation sensors.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
@@ -136,17 +127,11 @@ def _mean_chi2(links: Links, chi2: Array) -> float:
 
 
 class _Window(NamedTuple):
-    """Factor graph of the nodes that are aligned together, and the links among its factors.
+    """Factor graph of the nodes that are aligned together, and the links among its factors."""
 
-    Args:
-        links: links between the nodes.
-        index_of: index of each node in the factor graph, by node number.
-        graph: factor graph; its first binary factors are the links.
-    """
-
-    links: Links
-    index_of: dict[int, int]
-    graph: FactorGraph
+    links: Links  #: links between the nodes
+    index_of: dict[int, int]  #: index of each node in the factor graph, by node number
+    graph: FactorGraph  #: factor graph; its first binary factors are the links
 
     def optimise(self, start: GraphState, max_iterations: int) -> Solution:
         """Returns the solution reached from `start`, at a local minimum of the cost or after `max_iterations` steps."""

@@ -67,7 +67,6 @@ def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> floa
     Args:
         world_from_camera: (n, 4, 4) poses of the nodes.
         depth_m: (n,) median depth of the floor in the image of each node [m].
-        rig: calibration of the images.
     """
     images_per_unit = np.array([rig.fx_px / rig.width_px, rig.fy_px / rig.height_px])
     views = []

@@ -23,38 +23,25 @@ _MAX_TILT_RAD = np.deg2rad(45.0)  # largest angle between the normal of the floo
 
 
 class PairInspection(NamedTuple):
-    """Stereo pair, resampled to square pixels, with its matches.
+    """Stereo pair, resampled to square pixels, with its matches."""
 
-    Args:
-        left, right: (H, W, 3) resampled images.
-        rig: calibration of these images.
-        disparity: dense disparity of the left image.
-        points: matched points.
-        swapped: whether the left and the right image seem to be exchanged (`inspect_pair`).
-    """
-
+    #: left, right: (H, W, 3) resampled images.
     left: Image
     right: Image
-    rig: StereoRig
-    disparity: Disparity
-    points: StereoPoints
-    swapped: bool
+    rig: StereoRig  #: calibration of these images
+    disparity: Disparity  #: dense disparity of the left image
+    points: StereoPoints  #: matched points
+    swapped: bool  #: whether the left and the right image seem to be exchanged (`inspect_pair`)
 
 
 class FloorPlane(NamedTuple):
-    """Plane of a floor in the axes of a camera: the points x with normal . x = -distance.
+    """Plane of a floor in the axes of a camera: the points x with normal . x = -distance."""
 
-    Args:
-        normal: (3,) unit normal that points from the floor to the side of the camera.
-        distance_m: distance of the camera from the plane [m].
-        scatter_m: robust standard deviation of the points about the plane [m].
-        fitted: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis, at the
-            median depth of the points.
-    """
-
-    normal: Array
-    distance_m: float
-    scatter_m: float
+    normal: Array  #: (3,) unit normal that points from the floor to the side of the camera
+    distance_m: float  #: distance of the camera from the plane [m]
+    scatter_m: float  #: robust standard deviation of the points about the plane [m]
+    #: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis, at the median
+    #: depth of the points.
     fitted: bool
 
     @property
@@ -78,8 +65,6 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
     matched with the images exchanged, and at least three times as many as in the given order.
 
     Args:
-        frame: frame with both images.
-        rig: believed calibration.
         settings: settings of the estimators, for the number of points and the patch size; None: the defaults.
     """
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
@@ -94,7 +79,6 @@ def square_images(frame: Frame, rig: StereoRig) -> tuple[Image, Image]:
     """Returns the left and the right image of a frame with both images, resampled to square pixels.
 
     Args:
-        frame: frame with both images.
         rig: believed calibration; that of the returned images is `rig.with_square_pixels()`.
     """
     assert frame.right is not None

@@ -40,8 +40,6 @@ def length_scales(
     Args:
         nodes: the nodes with their readings.
         links: measured motions between these nodes; those between consecutive nodes are used.
-        rig: believed calibration.
-        noise: believed noise of the readings.
     """
     number = np.array([node.number for node in nodes])
     at_i, at_j = np.searchsorted(number, links.i), np.searchsorted(number, links.j)

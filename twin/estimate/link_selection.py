@@ -28,22 +28,18 @@ _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
 class _View(NamedTuple):
-    """Camera intrinsics and image size, for projection in compiled code.
+    """Camera intrinsics and image size, for projection in compiled code."""
 
-    Args:
-        fx, fy: focal lengths along the rows (fx) and the columns (fy) of the image [px].
-        cx, cy: column and row of the principal point [px].
-        width, height: image size [px].
-        margin: smallest distance of a visible point from the image border [px].
-    """
-
+    #: fx, fy: focal lengths along the rows (fx) and the columns (fy) of the image [px].
     fx: float
     fy: float
+    #: cx, cy: column and row of the principal point [px].
     cx: float
     cy: float
+    #: width, height: image size [px].
     width: int
     height: int
-    margin: int
+    margin: int  #: smallest distance of a visible point from the image border [px]
 
 
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
@@ -83,7 +79,6 @@ def choose_links(
         node: the new node.
         earlier: candidate nodes in chronological order.
         poses: (n, 4, 4) world_from_camera of the candidates.
-        rig: believed calibration.
         min_overlap: smallest sufficient overlap, 0 to 1.
         max_links: largest number of links.
         patch_px: side of the matching window [px].
@@ -129,9 +124,6 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
     """Returns the number m = 1 / (1 - q) of consecutive links during which a patch of floor stays in view.
 
     q is the overlap of the link from the latest earlier node, limited to `_LARGEST_OVERLAP`; 0 without links.
-
-    Args:
-        links: links of one node.
     """
     overlap = max(links, key=lambda link: link.i).overlap if links else 0.0
     return 1 / (1 - min(overlap, _LARGEST_OVERLAP))
@@ -168,8 +160,6 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
     Args:
         others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
-        earlier: candidate nodes in chronological order.
-        count: largest number of indices.
     """
     numbers = np.array([node.number for node in earlier])
     stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
@@ -197,7 +187,6 @@ def _overlaps(world, position, poses, reach, view):
         position: (3,) position of the node's camera in the world [m].
         poses: (n, 4, 4) poses of the other images.
         reach: distance between the cameras at which the overlap is taken as zero [m].
-        view: `_View`.
     """
     shares = np.zeros(len(poses))
     for k in range(len(poses)):

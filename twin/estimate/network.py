@@ -286,12 +286,7 @@ class KeyframeNetwork:
         )
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """Returns the links from earlier nodes that could be measured, and adds the results to the history.
-
-        Args:
-            node: the new node.
-            others: earlier nodes with their predicted overlaps, 0 to 1.
-        """
+        """Returns the links from earlier nodes that could be measured, and adds the results to the history."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         self.history.link_residuals += [np.nan if motion is None else motion.residual for motion in motions]
         offsets = [motion.disparity_offset for motion in motions if motion is not None]
@@ -324,8 +319,6 @@ class KeyframeNetwork:
         relative to the preceding node. Links rejected as outliers are removed from the network.
 
         Args:
-            nodes: nodes to align, in chronological order, up to the newest node.
-            track: number of the track, stored in the history.
             marginals: numbers of the nodes whose marginal covariances are computed; None for all nodes.
 
         Returns:

@@ -61,17 +61,11 @@ _SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equa
 
 
 class MotionSinceNode(NamedTuple):
-    """Motion since the last node of the network, from frame-to-frame motion fused with the DVL.
+    """Motion since the last node of the network, from frame-to-frame motion fused with the DVL."""
 
-    Args:
-        motion: (4, 4) pose of the camera at the current frame in the camera at the node.
-        cov: (6, 6) covariance of `motion` [rotation, translation] (rad, m), in the axes of the current camera.
-        cov_at_node: (6, 6) covariance of the online pose at the node, in the camera axes of the node.
-    """
-
-    motion: Array
-    cov: Array
-    cov_at_node: Array
+    motion: Array  #: (4, 4) pose of the camera at the current frame in the camera at the node
+    cov: Array  #: (6, 6) covariance of `motion` [rotation, translation] (rad, m), in the axes of the current camera
+    cov_at_node: Array  #: (6, 6) covariance of the online pose at the node, in the camera axes of the node
 
 
 class Navigator:
@@ -423,11 +417,6 @@ class Navigator:
 
         If too few points are matched in stereo, the frame does not become a keyframe and only position fixes are fused.
 
-        Args:
-            frame: frame with both images.
-            track: number of its track.
-            status: "ok", or the reason why tracking failed at this frame.
-
         Returns:
             `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
             link from the last node measures the motion of a frame at which tracking failed.
@@ -505,7 +494,6 @@ class Navigator:
         """Sets `accumulated_cov` of a keyframe from that of the last node and the motion since then.
 
         Args:
-            keyframe: keyframe that is not yet a node.
             step_cov: (6, 6) covariance of the motion since the last node, in the axes of the current camera.
         """
         if self.network.nodes:

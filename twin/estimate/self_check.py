@@ -46,8 +46,6 @@ def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
     The findings are in the order of tracking, navigation sensors, stereo, rectification and consistency.
 
     Args:
-        result: output of the estimators.
-        rig: believed calibration.
         elevation: map of the survey; None if none was built.
     """
     return [

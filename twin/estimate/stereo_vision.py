@@ -46,19 +46,12 @@ _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern
 
 
 class _MatchedPair(NamedTuple):
-    """Result of the matching of one stereo pair.
+    """Result of the matching of one stereo pair."""
 
-    Args:
-        right_image: (H, W, 3) right image at full size, without the known rectification errors.
-        right: grey levels of the right image at the image scale.
-        dense_px: (H, W) disparity by semi-global matching [px], NaN where unknown.
-        points: matched points.
-    """
-
-    right_image: Image
-    right: matching.Gray
-    dense_px: NDArray[np.float32]
-    points: StereoPoints
+    right_image: Image  #: (H, W, 3) right image at full size, without the known rectification errors
+    right: matching.Gray  #: grey levels of the right image at the image scale
+    dense_px: NDArray[np.float32]  #: (H, W) disparity by semi-global matching [px], NaN where unknown
+    points: StereoPoints  #: matched points
 
 
 class StereoVision:
@@ -206,9 +199,7 @@ class StereoVision:
         Row differences are in pixels of the full image with square pixels.
 
         Args:
-            row: index of the frame in the trajectories.
             left: (H, W, 3) left image of the frame, not resampled.
-            points: matched points.
         """
         contrast, saturated = matching.contrast(self._gray), matching.saturated_fraction(left)
         repeated = repetition(self._image, self.settings.patch_px)
@@ -347,7 +338,6 @@ def check_image_sizes(frame: Frame, size_px: tuple[int, int]) -> None:
     """Checks the sizes of the images of a frame.
 
     Args:
-        frame: frame to check; a missing image passes.
         size_px: width and height that the calibration states [px].
 
     Raises:

@@ -30,15 +30,10 @@ _MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smalle
 
 
 class CholeskyFactor(NamedTuple):
-    """Cholesky factor of a symmetric block matrix.
+    """Cholesky factor of a symmetric block matrix."""
 
-    Args:
-        symbolic: sparsity pattern and memory layout.
-        panels: values of all panels in one long array; a panel holds L1^-1 above L2.
-    """
-
-    symbolic: SymbolicFactor
-    panels: Array
+    symbolic: SymbolicFactor  #: sparsity pattern and memory layout
+    panels: Array  #: values of all panels in one long array; a panel holds L1^-1 above L2
 
     def solve(self, right: Array) -> Array:
         """Returns the solution (n, 6) of the linear system of the factorised matrix with a right-hand side (n, 6)."""
@@ -91,15 +86,10 @@ class CholeskyFactor(NamedTuple):
 
 
 class BlockMatrix(NamedTuple):
-    """Symmetric block matrix, stored with the memory layout of its Cholesky factor.
+    """Symmetric block matrix, stored with the memory layout of its Cholesky factor."""
 
-    Args:
-        symbolic: sparsity pattern and memory layout.
-        panels: values of all panels in one long array, modified in place.
-    """
-
-    symbolic: SymbolicFactor
-    panels: Array
+    symbolic: SymbolicFactor  #: sparsity pattern and memory layout
+    panels: Array  #: values of all panels in one long array, modified in place
 
     @classmethod
     def allocate(cls, symbolic: SymbolicFactor) -> BlockMatrix:
@@ -171,7 +161,6 @@ def _factorise(s, original, panels):
     Returns whether the matrix is numerically positive definite; if it is not, the factorisation is incomplete.
 
     Args:
-        s, panels: see the module.
         original: (6 n,) diagonal entries of the matrix before elimination, in elimination order.
     """
     for p in range(len(s.panel_start) - 1):
@@ -230,9 +219,7 @@ def _next_ancestor(s, positions, start):
     """Finds the panel that holds positions[start], and the block rows of positions[start:] in this panel.
 
     Args:
-        s: see the module.
         positions: (m,) positions of the rows below an earlier panel, ascending.
-        start: index of the first position to process.
 
     Returns:
         end: positions[start:end] are the found panel's own positions; positions[end:] are below it.
@@ -260,7 +247,6 @@ def _subtract(product, at, panel):
     Args:
         product: (6 m, 6 w) matrix of m x w blocks.
         at: (m,) block rows in the panel; the first w are also the block columns.
-        panel: matrix of the panel, changed in place.
     """
     for b in range(len(at)):
         for a in range(min(b + 1, product.shape[1] // _D)):
@@ -286,7 +272,6 @@ def _invert(s, panels, diagonal):
     """Replaces the factor by the blocks of the inverse that lie within its sparsity pattern.
 
     Args:
-        s, panels: see the module.
         diagonal: (n, 6, 6), filled with the diagonal blocks of the inverse, in elimination order.
     """
     for p in range(len(s.panel_start) - 2, -1, -1):

@@ -27,28 +27,22 @@ class SymbolicFactor(NamedTuple):
     """Sparsity pattern and memory layout of a Cholesky factor.
 
     The position of a node is its index in the elimination order, from 0.
-
-    Args:
-        permutation: (n,) position of each node.
-        panel_start: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1.
-        row_start, rows: (s + 1,), (r,) the positions of the nonzero block rows below panel p are
-            rows[row_start[p] : row_start[p + 1]], ascending.
-        offset: (s + 1,) index of the first element of each panel in one long array, and the length of this array. A
-            panel is a row-major matrix; its block rows are the panel's own positions and those below it, its block
-            columns are its own positions.
-        panel_of: (n,) number of the panel that holds each position.
-        off_diagonal: (m, 2) row and column position of each off-diagonal block, row > column.
-        transposed: (m,) true where the off-diagonal block (i, j) given to `analyse` has to be transposed, because node
-            i is eliminated before node j.
     """
 
-    permutation: Indices
-    panel_start: Indices
+    permutation: Indices  #: (n,) position of each node
+    panel_start: Indices  #: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1
+    #: row_start, rows: (s + 1,), (r,) the positions of the nonzero block rows below panel p are rows[row_start[p] :
+    #: row_start[p + 1]], ascending.
     row_start: Indices
     rows: Indices
+    #: (s + 1,) index of the first element of each panel in one long array, and the length of this array. A panel is a
+    #: row-major matrix; its block rows are the panel's own positions and those below it, its block columns are its own
+    #: positions.
     offset: Indices
-    panel_of: Indices
-    off_diagonal: Indices
+    panel_of: Indices  #: (n,) number of the panel that holds each position
+    off_diagonal: Indices  #: (m, 2) row and column position of each off-diagonal block, row > column
+    #: (m,) true where the off-diagonal block (i, j) given to `analyse` has to be transposed, because node i is
+    #: eliminated before node j.
     transposed: NDArray[np.bool_]
 
     def rows_below(self, panel: int) -> Indices:
@@ -108,7 +102,6 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
     """Returns, for each supernode in elimination order, its nodes and the nodes of the nonzero rows below it.
 
     Args:
-        n: number of nodes.
         early, late: (m,) the two nodes of each off-diagonal block, numbered in elimination order, early < late.
     """
     order = np.argsort(early, kind="stable")

@@ -35,55 +35,39 @@ _BATCH = 4096  # number of binary factors whose Jacobians are in memory at the s
 
 
 class UnaryFactors(NamedTuple):
-    """Factors of one kind that each constrain one pose.
+    """Factors of one kind that each constrain one pose."""
 
-    Args:
-        pose_index: (m,) index of the constrained pose.
-        information: (m, d, d) information matrices.
-        residuals: function of the poses (m, 4, 4) that returns residuals (m, d).
-        jacobians: function of poses and residuals that returns the Jacobians (m, d, 6) with respect to the increment of
-            the pose.
-    """
-
-    pose_index: Indices
-    information: Array
-    residuals: Callable[[Array], Array]
+    pose_index: Indices  #: (m,) index of the constrained pose
+    information: Array  #: (m, d, d) information matrices
+    residuals: Callable[[Array], Array]  #: function of the poses (m, 4, 4) that returns residuals (m, d)
+    #: function of poses and residuals that returns the Jacobians (m, d, 6) with respect to the increment of the pose.
     jacobians: Callable[[Array, Array], Array]
 
 
 class BinaryFactors(NamedTuple):
-    """Factors of one kind that each constrain the relative pose of two nodes.
+    """Factors of one kind that each constrain the relative pose of two nodes."""
 
-    Args:
-        i, j: (m,) indices of the two poses of each factor.
-        information: (m, d, d) information matrices.
-        residuals: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
-        jacobians: function of i_from_j, the shared parameter and the residuals that returns two Jacobians: with respect
-            to the increment of pose j (m, d, 6), and with respect to the shared parameter (m, d), None if the factors
-            do not depend on it. It is called for a part of the factors at a time.
-        huber: residual [standard deviations] above which the loss is linear; None: least squares.
-    """
-
+    #: i, j: (m,) indices of the two poses of each factor.
     i: Indices
     j: Indices
-    information: Array
+    information: Array  #: (m, d, d) information matrices
+    #: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
     residuals: Callable[[Array, float], Array]
+    #: function of i_from_j, the shared parameter and the residuals that returns two Jacobians: with respect to the
+    #: increment of pose j (m, d, 6), and with respect to the shared parameter (m, d), None if the factors do not depend
+    #: on it. It is called for a part of the factors at a time.
     jacobians: Callable[[Array, float, Array], tuple[Array, Array | None]]
-    huber: float | None = None
+    huber: float | None = None  #: residual [standard deviations] above which the loss is linear; None: least squares
 
 
 class FactorGraph(NamedTuple):
-    """Factor graph of poses and, optionally, one parameter shared by binary factors.
+    """Factor graph of poses and, optionally, one parameter shared by binary factors."""
 
-    Args:
-        n_poses: number of poses.
-        unary, binary: the factors, grouped by kind.
-        shared_sigma: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
-    """
-
-    n_poses: int
+    n_poses: int  #: number of poses
+    #: unary, binary: the factors, grouped by kind.
     unary: Sequence[UnaryFactors]
     binary: Sequence[BinaryFactors]
+    #: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
     shared_sigma: float | None = None
 
 
@@ -95,60 +79,39 @@ class GraphState(NamedTuple):
 
 
 class _Evaluation(NamedTuple):
-    """A factor graph evaluated at a state.
+    """A factor graph evaluated at a state."""
 
-    Args:
-        state: state at which the graph is evaluated.
-        cost: value of F.
-        unary: residuals (m, d) of each kind of unary factors.
-        binary: residuals (m, d) and robust weights (m,) of each kind of binary factors.
-        chi2: squared norms (m,) of the whitened residuals of each kind of binary factors.
-    """
-
-    state: GraphState
-    cost: float
-    unary: list[Array]
-    binary: list[tuple[Array, Array]]
-    chi2: list[Array]
+    state: GraphState  #: state at which the graph is evaluated
+    cost: float  #: value of F
+    unary: list[Array]  #: residuals (m, d) of each kind of unary factors
+    binary: list[tuple[Array, Array]]  #: residuals (m, d) and robust weights (m,) of each kind of binary factors
+    chi2: list[Array]  #: squared norms (m,) of the whitened residuals of each kind of binary factors
 
 
 class _NormalEquations(NamedTuple):
-    """Normal equations, without the off-diagonal blocks of the poses, which are stored in a `BlockMatrix`.
+    """Normal equations, without the off-diagonal blocks of the poses, which are stored in a `BlockMatrix`."""
 
-    Args:
-        diagonal: (n, 6, 6) diagonal blocks.
-        gradient: (n, 6) gradient of F with respect to the poses.
-        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter. All second
-            derivatives are in the Gauss-Newton approximation.
-        corner: second derivative of F with respect to the shared parameter; 0 if there is no such parameter.
-        shared_gradient: derivative of F with respect to the shared parameter.
-    """
-
-    diagonal: Array
-    gradient: Array
+    diagonal: Array  #: (n, 6, 6) diagonal blocks
+    gradient: Array  #: (n, 6) gradient of F with respect to the poses
+    #: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter. All second derivatives
+    #: are in the Gauss-Newton approximation.
     border: Array
-    corner: float
-    shared_gradient: float
+    corner: float  #: second derivative of F with respect to the shared parameter; 0 if there is no such parameter
+    shared_gradient: float  #: derivative of F with respect to the shared parameter
 
 
 class Solution(NamedTuple):
-    """Minimum of the cost of a factor graph; if not converged, the last accepted state of the iteration.
+    """Minimum of the cost of a factor graph; if not converged, the last accepted state of the iteration."""
 
-    Args:
-        state: poses and shared parameter at the minimum.
-        cost: F at the minimum.
-        chi2: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
-        converged: false if the iterations ended before the minimum was reached.
-        cholesky: factor of the normal matrix of the poses, undamped, at the last linearisation.
-        border: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal
-            information of this parameter; None if there is no shared parameter.
-    """
-
-    state: GraphState
-    cost: float
+    state: GraphState  #: poses and shared parameter at the minimum
+    cost: float  #: F at the minimum
+    #: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
     chi2: list[Array]
-    converged: bool
+    converged: bool  #: false if the iterations ended before the minimum was reached
+    #: factor of the normal matrix of the poses, undamped, at the last linearisation.
     cholesky: block_cholesky.CholeskyFactor
+    #: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal information of
+    #: this parameter; None if there is no shared parameter.
     border: tuple[Array, float] | None
 
     def marginals_in_place(self) -> Array:
@@ -215,29 +178,18 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
 
 
 class _Step(NamedTuple):
-    """Solution of the damped normal equations.
+    """Solution of the damped normal equations."""
 
-    Args:
-        damping: the diagonal of the pose block was multiplied by 1 + damping.
-        poses: (n, 6) increments of the poses.
-        shared: increment of the shared parameter.
-        cholesky, border: as in `Solution`, but of the damped equations.
-    """
-
-    damping: float
-    poses: Array
-    shared: float
+    damping: float  #: the diagonal of the pose block was multiplied by 1 + damping
+    poses: Array  #: (n, 6) increments of the poses
+    shared: float  #: increment of the shared parameter
+    #: cholesky, border: as in `Solution`, but of the damped equations.
     cholesky: block_cholesky.CholeskyFactor
     border: tuple[Array, float] | None
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
     """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites `matrix`.
-
-    Args:
-        matrix: off-diagonal blocks of the poses.
-        equations: the other parts of the normal equations.
-        damping: the diagonal of the pose block is multiplied by 1 + damping.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -370,7 +322,6 @@ def _add_border(first, second, by_j, weighted, i_from_j, border):
     """Adds the mixed second derivatives (poses and shared parameter) of binary factors to the border.
 
     Args:
-        first, second, by_j: see `_add_binary`.
         weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
         i_from_j: (m, 4, 4) poses of camera j in camera i.
         border: (n, 6), changed in place.

@@ -34,27 +34,17 @@ MOTION_MIN_SIGMA_PX = 0.03
 
 
 class DepthMap(NamedTuple):
-    """Depth of every pixel of a left image, with its variance.
+    """Depth of every pixel of a left image, with its variance."""
 
-    Args:
-        depth_m: (H, W) float32 depth [m], NaN where unknown.
-        variance_m2: (H, W) float32 variance of the depth [m^2], NaN where unknown.
-    """
-
-    depth_m: Map
-    variance_m2: Map
+    depth_m: Map  #: (H, W) float32 depth [m], NaN where unknown
+    variance_m2: Map  #: (H, W) float32 variance of the depth [m^2], NaN where unknown
 
 
 class PropagatedDepth(NamedTuple):
-    """Result of `propagate`.
+    """Result of `propagate`."""
 
-    Args:
-        fused: depth map of the new keyframe.
-        inherited: (H, W) bool, true where the depth contains information from the old map.
-    """
-
-    fused: DepthMap
-    inherited: Mask
+    fused: DepthMap  #: depth map of the new keyframe
+    inherited: Mask  #: (H, W) bool, true where the depth contains information from the old map
 
 
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:

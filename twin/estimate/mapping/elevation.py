@@ -206,7 +206,6 @@ def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
     Args:
         height: (rows, cols) heights [m]; NaN where unknown.
         variance: (rows, cols) variance of the difference from a level floor [m^2].
-        edge_fraction: standard deviation of a height due to lateral errors, as a fraction of the range of heights.
     """
     rows, cols = height.shape
     near, near_variance = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, variance))

@@ -33,17 +33,11 @@ _MIN_LEVEL = 4.0  # darkest mean colour that is used [grey levels]
 
 
 class PatchColours(NamedTuple):
-    """Mean colours of n patches of the floor in one image.
+    """Mean colours of n patches of the floor in one image."""
 
-    Args:
-        patch: (n,) number of each patch.
-        log_colour: (n, 3) natural logarithm of the mean colour of each patch [grey levels].
-        position: (n, 2) normalised image coordinates of the centre of each patch.
-    """
-
-    patch: NDArray[np.int64]
-    log_colour: Array
-    position: Array
+    patch: NDArray[np.int64]  #: (n,) number of each patch
+    log_colour: Array  #: (n, 3) natural logarithm of the mean colour of each patch [grey levels]
+    position: Array  #: (n, 2) normalised image coordinates of the centre of each patch
 
 
 def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
@@ -79,7 +73,6 @@ def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points
     Args:
         image: (H, W, 3) image.
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        rig: calibration of the image.
         points: (n, 3) centres of the patches in the axes of the map [m] (`patch_points`).
     """
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)

@@ -30,18 +30,12 @@ _FILLED_CELLS = 3
 
 
 class Views(NamedTuple):
-    """Images from which an orthomosaic is made.
+    """Images from which an orthomosaic is made."""
 
-    Args:
-        world_from_camera: (n, 4, 4) poses of the cameras in the axes of the map.
-        depth_m: (n,) median depth of the floor in each image [m].
-        exposures: exposure of each image, None where the cameras did not report it.
-        load: function that returns the image (H, W, 3) with a given number, from 0; its pixels are square.
-    """
-
-    world_from_camera: Array
-    depth_m: Array
-    exposures: Sequence[Exposure | None]
+    world_from_camera: Array  #: (n, 4, 4) poses of the cameras in the axes of the map
+    depth_m: Array  #: (n,) median depth of the floor in each image [m]
+    exposures: Sequence[Exposure | None]  #: exposure of each image, None where the cameras did not report it
+    #: function that returns the image (H, W, 3) with a given number, from 0; its pixels are square.
     load: Callable[[int], Image]
 
 
@@ -108,7 +102,6 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
     are NaN.
 
     Args:
-        elevation: the map.
         part: grid whose pixels divide the cells of the map; it may extend beyond the map.
     """
     grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
@@ -160,8 +153,6 @@ def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
     """Returns the grid of the pixels of a tile and of a margin of `_MARGIN_PX` on all its sides.
 
     Args:
-        grid: grid of the whole orthomosaic.
-        row, col: first pixel of the tile.
         side: side of a tile [px]; tiles at the east and south edges of the grid are smaller.
     """
     rows, cols = min(side, grid.rows - row), min(side, grid.cols - col)
@@ -173,7 +164,6 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
 
     Args:
         boxes: (n, 4) bounding boxes of the footprints, see `orthophoto.footprint`.
-        part: the part of the grid.
     """
     west, south, east, north = boxes.T
     east_m, south_m = part.west_m + part.cols * part.cell_m, part.north_m - part.rows * part.cell_m
@@ -186,10 +176,7 @@ def _prepared(
     """Yields the number and the colours of each of the images `numbers`, while a second thread prepares the next one.
 
     Args:
-        views: all images.
-        numbers: numbers of the images to prepare.
         factors: (n, 3) factors by which to multiply the images; not used with `restore`.
-        restore: see `orthomosaic`.
     """
 
     def colours(k: int) -> Colours:

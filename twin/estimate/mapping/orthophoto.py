@@ -38,21 +38,13 @@ _HIDDEN_SHARE = 0.02
 
 
 class OrthoLayers(NamedTuple):
-    """Part of an orthomosaic in progress.
+    """Part of an orthomosaic in progress."""
 
-    Args:
-        grid: grid of the pixels of this part.
-        height_m: (rows, cols) height of each pixel, NaN where unknown.
-        colour: (rows, cols, 3) sum of the colours, multiplied by their weights w / exp(-best).
-        weight: (rows, cols) sum of the weights w / exp(-best).
-        best: (rows, cols) smallest value of -log w so far; inf without a view.
-    """
-
-    grid: MapGrid
-    height_m: Map
-    colour: Map
-    weight: Map
-    best: Map
+    grid: MapGrid  #: grid of the pixels of this part
+    height_m: Map  #: (rows, cols) height of each pixel, NaN where unknown
+    colour: Map  #: (rows, cols, 3) sum of the colours, multiplied by their weights w / exp(-best)
+    weight: Map  #: (rows, cols) sum of the weights w / exp(-best)
+    best: Map  #: (rows, cols) smallest value of -log w so far; inf without a view
 
 
 def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
@@ -71,7 +63,6 @@ def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, 
 
     Args:
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        rig: calibration, with square pixels.
         heights_m: heights of the lowest and of the highest floor.
     """
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
@@ -86,15 +77,11 @@ def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, 
 
 
 class Colours(NamedTuple):
-    """Colours of an image.
+    """Colours of an image."""
 
-    Args:
-        rgb: (H, W, 3) float32 red, green and blue, 0 to 255 (values above are possible).
-        saturated: (H, W) uint8, 1 where the colour is not reliable because the image is saturated there or at a
-            neighbouring pixel, else 0.
-    """
-
-    rgb: Map
+    rgb: Map  #: (H, W, 3) float32 red, green and blue, 0 to 255 (values above are possible)
+    #: (H, W) uint8, 1 where the colour is not reliable because the image is saturated there or at a neighbouring pixel,
+    #: else 0.
     saturated: NDArray[np.uint8]
 
 
@@ -108,10 +95,7 @@ def add_view(
     """Adds an image to the layers, in place.
 
     Args:
-        layers: part of the orthomosaic.
-        colours: the image.
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        rig: calibration, with square pixels.
         heights_m: heights of the lowest and of the highest floor.
     """
     grid = layers.grid
@@ -138,7 +122,6 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
 
     Args:
         box_m: (4,) west, south, east, north [m] (`footprint`).
-        grid: grid of the pixels.
     """
     west, south, east, north = box_m
     rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
@@ -177,14 +160,12 @@ def _blend(
     """Adds the colours of an image to `colour`, `weight` and `best`, see `OrthoLayers`.
 
     Args:
-        height, colour, weight, best: see `OrthoLayers`.
         first, end, left, right: first row, end row, first column and end column of the pixels to process; ends are
             exclusive.
         steps: (3, 3) columns: displacement in camera axes per column, per row and per metre of height [m].
         origin: (3,) position of pixel (0, 0) at height 0, in camera axes [m].
         camera_at: (4,) x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].
         camera: focal length, column and row of the principal point [px].
-        image, clipped: see `Colours`.
         nearest: (H, W) smallest depth in each pixel of the image [m], from `_mark_nearest`.
     """
     focal, cx, cy = camera

@@ -24,28 +24,21 @@ LATERAL_SIGMA_PX = 0.35
 
 
 class HeightPatch(NamedTuple):
-    """Heights computed from one depth map, in a rectangular window of the grid.
+    """Heights computed from one depth map, in a rectangular window of the grid."""
 
-    Args:
-        row, col: row and column, in the grid, of the first (north-west) cell of the window.
-        height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
-        variance_m2: (rows, cols) variance due to errors of depth. These are independent between the heights that
-            different keyframes add to the map, because each depth enters the map only once.
-        systematic_m2: (rows, cols) variance due to the errors of the pose and to the smoothing of slopes, which are
-            common to all views.
-        pixel: (rows, cols, 2) position (u, v) of the cell centre in the image [px].
-        lateral_m: standard deviation of the lateral error at the mean depth of the depth map [m].
-        camera_m: (3,) position of the camera in the frame of the map [m]; None if it is not known.
-    """
-
+    #: row, col: row and column, in the grid, of the first (north-west) cell of the window.
     row: int
     col: int
-    height_m: Map
+    height_m: Map  #: (rows, cols) height at the cell centres, NaN where the surface does not cover them
+    #: (rows, cols) variance due to errors of depth. These are independent between the heights that different keyframes
+    #: add to the map, because each depth enters the map only once.
     variance_m2: Map
+    #: (rows, cols) variance due to the errors of the pose and to the smoothing of slopes, which are common to all
+    #: views.
     systematic_m2: Map
-    pixel: Map
-    lateral_m: float
-    camera_m: Array | None = None
+    pixel: Map  #: (rows, cols, 2) position (u, v) of the cell centre in the image [px]
+    lateral_m: float  #: standard deviation of the lateral error at the mean depth of the depth map [m]
+    camera_m: Array | None = None  #: (3,) position of the camera in the frame of the map [m]; None if it is not known
 
 
 def rasterise(
@@ -62,8 +55,6 @@ def rasterise(
         depth_map: depth in the left camera.
         world_from_camera: (4, 4) pose of the left camera.
         pose_cov: (6, 6) covariance of the pose [rotation, translation] (rad, m), in camera axes.
-        rig: calibration of the image, with square pixels.
-        grid: grid of the map.
 
     Returns:
         The patch, or None if the surface does not overlap the grid.
@@ -96,23 +87,15 @@ def rasterise(
 
 
 class _ViewGeometry(NamedTuple):
-    """Pose of the camera relative to the grid, and constants of the rasterisation.
+    """Pose of the camera relative to the grid, and constants of the rasterisation."""
 
-    Args:
-        position: (3,) position of the camera relative to the north-west corner of the grid at height 0 [m].
-        axis: (3,) optical axis in the world.
-        cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
-        cell_m: cell size [m].
-        focal_px: focal length [px].
-        max_jump: largest difference of inverse depth between the corners of a triangle [1/m]; with a larger one, the
-            triangle is omitted.
-    """
-
-    position: Array
-    axis: Array
-    cov: Array
-    cell_m: float
-    focal_px: float
+    position: Array  #: (3,) position of the camera relative to the north-west corner of the grid at height 0 [m]
+    axis: Array  #: (3,) optical axis in the world
+    cov: Array  #: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m)
+    cell_m: float  #: cell size [m]
+    focal_px: float  #: focal length [px]
+    #: largest difference of inverse depth between the corners of a triangle [1/m]; with a larger one, the triangle is
+    #: omitted.
     max_jump: float
 
 
@@ -127,7 +110,6 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 
     Args:
         bounds: (4,) lowest row and column, highest row and column, from `_grid_points`.
-        grid: grid of the map.
     """
     if not np.isfinite(bounds).all():
         return None
@@ -181,7 +163,6 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
     Args:
         points: (H, W, 3) points of the depth map in grid coordinates (`_grid_points`).
         depth, variance: (H, W) depth map [m] and its variance [m^2].
-        view: `_ViewGeometry`.
         row, col, height, height_variance, systematic, pixel: fields of the `HeightPatch`; the last four are changed in
             place.
     """

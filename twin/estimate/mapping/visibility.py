@@ -50,7 +50,6 @@ def hidden(
         camera: (rows, cols) row of `cameras_m` for each height; negative where it is not known: such a height passes.
         cameras_m: (n, 3) positions of cameras in the frame of the map [m].
         surface: heights of the surface (rows, cols) [m], NaN where there is none, and their variance [m2].
-        grid: grid of the map.
     """
     low, variance = surface
     if not len(cameras_m):
@@ -112,7 +111,6 @@ def _blocked(height, camera, cameras_m, low, variance, highest, corner):
     """Compiled kernel of `hidden`.
 
     Args:
-        height, camera, cameras_m, variance: see `hidden`.
         low: (rows, cols) from `_lowest`.
         highest: greatest height of the surface [m]; a line of sight is free above it.
         corner: west, north and cell size of the grid [m].

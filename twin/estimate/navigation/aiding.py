@@ -31,8 +31,6 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
 
     Args:
         nodes: nodes, in the order of the poses in the graph.
-        rig: believed calibration.
-        noise: believed noise of the navigation sensors.
     """
     return [
         _height_factors(nodes, noise),
@@ -159,7 +157,6 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
     Args:
         nodes: nodes, in the order of the poses in the graph.
-        rig: believed calibration.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     with_dvl = [(k, node.dvl_displacement) for k, node in enumerate(nodes) if node.dvl_displacement is not None]

@@ -15,41 +15,28 @@ from twin.kernels import kernel
 
 
 class DvlModel(NamedTuple):
-    """Error model of the DVL.
+    """Error model of the DVL."""
 
-    Args:
-        body_from_camera: (4, 4) pose of the left camera in the body.
-        step_s: time since the previous frame [s].
-        white_m2: variance of each component of a frame's displacement due to white noise [m^2].
-        scale_variance: variance of the scale error (a relative error of the velocity).
-    """
-
-    body_from_camera: Array
-    step_s: float
-    white_m2: float
-    scale_variance: float
+    body_from_camera: Array  #: (4, 4) pose of the left camera in the body
+    step_s: float  #: time since the previous frame [s]
+    white_m2: float  #: variance of each component of a frame's displacement due to white noise [m^2]
+    scale_variance: float  #: variance of the scale error (a relative error of the velocity)
 
 
 class DvlState(NamedTuple):
-    """Integration of DVL velocities since the last node. All arrays are modified in place.
+    """Integration of DVL velocities since the last node. All arrays are modified in place."""
 
-    Args:
-        velocity: (3,) last reading, in body axes [m/s]; NaN if the last frame had none.
-        node_from_body, rotation_cov: (3, 3), (3, 3) rotation of the body since the node, and its covariance in the body
-            axes at the node [rad^2].
-        displacement_m, cov: (3,), (3, 3) displacement of the body's origin since the node, in the body axes at the node
-            [m], and its covariance due to white noise [m^2].
-        path_m: (1,) path length since the node [m].
-        complete: (1,) false if the reading at the node or at a frame after it is missing.
-    """
-
-    velocity: Array
+    velocity: Array  #: (3,) last reading, in body axes [m/s]; NaN if the last frame had none
+    #: node_from_body, rotation_cov: (3, 3), (3, 3) rotation of the body since the node, and its covariance in the body
+    #: axes at the node [rad^2].
     node_from_body: Array
     rotation_cov: Array
+    #: displacement_m, cov: (3,), (3, 3) displacement of the body's origin since the node, in the body axes at the node
+    #: [m], and its covariance due to white noise [m^2].
     displacement_m: Array
     cov: Array
-    path_m: Array
-    complete: NDArray[np.bool_]
+    path_m: Array  #: (1,) path length since the node [m]
+    complete: NDArray[np.bool_]  #: (1,) false if the reading at the node or at a frame after it is missing
 
 
 class DvlIntegrator:
@@ -89,9 +76,6 @@ class DvlIntegrator:
     def displacement_at_node(self, number: int) -> Displacement | None:
         """Returns the displacement from the last node to the current node, and restarts the integration.
 
-        Args:
-            number: number of the current node.
-
         Returns:
             The displacement, or None if the reading at the last node or at a frame after it is missing.
         """
@@ -130,11 +114,8 @@ def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
     """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
     Args:
-        state: `DvlState`, modified in place.
-        model: `DvlModel`.
         a_from_b, cov: (4, 4), (6, 6) visual motion of the camera and its covariance.
         velocity: (3,) reading of this frame, in body axes [m/s]; NaN if there is none.
-        gates: `ReadingGates`, modified in place.
 
     Returns:
         The fused motion (4, 4) and its covariance (6, 6). If the reading of this frame or of the previous one is
@@ -192,8 +173,6 @@ def _accumulate(state, model, step, a_from_b, cov):
     """Adds a frame to the integration since the node.
 
     Args:
-        state: `DvlState`, modified in place.
-        model: `DvlModel`.
         step: (3,) displacement since the previous frame, in the body axes at the previous frame [m].
         a_from_b, cov: (4, 4), (6, 6) motion of the camera since the previous frame, and its covariance.
     """
@@ -234,7 +213,6 @@ def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera, gates):
         a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
         step, step_cov: (3,), (3, 3) displacement [m] in the axes of the body before the motion, and its covariance.
         body_from_camera: (4, 4) pose of the camera in the body.
-        gates: `ReadingGates`, modified in place.
 
     Returns:
         Motion (4, 4) and covariance (6, 6) after the update, and whether the displacement was used.

@@ -160,30 +160,20 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
 
 
 class ReadingGates(NamedTuple):
-    """States of the gates that reject readings, one row for each sensor in `SENSORS`. The arrays are modified in place.
+    """States of the gates that reject readings, one row for each sensor in `SENSORS`. The arrays are modified in place."""
 
-    Args:
-        counts: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used
-            although they contradict the pose.
-        residuals: (6, 3) residual of the last reading that contradicted the pose.
-    """
-
+    #: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used although
+    #: they contradict the pose.
     counts: NDArray[np.int64]
-    residuals: Array
+    residuals: Array  #: (6, 3) residual of the last reading that contradicted the pose
 
 
 class PressureAhrsModel(NamedTuple):
-    """Error model of the pressure sensor and the AHRS.
+    """Error model of the pressure sensor and the AHRS."""
 
-    Args:
-        camera_from_body: (4, 4) pose of the body in the camera.
-        pressure_m2: variance of the height measured by the pressure sensor [m^2].
-        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad].
-    """
-
-    camera_from_body: Array
-    pressure_m2: float
-    attitude_sigmas_rad: Array
+    camera_from_body: Array  #: (4, 4) pose of the body in the camera
+    pressure_m2: float  #: variance of the height measured by the pressure sensor [m^2]
+    attitude_sigmas_rad: Array  #: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad]
 
 
 @kernel
@@ -192,10 +182,8 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad, gates):
 
     Args:
         world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
-        model: `PressureAhrsModel`.
         height_m, rpy_rad: readings of the height of the left camera in the world [m], and of roll, pitch and yaw (3,)
             of the body in the world [rad]; NaN where there is no reading.
-        gates: `ReadingGates`, modified in place.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -246,8 +234,6 @@ def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, senso
     the same way, the pose is taken to be wrong: its covariance is increased by that of the error they imply.
 
     Args:
-        world_from_camera, prior, residual, jacobian, cov: see `kalman_update`.
-        gates: `ReadingGates`, modified in place.
         sensor: index of the sensor in `SENSORS`.
 
     Returns:
@@ -357,7 +343,6 @@ def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise)
     Args:
         rpy_rad: (3,) roll, pitch and yaw of the body [rad].
         camera_from_body: (4, 4) pose of the body in the camera.
-        noise: believed noise of the navigation sensors.
     """
     return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
 

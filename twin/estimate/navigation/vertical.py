@@ -28,17 +28,11 @@ _START_S = 1.0  # the mean specific force over this time gives the first attitud
 
 
 class InertialNoise(NamedTuple):
-    """Noise of an IMU in the terms of Kalibr; that of the accelerometer is far below the accelerations of a vehicle.
+    """Noise of an IMU in the terms of Kalibr; that of the accelerometer is far below the accelerations of a vehicle."""
 
-    Args:
-        rate_density: white noise of each angular rate [rad/s/sqrt(Hz)].
-        rate_walk: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)].
-        force_density: white noise of each specific force [m/s2/sqrt(Hz)].
-    """
-
-    rate_density: float
-    rate_walk: float
-    force_density: float
+    rate_density: float  #: white noise of each angular rate [rad/s/sqrt(Hz)]
+    rate_walk: float  #: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]
+    force_density: float  #: white noise of each specific force [m/s2/sqrt(Hz)]
 
 
 def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array]:
@@ -73,7 +67,6 @@ def _filtered(times_s, rates, forces, rate_density2, rate_walk2, force_density2)
 
     Args:
         times_s, rates, forces: (n,), (n, 3), (n, 3) readings.
-        rate_density2, rate_walk2, force_density2: squared noise densities; the last includes accelerations.
     """
     n = len(times_s)
     up, variance, bias = np.empty((n, 3)), np.empty(n), np.zeros(3)

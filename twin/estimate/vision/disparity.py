@@ -37,15 +37,10 @@ MAX_SIGMA_PX = 1.0
 
 
 class Disparity(NamedTuple):
-    """Disparity of every pixel of a left image, with its standard deviation.
+    """Disparity of every pixel of a left image, with its standard deviation."""
 
-    Args:
-        disparity_px: (H, W) float32 disparity [px], NaN where unknown.
-        sigma_px: (H, W) float32 standard deviation of the disparity [px], NaN where unknown.
-    """
-
-    disparity_px: Map
-    sigma_px: Map
+    disparity_px: Map  #: (H, W) float32 disparity [px], NaN where unknown
+    sigma_px: Map  #: (H, W) float32 standard deviation of the disparity [px], NaN where unknown
 
     def with_sigma_below(self, sigma_px: float | Map) -> Disparity:
         """Returns the disparity with the pixels whose standard deviation is not below `sigma_px` set to NaN.

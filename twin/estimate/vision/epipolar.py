@@ -47,34 +47,25 @@ class TwoView(NamedTuple):
 
     K is the camera matrix, f the focal length [px], b the baseline of the stereo pair [m]; the pose of the reference
     camera in the other camera has rotation R and translation t [m]. p is in homogeneous pixel coordinates.
-
-    Args:
-        matrix: (3, 3) K R K^-1, the infinite homography other_from_reference.
-        epipole: (3,) K t / (f b), the displacement in homogeneous pixel coordinates per pixel of disparity.
     """
 
-    matrix: Array
-    epipole: Array
+    matrix: Array  #: (3, 3) K R K^-1, the infinite homography other_from_reference
+    epipole: Array  #: (3,) K t / (f b), the displacement in homogeneous pixel coordinates per pixel of disparity
 
 
 class Refinement(NamedTuple):
-    """Result of `refine`.
+    """Result of `refine`."""
 
-    Args:
-        disparity_px: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed.
-        sigma_px: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard
-            deviation `PRIOR_PX` [px].
-        gain: (H, W) fraction of an error of the disparity that the last iteration removes: near 1 on texture, near 0
-            without texture.
-        noise: standard deviation of the image noise in the difference of both images [grey levels].
-        variance_inflation: factor by which the correlation of the noise of neighbouring pixels increases the variance;
-            not included in `sigma_px`.
-    """
-
-    disparity_px: Map
+    disparity_px: Map  #: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed
+    #: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard deviation
+    #: `PRIOR_PX` [px].
     sigma_px: Map
+    #: (H, W) fraction of an error of the disparity that the last iteration removes: near 1 on texture, near 0 without
+    #: texture.
     gain: Map
-    noise: float
+    noise: float  #: standard deviation of the image noise in the difference of both images [grey levels]
+    #: factor by which the correlation of the noise of neighbouring pixels increases the variance; not included in
+    #: `sigma_px`.
     variance_inflation: float
 
     @property
@@ -120,7 +111,6 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         reference, other: (H, W) float32 grey images.
         disparity_px: (H, W) float32 initial disparity [px], NaN where unknown.
         view: two-view geometry of the images.
-        iterations: number of Gauss-Newton iterations.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
     sigma, gain, mean_square, noise_variance, inflation, window_px = fitted, fitted, fitted, 1.0, 1.0, WINDOW_PX
@@ -164,7 +154,6 @@ def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
     Args:
         sigma: (H, W) standard deviation of the disparity [px].
         fitted: (H, W) disparity [px], `UNKNOWN_PX` where unknown.
-        window_px: the present value, which is returned if no disparity is known.
     """
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
@@ -365,8 +354,6 @@ def _fit_planes(disparity, residual, slope, locking, noise, window, support, pri
         disparity, residual, slope, locking: (H, W) results of `_balanced_warp` and the current disparity [px].
         noise: (H, W) noise variance [grey levels squared].
         window: (n,) weights of the window along one axis.
-        support: see `SUPPORT_PX`.
-        priors: see `_PRIORS`.
 
     Returns:
         Disparity at the centre (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (see

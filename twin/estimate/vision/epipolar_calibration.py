@@ -44,17 +44,11 @@ _REGIONS = (4, 3)  # regions of the image along columns and rows
 
 
 class RegionMeans(NamedTuple):
-    """Weighted sums of the row differences in each of m regions of the image, from which their means follow.
+    """Weighted sums of the row differences in each of m regions of the image, from which their means follow."""
 
-    Args:
-        weight: (m,) sum of the weights, which is the inverse variance of the mean row difference.
-        rows: (m,) weighted sum of the normalised row differences.
-        jacobian: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`).
-    """
-
-    weight: Array
-    rows: Array
-    jacobian: Array
+    weight: Array  #: (m,) sum of the weights, which is the inverse variance of the mean row difference
+    rows: Array  #: (m,) weighted sum of the normalised row differences
+    jacobian: Array  #: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`)
 
     def plus(self, region: NDArray[np.int64], weight: Array, rows: Array, jacobian: Array) -> RegionMeans:
         """Returns the sums with n more row differences.
@@ -108,7 +102,6 @@ class EpipolarCalibration:
 
         Args:
             points: matched points of the pair.
-            rig: calibration at the scale of the images.
             patch_px: side of the matched patches [px], for the correlation between overlapping patches.
         """
         x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]

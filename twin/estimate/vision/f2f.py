@@ -25,19 +25,12 @@ _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single 
 
 
 class _Reference(NamedTuple):
-    """Image with which frames are matched, and its points.
+    """Image with which frames are matched, and its points."""
 
-    Args:
-        image: (height, width) normalised left image.
-        pixels: (n, 2) positions of the points in the image [px].
-        measured: (n, 3) normalised (x, y, disparity) of the points.
-        cov: (n, 3, 3) covariance of each row of `measured`.
-    """
-
-    image: matching.Image
-    pixels: matching.Points
-    measured: Array
-    cov: Array
+    image: matching.Image  #: (height, width) normalised left image
+    pixels: matching.Points  #: (n, 2) positions of the points in the image [px]
+    measured: Array  #: (n, 3) normalised (x, y, disparity) of the points
+    cov: Array  #: (n, 3, 3) covariance of each row of `measured`
 
     def xyz(self, baseline_m: float) -> Array:
         """Returns the positions (n, 3) of the points in the axes of the reference camera [m]."""
@@ -46,21 +39,14 @@ class _Reference(NamedTuple):
 
 
 class _Located(NamedTuple):
-    """Pose of an image relative to the reference, from tracked points.
+    """Pose of an image relative to the reference, from tracked points."""
 
-    Args:
-        motion: pose of the image in the reference camera, its covariance and the number of inliers.
-        inlier_share: fraction of the tracked points that are inliers, 0 to 1.
-        tracked_share: fraction of the points of the reference that were tracked, 0 to 1.
-        residual_px: median distance between the tracked and the fitted positions of the points [px].
-        as_reference: the image with the tracked points, which can replace the reference.
-    """
-
+    #: pose of the image in the reference camera, its covariance and the number of inliers.
     motion: two_view_motion.Motion
-    inlier_share: float
-    tracked_share: float
-    residual_px: float
-    as_reference: _Reference
+    inlier_share: float  #: fraction of the tracked points that are inliers, 0 to 1
+    tracked_share: float  #: fraction of the points of the reference that were tracked, 0 to 1
+    residual_px: float  #: median distance between the tracked and the fitted positions of the points [px]
+    as_reference: _Reference  #: the image with the tracked points, which can replace the reference
 
 
 class FrameToFrame:

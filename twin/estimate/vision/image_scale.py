@@ -26,7 +26,6 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
     Args:
         left, right: (height, width, 3) images of a stereo pair.
         rig: calibration at full image size.
-        settings: settings of the estimators.
 
     Returns:
         Number of pixels along each side that are averaged to one.
@@ -50,9 +49,6 @@ def _matched_fraction(
 
     Args:
         left_rgb, right_rgb: (H, W, 3) images at full size.
-        binning: number of pixels along each side that are averaged to one.
-        rig: calibration of the binned images.
-        settings: settings of the estimators.
     """
     left, right = matching.gray(left_rgb, binning), matching.gray(right_rgb, binning)
     max_disparity_px = disparity.SearchRange(rig).max_disparity_px

@@ -24,12 +24,9 @@ DEGREE = 6
 
 
 class LightPattern(NamedTuple):
-    """Light pattern of a stereo camera.
+    """Light pattern of a stereo camera."""
 
-    Args:
-        left, right: (H, W) float32 pattern in each image [grey levels].
-    """
-
+    #: left, right: (H, W) float32 pattern in each image [grey levels].
     left: Map
     right: Map
 

@@ -36,17 +36,13 @@ _BLOCKS = (6, 8)  # rows and columns of image blocks; a block is about as wide a
 
 
 class Registration(NamedTuple):
-    """Result of a registration with the mosaic.
+    """Result of a registration with the mosaic."""
 
-    Args:
-        correction: pose of the camera at its estimated pose, relative to the camera at its predicted pose
-            (predicted_from_estimated); `n_points` is the number of compared cells, `residual` is in normalised grey
-            levels.
-        reference_keyframe: median of the keyframe numbers of the compared cells; at least half of the cells come from
-            this keyframe or older ones.
-    """
-
+    #: pose of the camera at its estimated pose, relative to the camera at its predicted pose
+    #: (predicted_from_estimated); `n_points` is the number of compared cells, `residual` is in normalised grey levels.
     correction: two_view_motion.Motion
+    #: median of the keyframe numbers of the compared cells; at least half of the cells come from this keyframe or older
+    #: ones.
     reference_keyframe: int
 
 
@@ -197,7 +193,6 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
         pose, inverse: (4, 4) world_from_camera and camera_from_world.
         focal, cx, cy: focal length, column and row of the principal point [px].
         west, south, cell: south-west corner of the window and cell size [m].
-        keyframe: number of the keyframe.
         brightness, height, number: (rows, cols) layers of the window, NaN in empty cells.
     """
     total = np.zeros(height.shape, np.float32)

@@ -50,38 +50,27 @@ _NUISANCES = 6  # brightness, contrast, and the linear gradients of both in colu
 
 
 class PatchTemplates(NamedTuple):
-    """Patches of one image at one pyramid level, prepared for matching: n patches of m pixels each.
+    """Patches of one image at one pyramid level, prepared for matching: n patches of m pixels each."""
 
-    Args:
-        half: half side of a patch, (side - 1) / 2 [px].
-        offset: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
-        energy: (n,) sum of squared deviations of the grey levels from the patch's mean; 0 if the patch cannot be
-            matched, because it is too uniform, or not inside the image with a margin of one pixel.
-        gradient: (n, 2, m) image gradient, with the nuisance parameters projected out.
-        nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients
-            of both with respect to column and row.
-    """
-
-    half: int
+    half: int  #: half side of a patch, (side - 1) / 2 [px]
+    #: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
     offset: Array
+    #: (n,) sum of squared deviations of the grey levels from the patch's mean; 0 if the patch cannot be matched,
+    #: because it is too uniform, or not inside the image with a margin of one pixel.
     energy: Array
-    gradient: NDArray[np.float32]
+    gradient: NDArray[np.float32]  #: (n, 2, m) image gradient, with the nuisance parameters projected out
+    #: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients of both
+    #: with respect to column and row.
     nuisance: NDArray[np.float32]
 
 
 class PatchMatches(NamedTuple):
-    """Positions of n patches in a target image.
+    """Positions of n patches in a target image."""
 
-    Args:
-        points: (n, 2) positions in the target [px].
-        ok: (n,) bool, true if the match converged and its correlation with the template is above 0.7.
-        cov: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the
-            noise of both, in the pixels and axes of the source image [px^2]; estimated from the texture and the
-            residuals.
-    """
-
-    points: Array
-    ok: NDArray[np.bool_]
+    points: Array  #: (n, 2) positions in the target [px]
+    ok: NDArray[np.bool_]  #: (n,) bool, true if the match converged and its correlation with the template is above 0.7
+    #: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the noise of
+    #: both, in the pixels and axes of the source image [px^2]; estimated from the texture and the residuals.
     cov: Array
 
 
@@ -325,8 +314,6 @@ def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance
     """Matches patches at one pyramid level.
 
     Args:
-        energies, gradients, nuisances, half: see `PatchTemplates`.
-        spline: spline coefficients of the target at this level.
         guess: (n, 2) expected positions [px of this level].
         warps: (n, 2, 2) derivative of target pixels with respect to source pixels.
         tolerance: the iteration ends at a step whose absolute column and row components sum to less [px of this level].

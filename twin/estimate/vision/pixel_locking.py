@@ -31,15 +31,10 @@ MAX_AMPLITUDE_PX = 3 * SIGMA_PX  #: largest plausible estimate of the amplitude
 
 
 class PixelLocking(NamedTuple):
-    """Derivatives of the measurements of n points in two stereo pairs with respect to the amplitude of pixel locking.
+    """Derivatives of the measurements of n points in two stereo pairs with respect to the amplitude of pixel locking."""
 
-    Args:
-        a: (n, 3) derivative of the normalised (x, y, disparity) in the earlier pair a [1/px].
-        b: (n, 3) the same in the later pair b.
-    """
-
-    a: Array
-    b: Array
+    a: Array  #: (n, 3) derivative of the normalised (x, y, disparity) in the earlier pair a [1/px]
+    b: Array  #: (n, 3) the same in the later pair b
 
 
 def shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:

@@ -19,28 +19,19 @@ _MIN_ROW_DIFFERENCES = 30  # with fewer points, the scatter of their row differe
 
 
 class StereoPoints(NamedTuple):
-    """Matched points of one stereo pair.
+    """Matched points of one stereo pair."""
 
-    Args:
-        pixels: (n, 2) whole pixels in the left image.
-        disparity_slope: (n, 2) gradient of the disparity at each point with respect to column and row [px/px].
-        mean_disparity_px: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of
-            the point and is used to predict whether the point lies inside another image.
-        measured: (n, 3) normalised (x, y, disparity), with x and y in the left image.
-        cov: (n, 3, 3) covariance of each point in `measured`.
-        xyz: (n, 3) positions in the axes of the left camera [m].
-        row_difference_px: (n,) row in the right image minus row in the left image [px].
-        noise_ratio: ratio of the measured to the expected standard deviation of the row differences
-            (`row_noise_ratio`); `cov` was computed with matching noise that is larger by this factor.
-    """
-
-    pixels: NDArray[np.float32]
-    disparity_slope: Array
+    pixels: NDArray[np.float32]  #: (n, 2) whole pixels in the left image
+    disparity_slope: Array  #: (n, 2) gradient of the disparity at each point with respect to column and row [px/px]
+    #: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of the point and is
+    #: used to predict whether the point lies inside another image.
     mean_disparity_px: Array
-    measured: Array
-    cov: Array
-    xyz: Array
-    row_difference_px: Array
+    measured: Array  #: (n, 3) normalised (x, y, disparity), with x and y in the left image
+    cov: Array  #: (n, 3, 3) covariance of each point in `measured`
+    xyz: Array  #: (n, 3) positions in the axes of the left camera [m]
+    row_difference_px: Array  #: (n,) row in the right image minus row in the left image [px]
+    #: ratio of the measured to the expected standard deviation of the row differences (`row_noise_ratio`); `cov` was
+    #: computed with matching noise that is larger by this factor.
     noise_ratio: float = 1.0
 
     def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
@@ -62,7 +53,6 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
     Args:
         left, right: (n, 2) positions in the left and in the right image [px].
         cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
-        rig: calibration, with square pixels.
 
     Returns:
         (n, 3) normalised (x, y, disparity) and (n, 3, 3) covariance.
@@ -86,7 +76,6 @@ def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> 
     Args:
         left, right: (n, 2) shifts of the positions in the left and in the right image [px].
         fused_cov: (n, 3, 3) covariance returned by `fuse`.
-        rig: calibration, with square pixels.
     """
     slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
     x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half

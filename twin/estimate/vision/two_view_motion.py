@@ -34,49 +34,38 @@ _MEDIAN_NORMALISED = {2: 0.680, 3: 0.888}  # sqrt(median of chi2 / 3) by degrees
 
 
 class Motion(NamedTuple):
-    """An estimated motion.
+    """An estimated motion."""
 
-    Args:
-        a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
-        cov: (6, 6) covariance of the motion [rotation, translation] (rad, m), in the axes of b.
-        n_points: number of inliers.
-        residual: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), divided by its
-            expected value (`pair_motion`), or in grey levels (`mosaic`); infinite for a predicted motion.
-        closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started;
-            None if it started from another motion.
-        disparity_offset: offset of all disparities, estimated from the points of two stereo pairs (`pair_motion`); None
-            if it is not estimated.
-    """
-
-    a_from_b: Array
-    cov: Array
-    n_points: int
+    a_from_b: Array  #: (4, 4) pose of the later camera b in the earlier camera a
+    cov: Array  #: (6, 6) covariance of the motion [rotation, translation] (rad, m), in the axes of b
+    n_points: int  #: number of inliers
+    #: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), divided by its expected
+    #: value (`pair_motion`), or in grey levels (`mosaic`); infinite for a predicted motion.
     residual: float
+    #: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started; None if it
+    #: started from another motion.
     closed_form: Array | None = None
+    #: offset of all disparities, estimated from the points of two stereo pairs (`pair_motion`); None if it is not
+    #: estimated.
     disparity_offset: DisparityOffset | None = None
 
 
 class PairMotionSettings(NamedTuple):
-    """Stochastic model and number of iterations of `pair_motion`.
+    """Stochastic model and number of iterations of `pair_motion`."""
 
-    Args:
-        common_sigma: standard deviation of the biases of x, y and disparity, each of which is the same at all points;
-            normalised. Their effect does not average out over the points.
-        variance_inflation: factor on the covariance for correlated points (`matching.variance_inflation`).
-        n_measured: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has
-            a large variance in `PairMeasurements.cov_a`.
-        iterations: number of Gauss-Newton iterations.
-        locking: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated
-            with the motion; None: the amplitude is not estimated.
-        measured_scatter: whether the covariance of the motion is computed from the residuals of the individual points
-            (`_scatter_cov`), instead of from the covariances of the measurements and a common scale.
-    """
-
+    #: standard deviation of the biases of x, y and disparity, each of which is the same at all points; normalised.
+    #: Their effect does not average out over the points.
     common_sigma: float = 0.0
-    variance_inflation: float = 1.0
+    variance_inflation: float = 1.0  #: factor on the covariance for correlated points (`matching.variance_inflation`)
+    #: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has a large
+    #: variance in `PairMeasurements.cov_a`.
     n_measured: int = 3
-    iterations: int = 6
+    iterations: int = 6  #: number of Gauss-Newton iterations
+    #: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated with the
+    #: motion; None: the amplitude is not estimated.
     locking: PixelLocking | None = None
+    #: whether the covariance of the motion is computed from the residuals of the individual points (`_scatter_cov`),
+    #: instead of from the covariances of the measurements and a common scale.
     measured_scatter: bool = False
 
 
@@ -108,7 +97,6 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
         points: (n, 3) positions in the earlier camera [m].
         observed: (n, 2) normalised coordinates in the later image.
         guess: (4, 4) initial pose of the later camera in the earlier one.
-        iterations: number of Gauss-Newton iterations.
 
     Returns:
         The motion, or None if there are too few points or inliers, or a point is behind the later camera.
@@ -205,25 +193,15 @@ def pair_motion(
 
 
 class _WeightedNormals(NamedTuple):
-    """Normal equations of `pair_motion` at one iteration, for p unknowns.
+    """Normal equations of `pair_motion` at one iteration, for p unknowns."""
 
-    Args:
-        observations: linearised observations of n points.
-        weight: (n,) robust weights.
-        scale: robust standard deviation of the residuals, divided by the expected one.
-        normal: (p, p) normal matrix, `prior` included.
-        prior: (p, p) prior information.
-        right: (p,) right-hand side.
-        bias_jacobian: (p, 3) derivative of `right` with respect to the common biases of x, y and disparity.
-    """
-
-    observations: LinearisedObservations
-    weight: Array
-    scale: float
-    normal: Array
-    prior: Array
-    right: Array
-    bias_jacobian: Array
+    observations: LinearisedObservations  #: linearised observations of n points
+    weight: Array  #: (n,) robust weights
+    scale: float  #: robust standard deviation of the residuals, divided by the expected one
+    normal: Array  #: (p, p) normal matrix, `prior` included
+    prior: Array  #: (p, p) prior information
+    right: Array  #: (p,) right-hand side
+    bias_jacobian: Array  #: (p, 3) derivative of `right` with respect to the common biases of x, y and disparity
 
 
 def _with_locking(
@@ -305,10 +283,6 @@ def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
     counts as 50 points. The prior information is added to M; multiplied by the squared scale of the residuals, it is
     added to S.
-
-    Args:
-        normals: normal equations at the last iteration.
-        n_measured: number of measured coordinates k per point in pair a: 3, or 2 without disparity.
     """
     observations, weight, scale = normals.observations, normals.weight, normals.scale
     size, n, p = observations.normalised_residual, int(np.count_nonzero(weight)), len(normals.normal)

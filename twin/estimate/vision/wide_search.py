@@ -36,7 +36,6 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
         range_px: largest error of a predicted position from which it is found [px].
         points: stereo points of the node.
         cov: (6, 6) covariance of the predicted motion [rotation, translation] (rad, m), in the axes of the node.
-        rig: calibration at the scale of the image.
     """
     x, y, disparity = np.ascontiguousarray(points.measured.T)
     depth_m = rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX / rig.focal_px)
@@ -76,7 +75,6 @@ def coarse_motion(
     Args:
         node, other: (H, W) grey levels of the left images.
         points: matched stereo points of the node.
-        rig: calibration at the scale of the images.
         patch_px: side of the patches, the largest distance of a feature from a stereo point [px].
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
@@ -119,10 +117,8 @@ def _at_features(points: StereoPoints, nearest: NDArray[np.int64], pixels: Array
     The disparity of a feature is extrapolated linearly from a stereo point, with the slope of the disparity there.
 
     Args:
-        points: stereo points.
         nearest: (n,) index of the nearest stereo point of each feature.
         pixels: (n, 2) positions of the features [px].
-        rig: calibration at the scale of the image.
     """
     offset_px = pixels - points.pixels[nearest]
     disparity = points.measured[nearest, 2] * rig.focal_px + (points.disparity_slope[nearest] * offset_px).sum(axis=1)
