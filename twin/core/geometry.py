@@ -119,10 +119,7 @@ def nearest_rigid(matrices: Array) -> Array:
 
 @kernel
 def _nearest_rigid(matrices):
-    """Compiled kernel of `nearest_rigid` for matrices (n, 4, 4).
-
-    Newton's iteration for the orthogonal polar factor, R <- (R + R^-T) / 2 (Higham 1986).
-    """
+    """Kernel of `nearest_rigid`: Newton's iteration R <- (R + R^-T) / 2 (Higham 1986)."""
     result = matrices.copy()
     for motion in result:
         change = np.inf

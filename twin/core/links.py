@@ -140,12 +140,10 @@ class Links(Sequence[Link]):
 
     @property
     def _table(self) -> NDArray[Any]:
-        """Returns all links as a structured array (n,)."""
         self._convert_pending()
         return self._rows.array
 
     def _convert_pending(self) -> None:
-        """Converts all links added since the last conversion to rows."""
         if self._pending:
             pending, self._pending = self._pending, []
             *columns, closed_forms, _ = zip(*pending, strict=True)

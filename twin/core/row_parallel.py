@@ -1,7 +1,6 @@
 """Parallel processing: an image in bands of rows, or the two images of a stereo pair at the same time.
 
-The result does not depend on the number of bands. Two images at a time take a tenth less processor time than the bands
-of one image after the other, as each processor keeps the data of its image in its caches, and waits only once.
+The result does not depend on the number of bands.
 """
 
 from __future__ import annotations
@@ -86,5 +85,4 @@ def _thread_pool(process: int) -> ThreadPoolExecutor:
 
 @cache
 def _n_processors() -> int:
-    """Returns the number of processors that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
