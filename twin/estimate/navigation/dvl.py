@@ -142,13 +142,11 @@ def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
 
 @kernel
 def _body_motion(a_from_b, body_from_camera):
-    """Returns the motion (4, 4) of the body that corresponds to a motion of the camera."""
     return geometry.compose(geometry.compose(body_from_camera, a_from_b), geometry.inverse(body_from_camera))
 
 
 @kernel
 def _length(step):
-    """Returns the length of a vector (3,)."""
     return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
@@ -170,12 +168,7 @@ def _step_cov(state, model, step):
 
 @kernel
 def _accumulate(state, model, step, a_from_b, cov):
-    """Adds a frame to the integration since the node.
-
-    Args:
-        step: (3,) displacement since the previous frame, in the body axes at the previous frame [m].
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera since the previous frame, and its covariance.
-    """
+    """Adds a frame, with displacement `step` (3,) in the body axes at the previous frame [m], to the integration."""
     state.path_m[0] += _length(step)
     node_from_body = state.node_from_body
     for i in range(3):

@@ -160,7 +160,7 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
 
 
 class ReadingGates(NamedTuple):
-    """States of the gates that reject readings, one row for each sensor in `SENSORS`. The arrays are modified in place."""
+    """States of the gates that reject readings, one row per sensor in `SENSORS`; arrays are modified in place."""
 
     #: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used although
     #: they contradict the pose.
@@ -259,7 +259,6 @@ def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, senso
 
 @kernel
 def _chi2(residual, cov):
-    """Returns the chi-square of a residual (k,) with covariance (k, k)."""
     return np.sum(residual * np.linalg.solve(cov, residual))
 
 
@@ -289,13 +288,7 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
 @kernel
 def _gain(prior, jacobian, cov):
-    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination.
-
-    Args:
-        prior: (6, 6) covariance P of the pose.
-        jacobian: (k, 6) derivative J of the predicted observation with respect to an increment of the pose.
-        cov: (k, k) covariance R of the observation.
-    """
+    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination; P `prior` (6, 6), R `cov` (k, k)."""
     size = len(cov)
     gain, innovation_cov = np.zeros((6, size)), cov.copy()
     for m in range(size):
@@ -323,11 +316,7 @@ def _gain(prior, jacobian, cov):
 
 @kernel
 def _correct(world_from_camera, prior, measured, cov, motion_cov):
-    """Compiled kernel of `PoseFilter.correct_pose`, without the gate; `prior` (6, 6) is the covariance of the pose.
-
-    Returns:
-        Chi-square of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the pose covariance.
-    """
+    """Kernel of `PoseFilter.correct_pose`: chi-square of the innovation, corrected pose, decrease of the covariance."""
     motion_cov = clip_covariance(motion_cov, prior, 0.0, 1.0)
     residual = geometry.log(geometry.inverse(world_from_camera) @ measured)
     inverse = np.linalg.inv(motion_cov + cov)
