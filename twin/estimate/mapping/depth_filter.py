@@ -1,9 +1,7 @@
-"""Kalman depth filter along the path: one scalar filter per pixel of the current keyframe.
+"""Kalman depth filter along the path: depth (H, W) [m] and variance [m^2] of each pixel of the newest keyframe.
 
-State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step
-propagates the state to the next keyframe and fuses it with the stereo depth of that keyframe and with the depth from
-the motion between the two keyframes. The depths of pixels that are not propagated are fused into the map (`elevation`),
-so that each depth enters the map exactly once.
+The depths of pixels that are not propagated to the next keyframe are fused into the map (`elevation`), so that each
+depth enters the map exactly once.
 """
 
 from __future__ import annotations
@@ -160,16 +158,7 @@ def _fuse(depth, variance, measured, measured_variance, gate):
 
 @kernel
 def _forward_project(old, rotation, translation, guess, camera):
-    """Fills unknown pixels of the new depth map `guess` (H, W), in place, from the old depth map.
-
-    A pixel receives the smallest depth, in the new camera, of the old points that project to it.
-
-    Args:
-        old: (H, W) old depth map [m].
-        rotation, translation: (3, 3), (3,) pose of the old camera in the new one [m].
-        guess: (H, W) depth map of the new image [m], NaN where unknown.
-        camera: focal length, column and row of the principal point [px].
-    """
+    """Fills unknown pixels of `guess` (H, W), in place, with the smallest depth of old points that project there."""
     height, width = old.shape
     focal, cx, cy = camera
     filled = np.zeros(old.shape, np.bool_)
@@ -190,10 +179,7 @@ def _forward_project(old, rotation, translation, guess, camera):
 
 @kernel(inline="always")
 def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
-    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth `depth` [m] in the first camera.
-
-    `rotation` and `translation` are the pose of the first camera in the other one.
-    """
+    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth [m] in the first."""
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],

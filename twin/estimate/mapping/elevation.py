@@ -122,11 +122,7 @@ class ElevationMapper:
         return np.where(_isolated(first, second), 1 - chosen, chosen)
 
     def _drop_hidden(self) -> None:
-        """Drops the hypotheses that their cameras cannot have seen.
-
-        The surface consists of the chosen hypotheses in large connected groups. Hypotheses in small groups are checked,
-        those that were chosen and the others.
-        """
+        """Drops hypotheses in small groups that their cameras cannot have seen behind large groups of chosen ones."""
         chosen, surface = self._choice(), None
         for which in (chosen, 1 - chosen):
             height, depth_m2, systematic, camera = (
@@ -183,10 +179,7 @@ def _isolated(height: Map, other: Map) -> Mask:
 
 
 def _small_groups(known: Mask) -> Mask:
-    """Returns a mask (rows, cols) of the known cells in connected groups of fewer than `MIN_CELLS` known cells.
-
-    Such groups are usually mismatches at image borders.
-    """
+    """Returns a mask of known cells in groups of fewer than `MIN_CELLS`, usually mismatches at image borders."""
     _, label, stats, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8), connectivity=8)
     small = np.asarray(stats)[:, cv2.CC_STAT_AREA] < MIN_CELLS
     return known & small[np.asarray(label, np.int64)]
@@ -228,17 +221,13 @@ def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
 
 
 def _trimmed_range(heights: Map) -> Map:
-    """Returns the range (n,) of the known heights in each row (n, 8) without the two highest and the two lowest ones.
-
-    It is 0 with fewer than six known heights.
-    """
+    """Returns the range (n,) of the known heights (n, 8) without the two highest and lowest; 0 with fewer than six."""
     ordered, known = np.sort(heights, axis=1), np.isfinite(heights).sum(axis=1)  # NaN last
     highest = np.take_along_axis(ordered, np.maximum(known - 3, 0)[:, None], axis=1)[:, 0]
     return np.where(known >= 6, highest - ordered[:, 2], np.float32(0))
 
 
 def _relief(height: Map) -> Map:
-    """Returns the range (rows, cols) of the known heights in the 3 x 3 cells around each cell [m]; 0 without any."""
     block = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)
     high = cv2.dilate(np.where(np.isnan(height), -far, height), block)
@@ -246,11 +235,7 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest absolute second difference (rows, cols) of height across each cell, over four directions [m].
-
-    Directions in which a height is unknown are left out; the result is 0 if all are, and at the edge of the grid. All
-    cells of a grid with fewer than three rows or columns are at its edge.
-    """
+    """Returns the largest absolute second difference (rows, cols) of height over four directions [m]; 0 where unknown."""
     step = np.zeros_like(height)
     if min(height.shape) < 3:
         return step
@@ -266,11 +251,7 @@ def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
 ):  # fmt: skip
-    """Sets to NaN, in place, the cells of `remaining` (rows, cols) that were propagated to the next keyframe.
-
-    The arguments from `row` to `systematic` and from `new_row` to `pixel` are fields of the patches of this keyframe
-    and of the next one (`HeightPatch`); `inherited` is as in `ElevationMapper.fuse`.
-    """
+    """Sets the cells of `remaining` that were propagated to the next keyframe to NaN (see `ElevationMapper.fuse`)."""
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col
@@ -320,9 +301,8 @@ def _fuse_cells(
 
 @kernel
 def _add_colours(row, col, height, pixel, rgb, gain, colour):
-    """Adds the weighted image colour of each cell with a height to `colour` (grid rows, grid cols, 4).
-
-    The last channel of `colour` is the sum of the weights. `colour` is modified in place.
+    """Adds the weighted image colour of each cell with a height to `colour` (rows, cols, 4); the last channel is the
+    weight.
     """
     rows, cols = rgb.shape[0] - 1, rgb.shape[1] - 1
     for i in range(height.shape[0]):

@@ -107,7 +107,6 @@ def build_map(
 
 
 def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    """Yields the items in order, while a second thread computes the following item."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -124,7 +123,6 @@ def gray_levels(pair: KeyframeImages) -> tuple[Map, Map]:
 def _measure_depth(
     pair: KeyframeImages, search_range: disparity.SearchRange, rig: StereoRig, pattern: LightPattern | None
 ) -> _StereoDepth:
-    """Computes the stereo depth of a pair and updates the search range for the next pair."""
     left, right = gray_levels(pair)
     if pattern is not None:
         left, right = left - pattern.left, right - pattern.right

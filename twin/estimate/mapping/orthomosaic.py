@@ -1,9 +1,7 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
-It is made in tiles of about 2048 x 2048 pixels (`twin.core.orthomosaic.tile_side_px`), one after the other. An image is
-read once for each tile that it touches, and once more if its exposure has to be estimated. One tile and two images are
-in memory at a time, whatever the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`)
-take 24 bytes per pixel, 114 MB for a whole tile.
+It is made tile by tile (`twin.core.orthomosaic.tile_side_px`); one tile (24 bytes per pixel) and two images are in
+memory at a time, whatever the size of the survey.
 """
 
 from __future__ import annotations
@@ -120,9 +118,8 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
 
 
 def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
-    """Returns heights with NaN replaced by the nearest known height, and a mask of known cells and small holes.
-
-    Without a known height, all heights are 0 and the mask is false.
+    """Returns heights with NaN replaced by the nearest known one (0 if none), and a mask of known cells and small
+    holes.
     """
     unknown = np.isnan(height)
     if unknown.all():
@@ -150,21 +147,13 @@ def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> 
 
 
 def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
-    """Returns the grid of the pixels of a tile and of a margin of `_MARGIN_PX` on all its sides.
-
-    Args:
-        side: side of a tile [px]; tiles at the east and south edges of the grid are smaller.
-    """
+    """Returns the grid of the pixels of a tile (smaller at the east and south edges) and of its margin of `_MARGIN_PX`."""
     rows, cols = min(side, grid.rows - row), min(side, grid.cols - col)
     return window(grid, row - _MARGIN_PX, col - _MARGIN_PX, rows + 2 * _MARGIN_PX, cols + 2 * _MARGIN_PX)
 
 
 def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
-    """Returns the indices of the images whose footprints overlap a part of the grid.
-
-    Args:
-        boxes: (n, 4) bounding boxes of the footprints, see `orthophoto.footprint`.
-    """
+    """Returns the indices of the images whose footprints `boxes` (n, 4) overlap a part of the grid."""
     west, south, east, north = boxes.T
     east_m, south_m = part.west_m + part.cols * part.cell_m, part.north_m - part.rows * part.cell_m
     return np.flatnonzero((west < east_m) & (east > part.west_m) & (south < part.north_m) & (north > south_m))
@@ -173,11 +162,7 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
 def _prepared(
     views: Views, numbers: NDArray[np.int64], factors: Array, restore: Restore | None
 ) -> Iterator[tuple[int, Colours]]:
-    """Yields the number and the colours of each of the images `numbers`, while a second thread prepares the next one.
-
-    Args:
-        factors: (n, 3) factors by which to multiply the images; not used with `restore`.
-    """
+    """Yields numbers and colours of the images, the next one prepared by a second thread; `factors` (n, 3): exposure."""
 
     def colours(k: int) -> Colours:
         image = views.load(k)

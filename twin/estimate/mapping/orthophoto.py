@@ -1,15 +1,9 @@
 """Rectification of single images onto the pixels of an orthomosaic, by the estimated heights and poses.
 
-Every pixel of the orthomosaic is projected, at its height, into the image, whose colour there is interpolated
-bicubically. Where several images show a pixel, their colours are averaged with the weights
-
-    w = r exp(-K tan^2(n)),
-
-with n the angle of the line of sight from the vertical (zero at nadir) and r a factor that rises from 0.001 at the
-border of the image to 1 at a distance of 12 pixels from it. K (`SHARPNESS`) is so large that a pixel shows the view
-nearest to nadir, except in a narrow seam between two views, where they are blended. Near nadir, errors of the height
-displace a colour least. The weight of a saturated pixel is multiplied by exp(-60), so that it is used only where other
-images do not show the floor, or show it far from nadir. An image is not used for pixels hidden in it by nearer floor.
+The colours of all views of a pixel are averaged with the weights w = r exp(-K tan^2(n)): n is the angle of the line of
+sight from the vertical; r rises from 0.001 at the border of the image to 1 at 12 pixels from it; K (`SHARPNESS`) is so
+large that the view nearest to nadir, where errors of height displace least, dominates. Saturated pixels have exp(-60)
+times the weight. Pixels hidden by nearer floor are not used.
 """
 
 from __future__ import annotations
@@ -118,10 +112,8 @@ def add_view(
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
-    """Returns first row, end row, first column and end column of the pixels of a grid within a box; ends are exclusive.
-
-    Args:
-        box_m: (4,) west, south, east, north [m] (`footprint`).
+    """Returns first row, end row, first column and end column of the pixels within a box (west, south, east, north)
+    [m].
     """
     west, south, east, north = box_m
     rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
@@ -131,10 +123,9 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
 
 @kernel(error_model="numpy")
 def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
-    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each pixel of an image shows.
+    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each image pixel shows, inf if none.
 
-    An orthomosaic pixel is shown by the 2 x 2 image pixels around its projection. `nearest` remains infinite where no
-    orthomosaic pixel is shown. The other arguments are those of `_blend`.
+    An orthomosaic pixel is shown by the 2 x 2 image pixels around its projection.
     """
     focal, cx, cy = camera
     for i in range(first, end):

@@ -106,11 +106,7 @@ def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """Returns first row, first column, number of rows and number of columns of the cells within `bounds`; None if none.
-
-    Args:
-        bounds: (4,) lowest row and column, highest row and column, from `_grid_points`.
-    """
+    """Returns first row, first column, numbers of rows and columns of the cells within `bounds`; None if none."""
     if not np.isfinite(bounds).all():
         return None
     low = np.maximum(np.ceil(bounds[:2]), 0)
@@ -121,17 +117,8 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 
 @kernel
 def _grid_points(depth, pose, camera, west, north, cell):
-    """Converts a depth map to grid coordinates.
-
-    Args:
-        depth: (H, W) depth [m].
-        pose: (4, 4) world_from_camera.
-        camera: focal length, column and row of the principal point [px].
-        west, north, cell: north-west corner and cell size of the grid [m].
-
-    Returns:
-        Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; bounds (4,) of the
-        points: lowest row and column, highest row and column.
+    """Returns points (H, W, 3) as row, column (0 at the centre of the first cell) and height [m], and their bounds
+    (4,).
     """
     (focal, cx, cy), (height, width) = camera, depth.shape
     points = np.empty((height, width, 3))
@@ -152,20 +139,12 @@ def _grid_points(depth, pose, camera, west, north, cell):
 
 @kernel(inline="always")
 def _contains_integer(a, b, c, e):
-    """Returns whether an integer lies between the smallest and the largest of four numbers."""
     return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
 
 
 @kernel
 def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
-    """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch.
-
-    Args:
-        points: (H, W, 3) points of the depth map in grid coordinates (`_grid_points`).
-        depth, variance: (H, W) depth map [m] and its variance [m^2].
-        row, col, height, height_variance, systematic, pixel: fields of the `HeightPatch`; the last four are changed in
-            place.
-    """
+    """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch, in place."""
     out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):
@@ -186,10 +165,7 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
-    """Writes the cells inside the triangle of the pixels a, b, c, given as rows v and columns u, unless it is omitted.
-
-    Where triangles overlap, the greatest height is kept. The other arguments are those of `_triangles`.
-    """
+    """Writes the cells in the triangle of the pixels a, b, c (rows v, columns u); the greatest height is kept."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)

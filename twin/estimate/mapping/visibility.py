@@ -1,8 +1,6 @@
 """Heights of a map that their camera cannot have seen, because the line of sight passes below the mapped surface.
 
-A mismatch of stereo is usually too far away: where the true match lies outside the other image, or the floor has little
-texture. A group of such pixels becomes an island in the map, far below the surface around it. A real pit is seen
-through its opening, so that no line of sight to its floor passes below the surface beside it.
+A mismatch of stereo is usually too far away; a group of them becomes an island far below the surface around it.
 """
 
 from __future__ import annotations
