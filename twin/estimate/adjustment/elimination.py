@@ -1,8 +1,7 @@
 """Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
-The elimination order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path of the elimination tree
-whose columns have nearly the same sparsity pattern below the diagonal form a supernode. The nodes of a supernode are
-renumbered to be consecutive, and their columns are stored as one dense matrix, a panel.
+The order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path of the elimination tree with nearly the
+same pattern below the diagonal form a supernode, whose columns are one dense matrix, a panel.
 """
 
 from __future__ import annotations
@@ -90,7 +89,6 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
 
 
 def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:
-    """Returns the position (n,) of each node in the minimum-degree order."""
     off = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     pattern = ((off + off.T) > 0).astype(np.float64)
     dominant = sparse.diags_array(np.asarray(pattern.sum(axis=1)).ravel() + 1.0)
@@ -124,13 +122,11 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
 
 @kernel
 def _fill_in(n, start, later):
-    """Returns the nonzero rows below the diagonal of each column of the factor (Davis 2006, chapter 4).
+    """Returns the rows below the diagonal of each column k of the factor: below[at[k] : at[k + 1]] (Davis 2006, chapter
+    4).
 
-    They are the later neighbours of node k in the matrix, later[start[k] : start[k + 1]], and the rows of the columns
-    of its children in the elimination tree, except k itself (the fill-in).
-
-    Returns:
-        The arrays `at` (n + 1,) and `below`: the rows of column k are below[at[k] : at[k + 1]], ascending.
+    They are the later neighbours later[start[k] : start[k + 1]] of node k, and the rows of its children in the
+    elimination tree.
     """
     at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
     last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists

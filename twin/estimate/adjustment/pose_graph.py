@@ -1,14 +1,11 @@
 """Factor graph of poses and its maximum-likelihood solution, the core of the global alignment.
 
-The cost F of the poses X is the sum of rho(r) over the binary factors and of r^2 / 2 over the unary factors, where r is
-the norm of a factor's residual, whitened by the covariance of that residual. The residual of a measured motion Z_ij is
-log(Z_ij^-1 X_i^-1 X_j). rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt
-damping after a step that increased the cost. The increment d of a pose X is a motion in the camera's own axes: X exp(d)
-replaces X.
+The cost F is the sum of rho(r) over the binary and of r^2 / 2 over the unary factors, with r the norm of a whitened
+residual, log(Z_ij^-1 X_i^-1 X_j) for a measured motion Z_ij, and rho either r^2 / 2 or Huber's loss. It is minimised by
+Gauss-Newton, with Levenberg-Marquardt damping after a step that increased F; X exp(d) replaces X.
 
-One scalar parameter may be shared by binary factors (the scale error of the DVL); F then includes its zero-mean
-Gaussian prior. The parameter adds one row and one column, the border, to the normal equations of the poses. The
-bordered system is solved by the Schur complement of the block of the poses.
+A scalar with a zero-mean prior may be shared by binary factors (scale error of the DVL). It adds a row and a column,
+the border, to the normal equations, which the Schur complement of the block of the poses solves.
 """
 
 from __future__ import annotations
@@ -213,7 +210,6 @@ def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damp
 
 
 def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
-    """Returns cost, residuals, robust weights and squared norms of a factor graph at a state."""
     cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
     unary, binary, chi2 = [], [], []
     for factors in graph.unary:
@@ -230,10 +226,7 @@ def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
 
 
 def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Returns the losses rho (m,) and robust weights (m,), given the squared norms (m,) of the whitened residuals.
-
-    `huber` is the norm above which the loss is linear; None: least squares.
-    """
+    """Returns losses rho (m,) and robust weights (m,) of squared whitened norms; `huber` None: least squares."""
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)
@@ -319,12 +312,8 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
 
 @kernel
 def _add_border(first, second, by_j, weighted, i_from_j, border):
-    """Adds the mixed second derivatives (poses and shared parameter) of binary factors to the border.
-
-    Args:
-        weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
-        i_from_j: (m, 4, 4) poses of camera j in camera i.
-        border: (n, 6), changed in place.
+    """Adds the mixed derivatives of poses and shared parameter to `border`; `weighted` (m, d): weighted shared
+    Jacobian.
     """
     for m in range(len(first)):
         slope = np.zeros(6)
@@ -395,7 +384,6 @@ def pose_residual_jacobians(residuals):
 
 @kernel
 def _retract(poses, increments):
-    """Returns the poses (n, 4, 4), each moved by its increment (n, 6) in its own axes."""
     moved = np.empty_like(poses)
     for k in range(len(poses)):
         geometry.copy_into(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
@@ -404,7 +392,6 @@ def _retract(poses, increments):
 
 @kernel
 def _relative_poses(poses, i, j):
-    """Returns the relative poses i_from_j (m, 4, 4) of the pairs of poses with the indices i and j (m,)."""
     relative = np.empty((len(i), 4, 4))
     for k in range(len(i)):
         geometry.copy_into(relative[k], geometry.compose(geometry.inverse(poses[i[k]]), poses[j[k]]))
