@@ -138,23 +138,12 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) of a disparity from the measurement alone, sigma / gain.
-
-    Where there is little texture, the result is too large, because `sigma` includes the error due to the prior.
-
-    Args:
-        sigma, gain: `Refinement.sigma_px`, which includes the prior, and `Refinement.gain`.
-    """
+    """Returns the standard deviation (H, W) from the measurement alone, sigma / gain; too large over little texture."""
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
 def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
-    """Returns the standard deviation [px] of the Gaussian window of the next iteration, which is larger for more noise.
-
-    Args:
-        sigma: (H, W) standard deviation of the disparity [px].
-        fitted: (H, W) disparity [px], `UNKNOWN_PX` where unknown.
-    """
+    """Returns the standard deviation [px] of the window of the next iteration, larger for more noise."""
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
         return window_px
@@ -203,16 +192,12 @@ def _mean(image: Map) -> Map:
 
 
 def _gaussian_window(window_px: float) -> Map:
-    """Returns the weights (n,) of a Gaussian window along one axis, with the standard deviation `window_px`."""
     half = int(np.ceil(2 * window_px))
     return np.exp(-0.5 * (np.arange(-half, half + 1) / window_px) ** 2).astype(np.float32)
 
 
 def _noise_variance(residual: Map, visible: Mask) -> float:
-    """Returns a robust variance of the residuals from their median absolute value, at least `MIN_NOISE_VARIANCE`.
-
-    Every second pixel of every second row is used. The result is 1 if fewer than 100 of them are visible.
-    """
+    """Returns a robust variance of the residuals, at least `MIN_NOISE_VARIANCE`; 1 if fewer than 100 are visible."""
     sample = np.abs(residual[::2, ::2][visible[::2, ::2]])
     if sample.size < 100:
         return 1.0

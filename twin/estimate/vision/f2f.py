@@ -153,7 +153,6 @@ class FrameToFrame:
         return geometry.transport_covariance(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
 
     def _set_reference(self, reference: _Reference) -> None:
-        """Makes the current frame, with these points, the reference."""
         self.reference, self._common_cov = reference, np.zeros((6, 6))
         self.filter.restart()
 
@@ -175,11 +174,7 @@ class FrameToFrame:
         return int(np.clip(levels, 1, _MOST_LEVELS))
 
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> _Located | None:
-        """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
-
-        Returns:
-            The pose with the tracked points, or None if too few points are tracked or are inliers.
-        """
+        """Returns the pose of an image in the reference camera with the tracked points; None if too few are inliers."""
         current_from_reference = geometry.inverse(predicted)
         points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))
         guess = self.rig.project(points).astype(np.float32)

@@ -1,9 +1,7 @@
 """Light pattern of the cameras: the smooth part of the images that is due to lamps and backscatter.
 
-The pattern moves with the cameras, not with the floor. In turbid water its gradient exceeds that of the texture of the
-floor, above all at the edge of the area that the lamps light. Dense matching would then find the disparity of the
-pattern instead of that of the floor. The pattern is therefore estimated from the images of many keyframes and
-subtracted before dense matching, unless the texture dominates the pattern.
+It moves with the cameras. In turbid water dense matching would find its disparity instead of that of the floor, so it
+is estimated from many keyframes and subtracted, unless the texture dominates.
 """
 
 from __future__ import annotations
@@ -92,11 +90,7 @@ def _fitting_matrix(n: int) -> Array:
 
 
 def _images_per_independent_image(deviation: Array) -> float:
-    """Returns (1 + r) / (1 - r), with r the correlation of consecutive keyframes, limited to 0 <= r <= 0.9.
-
-    Args:
-        deviation: (n, 2, d, d) coefficients of the keyframes, minus their means.
-    """
+    """Returns (1 + r) / (1 - r), r the correlation (0 to 0.9) of consecutive keyframes' `deviation` (n, 2, d, d)."""
     power = np.sum(deviation[1:] ** 2 + deviation[:-1] ** 2) / 2
     r = float(np.clip(np.sum(deviation[1:] * deviation[:-1]) / max(power, 1e-12), 0.0, 0.9))
     return (1 + r) / (1 - r)

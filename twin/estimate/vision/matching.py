@@ -209,10 +209,7 @@ def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
 
 @kernel
 def _summed_overlap(points, patch):
-    """Returns the sum of the overlaps, 0 to 1, over all ordered pairs of patches; a patch also pairs with itself.
-
-    `points` (n, 2) are the centres and `patch` is the side of the patches [px].
-    """
+    """Returns the sum of the overlaps over all ordered pairs of patches of side `patch` [px], each with itself too."""
     total = float(len(points))
     for i in range(len(points)):
         for j in range(i):

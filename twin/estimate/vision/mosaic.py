@@ -1,14 +1,9 @@
 """Local 2.5-D mosaic, and the registration of frames with it (F2M) in six degrees of freedom over any relief.
 
-The mosaic is a raster in world coordinates. Each cell has a normalised brightness, an elevation, and the number of the
-keyframe from which both come. Cells are not overwritten, because the pose of the oldest keyframe has drifted least. A
-frame is registered by direct image alignment: textured cells are projected into the frame, and the pose is adjusted to
-minimise the differences of brightness (Gauss-Newton with Huber weights).
-
-The residuals are caused less by pixel noise than by errors of height and by uneven illumination, which are correlated
-between neighbouring cells. Over a floor of coarse texture, with cells treated as independent, the computed standard
-deviation of the rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore computed as for
-clustered data (Liang & Zeger 1986), with blocks of the image as clusters.
+A cell has brightness, elevation and number of the oldest keyframe that saw it, whose pose has drifted least. Textured
+cells are aligned directly with the frame (Gauss-Newton, Huber weights). Their residuals are correlated (heights,
+light): with independent cells, the computed standard deviation of the rotation was 0.4 mrad at an error of 1.4 to 6
+mrad, so the covariance is that of clustered data (Liang & Zeger 1986), with image blocks as clusters.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
 """Linearised observation equations of camera motion, in one image and between two stereo pairs (compiled).
 
-Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f, with the principal point (cx, cy) and the focal
-length f [px]. Disparity is also divided by f, so depth = baseline / disparity. The functions are compiled, because a
-keyframe with five links needs 30 least-squares solutions (six iterations per link) with 500 points each.
+Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f, and disparity / f: depth = baseline / disparity.
 """
 
 from __future__ import annotations

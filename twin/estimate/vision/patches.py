@@ -1,25 +1,10 @@
 """Registration of small image patches between images, to a few thousandths of a pixel.
 
-Systematic errors of patch matching, measured against the simulated truth, and their remedies here:
-
-- A patch on a slanted surface appears sheared in the other image. A square window there covers a different part of
-  the floor, with different relief, which biased the motion between legs by 0.4 mrad with patches of 21 px. Each patch
-  is therefore warped according to the plane that stereo measures around its point, so that it covers the same part of
-  the floor in all images.
-- The lamps move with the vehicle, so the illumination of a point changes between images. If the change varies across
-  the patch, the match is shifted by about the squared correlation length of the texture times the gradient of the
-  change (0.01 px on a lamp-lit reef, with the same sign at every step). Linear gradients of brightness and of contrast
-  over the patch are therefore estimated as nuisance parameters.
-- Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. With cubic
-  B-splines the bias is 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images
-  (`matching.gray`).
-- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
-  cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 to 0.6 mrad relative to the
-  next. Grey levels are therefore matched without normalisation; the nuisance parameters account for differences of
-  brightness and contrast.
-
-Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), from
-coarse to fine pyramid levels, with cubic B-spline interpolation (Unser 1999).
+Inverse compositional Gauss-Newton, coarse to fine (Baker & Matthews 2004), with cubic B-splines (Unser 1999). Remedies
+of systematic errors: each patch is warped by the plane that stereo measures around its point (unwarped, slopes bias the
+rotation between legs by 0.4 mrad); gradients of brightness and contrast are nuisance parameters that are projected out,
+because the lamps move (0.01 px); B-splines halve the bias of cubic convolution (0.014 px); grey levels are not
+normalised locally (0.015 px near the border).
 """
 
 from __future__ import annotations
@@ -156,7 +141,6 @@ def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floati
 
 @kernel
 def _slope(disparity, points, half):
-    """Compiled kernel of `disparity_slope`."""
     out = np.zeros((len(points), 2))
     for k in range(len(points)):
         u0, v0 = points[k]
@@ -196,10 +180,7 @@ def _slope(disparity, points, half):
 
 @kernel
 def _extract(source, centres, half):
-    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches at `centres` (n, 2) [px].
-
-    See `PatchTemplates`; gradient and basis are undefined where the energy is 0.
-    """
+    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches, see `PatchTemplates`."""
     count, m = len(centres), (2 * half + 1) ** 2
     energy = np.zeros(count)
     gradient, nuisance = np.empty((count, 2, m), np.float32), np.empty((count, _NUISANCES, m), np.float32)

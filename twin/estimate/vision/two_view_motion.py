@@ -207,10 +207,7 @@ class _WeightedNormals(NamedTuple):
 def _with_locking(
     observations: LinearisedObservations, locking: PixelLocking, amplitude_px: float
 ) -> LinearisedObservations:
-    """Returns the observations with the amplitude of pixel locking as seventh unknown, linearised at `amplitude_px`.
-
-    The residuals are reduced by the effect of this amplitude.
-    """
+    """Returns the observations with pixel locking as seventh unknown, linearised and reduced at `amplitude_px`."""
     moved = np.einsum("nij,nj->ni", observations.jacobian_point, locking.b)
     derivative = locking.a - moved  # of the predicted measurements with respect to the amplitude
     residual = observations.residual - derivative * amplitude_px

@@ -112,14 +112,7 @@ def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64]
 
 
 def _at_features(points: StereoPoints, nearest: NDArray[np.int64], pixels: Array, rig: StereoRig) -> Array:
-    """Returns the positions (n, 3) [m] of features at `pixels` (n, 2), in the axes of the left camera.
-
-    The disparity of a feature is extrapolated linearly from a stereo point, with the slope of the disparity there.
-
-    Args:
-        nearest: (n,) index of the nearest stereo point of each feature.
-        pixels: (n, 2) positions of the features [px].
-    """
+    """Returns the positions (n, 3) [m] of features; disparity is extrapolated from the `nearest` (n,) stereo points."""
     offset_px = pixels - points.pixels[nearest]
     disparity = points.measured[nearest, 2] * rig.focal_px + (points.disparity_slope[nearest] * offset_px).sum(axis=1)
     depth_m = rig.focal_px * rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX)
