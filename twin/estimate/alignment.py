@@ -1,8 +1,7 @@
 """Global alignment: maximum-likelihood poses of the nodes, given the links between them and the sensor readings.
 
-Eliminating the Lagrange multipliers of the mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) leaves a
-least-squares problem with one residual block per link. Together with the readings of the navigation sensors, it is
-solved as a factor graph with a Huber loss on the links. Outlier links are removed and reported.
+The mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) reduces to one residual block per link; solved as a
+factor graph with a Huber loss on the links. Outlier links are removed and reported.
 """
 
 from __future__ import annotations
@@ -174,10 +173,7 @@ def _factor_graph(
 
 
 def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
-    """Returns the marginal covariances (n, 6, 6) of the n nodes, in the order of `index_of`.
-
-    They are zero for nodes that are not in `numbers`; None computes all of them.
-    """
+    """Returns the marginal covariances (n, 6, 6) of the nodes, zero for those not in `numbers` (None: all)."""
     if numbers is None:
         return solution.marginals_in_place()
     covs = np.zeros((len(index_of), 6, 6))

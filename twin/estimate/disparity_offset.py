@@ -1,11 +1,7 @@
-"""Offset that all disparities share, estimated from the motions between keyframes.
+"""Offset that all disparities share (principal point, yaw of a camera), from the motions between keyframes.
 
-An error in the column of a camera's principal point adds the same offset to all disparities and does not change the
-rows of points. A small yaw of one camera has nearly the same effect. Depths, and with them the lengths of all motions,
-are then wrong. Over a floor with relief the offset is observable: the image motions of near and far points must be
-proportional to their disparities, and are not if there is an offset. Over a level floor the offset is not observable:
-errors of a hundredth of a pixel that all matches share then appear as an offset of several pixels, and the scatter of
-the offsets from single links does not reveal these errors.
+It is observable over relief, where the image motions of near and far points must be proportional to their disparities.
+Over a level floor it is not, and the scatter between links does not reveal that.
 """
 
 from __future__ import annotations

@@ -121,12 +121,7 @@ def floor_plane(points: StereoPoints) -> FloorPlane | None:
 
 
 def _fitted_plane(xyz: Array) -> tuple[Array, float, float]:
-    """Returns the plane fitted to points (n, 3) [m] in camera axes.
-
-    Returns:
-        Unit normal (3,) towards the camera, distance of the camera from the plane, and scatter of the points about it
-        [m].
-    """
+    """Returns the plane fitted to points (n, 3) [m]: unit normal (3,) to the camera, distance and scatter [m]."""
     rng, best = np.random.default_rng(_SEED), (np.inf, np.array([0.0, 0.0, -1.0]), 0.0)
     for _ in range(_TRIALS):
         a, b, c = xyz[rng.choice(len(xyz), 3, replace=False)]

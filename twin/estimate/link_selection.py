@@ -145,10 +145,7 @@ def floor_share(motion: Motion) -> float:
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the consecutive indices newest, newest - 1, ... with which the descending list `linked` begins.
-
-    These nodes lie on one swath. The result is empty if `linked` does not start with `newest`.
-    """
+    """Returns the consecutive indices newest, newest - 1, ... (one swath) with which the descending `linked` begins."""
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
@@ -171,23 +168,13 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:
-    """Returns the distance between two cameras [m] from which on their overlap is taken as zero.
-
-    It is the diagonal of the footprint at the largest depth of the points (n, 3), which are in camera axes [m].
-    """
+    """Returns the distance between cameras beyond which their overlap is zero [m]: the diagonal of the footprint."""
     return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 
 @kernel
 def _overlaps(world, position, poses, reach, view):
-    """Compiled kernel of `overlaps`; returns the overlaps (n,).
-
-    Args:
-        world: (m, 3) matched points of the node in the world [m].
-        position: (3,) position of the node's camera in the world [m].
-        poses: (n, 4, 4) poses of the other images.
-        reach: distance between the cameras at which the overlap is taken as zero [m].
-    """
+    """Kernel of `overlaps` (n,) for points `world` (m, 3) [m]; zero from the distance `reach` [m] on."""
     shares = np.zeros(len(poses))
     for k in range(len(poses)):
         pose, count = poses[k], 0

@@ -353,10 +353,7 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets the poses (4, 4) of nodes, given by number.
-
-        Later keyframes that are not nodes keep their pose relative to the preceding node.
-        """
+        """Sets the poses of nodes, by number; later keyframes that are not nodes follow the preceding node."""
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

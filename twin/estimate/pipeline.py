@@ -325,7 +325,6 @@ class Navigator:
         return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress)
 
     def _quality(self) -> EstimationQuality:
-        """Returns the quality of the estimation: lost frames, failed links, residuals and rectification errors."""
         history = self.network.history
         residuals = np.array(history.link_residuals)
         failed = np.isnan(residuals)
@@ -491,20 +490,13 @@ class Navigator:
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
     def _accumulate(self, keyframe: Keyframe, step_cov: Array) -> None:
-        """Sets `accumulated_cov` of a keyframe from that of the last node and the motion since then.
-
-        Args:
-            step_cov: (6, 6) covariance of the motion since the last node, in the axes of the current camera.
-        """
+        """Sets `accumulated_cov` of a keyframe from that of the last node and `step_cov` (6, 6) since then."""
         if self.network.nodes:
             to_world = geometry.adjoint(self.filter.world_from_camera)
             keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Adds a node to the network, linked to the last node by `chain`, or by the F2F motion if `chain` is None.
-
-        The motion since the last node is then counted from this node.
-        """
+        """Adds a node to the network, linked to the last node by `chain` or, if None, by the F2F motion since then."""
         bridge = None
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
@@ -513,11 +505,8 @@ class Navigator:
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
     def _follow_last_keyframe(self, before: Array, node_cov: Array) -> None:
-        """Applies to the online pose the correction that an alignment made to the last keyframe.
-
-        Args:
-            before: (4, 4) pose of the last keyframe before the alignment.
-            node_cov: (6, 6) covariance of the aligned pose of the last node [rotation, translation] (rad, m).
+        """Applies to the online pose the correction that an alignment made to the last keyframe, whose pose was
+        `before`.
         """
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(before) @ self.filter.world_from_camera

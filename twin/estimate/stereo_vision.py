@@ -104,7 +104,6 @@ class StereoVision:
         self.matcher.close()
 
     def _configure(self, binning: int) -> None:
-        """Creates the image spool, the tracker, the matcher and the search range for images of this binning."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self._pattern_fits: dict[int, Array] = {}  # by frame index
@@ -123,7 +122,6 @@ class StereoVision:
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
 
     def _square(self, image: Image) -> Image:
-        """Returns the image resampled to square pixels."""
         return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
 
     def _interval_s(self, time_s: float) -> float | None:
@@ -138,10 +136,7 @@ class StereoVision:
         return self._plane_from_world @ world_from_camera
 
     def _choose_scale(self, left: Image, right: Image) -> None:
-        """Chooses the binning from a stereo pair, before the first keyframe is stored, and applies it if it changed.
-
-        The current left image is then processed again at the new binning.
-        """
+        """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
