@@ -59,7 +59,6 @@ def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array)
 
     Args:
         poses: (n, 4, 4) world_from_camera.
-        rig: calibration of the camera.
         pixels: (m, 2) column and row [px].
     """
     return _cast_directions(field, np.ascontiguousarray(poses, np.float64), rig.normalised(pixels))

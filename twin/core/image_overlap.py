@@ -27,7 +27,6 @@ def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRi
 
     Args:
         first, second: (n, 4, 4) world_from_camera of the images of each pair.
-        rig: calibration of the camera that takes both images.
 
     Returns:
         The overlaps, 0 to 1; NaN where the first image shows no floor.

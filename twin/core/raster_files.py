@@ -41,7 +41,6 @@ def open_raster(
     Args:
         key: key of the scenario that names the file; "": the error names the file itself.
         allowed: the files that are allowed, for the error.
-        drivers: names of the drivers.
 
     Raises:
         TwinError: the file is missing, damaged or of another format, names another file, or has larger tiles than it
