@@ -27,19 +27,13 @@ def combine(
 
     None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`).
 
-    The links of a node share the noise of its stereo points, so the variance of the mean is multiplied by the number of
-    links per node, if that exceeds 1. All nodes that see the same floor share part of the errors that its relief
-    causes, for example at the edges of an object. The variance is therefore also multiplied by 1 + c (m - 1), with m
-    the number of nodes that see a point of the floor and c = `link_selection.RECURRENCE`. Unlike in
-    `link_selection.inflate_for_shared_noise`, the fraction of the variance that image noise does not explain is not
-    known here, because few near points determine the offset; it is taken as 1. Finally, the variance is multiplied by
-    the mean chi-square of the offsets about their mean, if that exceeds 1.
+    The variance is multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes
+    that share the errors of relief, with c = `link_selection.RECURRENCE`, and by the mean chi-square (if above 1).
 
     Args:
         offsets: offset from each link, with a standard deviation that assumes independent links.
         n_nodes: number of nodes that can have links to earlier nodes.
         n_views: m, the mean number of nodes that see a point of the floor (`mean_views`).
-        focal_px: focal length [px].
     """
     if not offsets or n_nodes < 1:
         return None

@@ -63,9 +63,6 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
     If the left and the right image were swapped in the recording, disparities are negative, so that almost no point is
     matched in the given order, and many are in the other order. The images count as swapped if at least 30 points are
     matched with the images exchanged, and at least three times as many as in the given order.
-
-    Args:
-        settings: settings of the estimators, for the number of points and the patch size; None: the defaults.
     """
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
     left, right = square_images(frame, rig)

@@ -76,12 +76,9 @@ def choose_links(
     directly precede or follow one selected from them earlier come last.
 
     Args:
-        node: the new node.
         earlier: candidate nodes in chronological order.
         poses: (n, 4, 4) world_from_camera of the candidates.
         min_overlap: smallest sufficient overlap, 0 to 1.
-        max_links: largest number of links.
-        patch_px: side of the matching window [px].
 
     Returns:
         The selected nodes with their overlaps (0 to 1).
@@ -101,19 +98,12 @@ def choose_links(
 def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     """Returns the links of one new node with covariances inflated to account for their correlated errors.
 
-    All n links use the same stereo points of the node, and the noise of these points dominates the errors of the links.
-    If the links were treated as independent, one stereo observation would count n times, and the variances of the
-    positions would be underestimated. Therefore the covariance of each link is multiplied by n.
+    All n links use the same stereo points of the node, whose noise dominates, so each covariance is multiplied by n.
 
-    The fraction s of the variance that image noise does not explain (`Link.floor_share`) is caused by the floor: relief
-    within a patch shifts its match by M t, with t the translation between the images and M a property of the patch.
-    Suppose that the shift of a patch is the same in all links of the path while the patch is in view. With the overlap
-    q of consecutive nodes, links whose nodes are l steps apart have the fraction 1 - l (1 - q) of their patches in
-    common. The variance of the summed error is then that of independent errors times
-    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), summed over 1 <= l < m. Real shifts are only partly the same,
-    because not all corners are selected again and M changes with the viewing direction. The covariance is therefore
-    also multiplied by 1 + c s (m - 1), with c = `RECURRENCE`. Links that span several nodes have the same m, because
-    one such link starts at every node.
+    The fraction s that image noise does not explain (`Link.floor_share`) is due to relief within patches, and would be
+    the same in all links while a patch is in view. With the overlap q of consecutive nodes, the summed error then has 1
+    + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q) times the variance of independent errors (1 <= l < m). Real shifts are
+    only partly the same, so the covariance is also multiplied by 1 + c s (m - 1), with c = `RECURRENCE`.
     """
     growth = RECURRENCE * (_links_over_a_footprint(links) - 1)
     factors = [len(links) * (1 + growth * link.floor_share) for link in links]

@@ -181,7 +181,6 @@ class KeyframeNetwork:
         """Adds a node and queues the measurement of its links to earlier nodes other than the last one.
 
         Args:
-            node: the new node.
             chain: measured link from the last node; None if the measurement failed or this is the first node.
             bridge: link from the last node that consists of the F2F motion, fused with the DVL; it replaces a `chain`
                 that could not be measured; otherwise None.

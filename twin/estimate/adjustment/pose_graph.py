@@ -145,7 +145,6 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
     `max_iterations` is reached first.
 
     Args:
-        graph: factors of the graph.
         start: initial values of the unknowns.
         max_iterations: largest number of steps, accepted or rejected; one step is always made.
 

@@ -34,32 +34,18 @@ _SUPPORT = 3
 class ElevationMapper:
     """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
-    A cell keeps up to two hypotheses of its height, because a steep cell is measured at its lower edge in one view and
-    at its upper edge in another. The height z in a patch, of variance R, updates the best-fitting hypothesis h, of
-    variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes another hypothesis; if
-    the cell has two already, z replaces the one with the larger depth variance if that of z is smaller. The lower
-    hypothesis is the result unless the depth variance of the higher one is more than ten times smaller, because a
-    matching window at an edge often assigns the height of the nearer surface to the floor behind it. In the cells of
-    the horseshoe reef with two hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %,
-    and the one chosen by this rule in 84 %. Where fewer than three of the neighbours support this choice, the other
-    hypothesis is the result (`_isolated`).
+    A cell keeps up to two hypotheses, because a steep cell is measured at its lower edge in one view and at its upper
+    edge in another. A height z of variance R updates the best-fitting hypothesis h of variance P if (z - h)^2 < GATE (P
+    + R). Otherwise it becomes another one, or replaces the one with the larger depth variance if its own is smaller.
+    The lower one is the result unless the higher one has less than a tenth of its depth variance (right in 84 % of the
+    cells of the horseshoe reef) or too few neighbours support it (`_isolated`). Hypotheses that their last camera
+    cannot have seen are dropped (`visibility`), and cells that contradict all neighbours have no result
+    (`_contradicted`).
 
-    A hypothesis is dropped if the camera that measured it last cannot have seen it, because the line of sight passes
-    below the connected surface of the map (`visibility`).
-
-    The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their
-    part, the depth variance, decreases with each fusion. Errors due to the pose and to the smoothing of slopes are
-    common to all patches of a leg and mostly to all legs, so their part is the weighted mean of the variances of the
-    patches, which does not decrease with the number of patches.
-
-    The variance of the result has three further terms. With f the standard deviation of the lateral error divided by
-    two cell sizes, these are f^2 times the squared range of heights around the cell, f times the squared height step
-    across the cell (only for steps larger than a cell, where the cell may be on the wrong side of an edge), and the
-    variance due to the choice between two hypotheses. Without the term for steps, the standard deviation was 1.9 times
-    too small over the whole map of a reef, because 1 % of the cells, all at edges, had the height of the wrong side of
-    the edge.
-
-    Cells whose heights contradict those of all their neighbours have no result (`_contradicted`).
+    The depth variance is independent between patches and decreases with each fusion; the variance of pose and smoothing
+    is common to them, so it is averaged. The result adds, with f the standard deviation of the lateral error per two
+    cells, f^2 times the squared range of heights around the cell, f times the squared step across it if larger than a
+    cell, and the variance of the choice between hypotheses.
 
     Args:
         grid: grid of the map.
@@ -188,17 +174,10 @@ def _small_groups(known: Mask) -> Mask:
 def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
     """Returns a mask (rows, cols) of the known cells, alone or in twos and threes, that contradict their neighbours.
 
-    Heights h and k of neighbouring cells agree if (h - k)^2 < GATE (P + Q + E), with P and Q the `variance` of the two
-    cells, and E the square of `edge_fraction` times the range of heights around the cell. A cell is supported if at
-    least `_SUPPORT` neighbours agree with it, or if one of those that agree is supported so. A cell that is not
-    supported, and contradicts a neighbour, is a mismatch: beside a real step, a cell has neighbours on its own side.
-
-    By the range of heights, a mismatch would excuse itself, so it is that of the neighbours, without the two highest
-    and the two lowest ones. It is computed for the cells only that are not supported without it.
-
-    Args:
-        height: (rows, cols) heights [m]; NaN where unknown.
-        variance: (rows, cols) variance of the difference from a level floor [m^2].
+    Heights h and k agree if (h - k)^2 < GATE (P + Q + E), with their variances P and Q, and E the square of
+    `edge_fraction` times the range of the neighbours' heights without the two highest and lowest (only for cells that
+    are not supported without it). A cell is supported if `_SUPPORT` neighbours agree, or one that is supported so; a
+    cell that is not, and contradicts a neighbour, is a mismatch.
     """
     rows, cols = height.shape
     near, near_variance = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, variance))

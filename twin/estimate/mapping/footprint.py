@@ -36,7 +36,6 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MO
 
     Args:
         result: result of a survey with at least one keyframe, whose final trajectory is in the axes of the map.
-        most_cells: largest number of cells.
     """
     seen = _corners(result, rig).reshape(-1, 2)
     cell = _CELL_PX * float(np.median(result.keyframe_depth_m)) / rig.focal_px

@@ -78,7 +78,6 @@ def build_map(
     Args:
         keyframes: stereo pairs along the path, read one at a time.
         path: poses of the keyframes and their covariances.
-        rig: calibration of the images, with square pixels.
         progress: called with the number of keyframes processed so far.
         pattern: light pattern of the images, which is subtracted before matching; None: it is not known.
     """

@@ -59,9 +59,6 @@ def orthomosaic(
     The pixels divide the cells of the map and are not larger than the median ground sample distance of the images.
 
     Args:
-        views: the images.
-        elevation: the estimated map.
-        rig: calibration of the images, with square pixels.
         restore: function that removes the effects of lamps and water. None: colours as seen, at equal exposure.
         progress: called with the finished fraction, 0 to 1.
     """

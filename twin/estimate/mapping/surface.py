@@ -52,7 +52,6 @@ def rasterise(
     the cell centre; on a slope, this includes the effect of horizontal errors.
 
     Args:
-        depth_map: depth in the left camera.
         world_from_camera: (4, 4) pose of the left camera.
         pose_cov: (6, 6) covariance of the pose [rotation, translation] (rad, m), in camera axes.
 

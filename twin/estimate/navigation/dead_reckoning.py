@@ -62,7 +62,6 @@ def dead_reckon(
     """Advances dead reckoning by one frame.
 
     Args:
-        last: state at the previous frame.
         aiding: error models of the sensors, and the states of the DVL integration and of the gates, modified in place.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
         height_m: height measured by the pressure sensor at this frame [m]; NaN if there is no reading.

@@ -288,7 +288,7 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
 @kernel
 def _gain(prior, jacobian, cov):
-    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination; P `prior` (6, 6), R `cov` (k, k)."""
+    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by elimination; P `prior` (6, 6), R `cov` (k, k)."""
     size = len(cov)
     gain, innovation_cov = np.zeros((6, size)), cov.copy()
     for m in range(size):

@@ -93,19 +93,14 @@ def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> T
 def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterations: int = 2) -> Refinement:
     """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
 
-    Let I be the reference image, and O the other image warped to it by the current disparities d. Each pixel measures
-    the error of its disparity, e = d_true - d = (I - O) / (dO/dd). A plane is fitted to the values d + e in a window,
-    weighted by (dO/dd)^2 and the weights of the window; its value at the centre is the refined disparity. This value is
-    unbiased on inclined surfaces and not biased towards whole or half pixels (`_warp`); neighbours on another surface
-    are excluded. Brightness and contrast of O are first matched locally to those of I, because backscatter and
-    illumination change with the viewpoint.
+    With the other image O warped to the reference image I by the disparities d, each pixel measures the error e = (I -
+    O) / (dO/dd). The refined disparity is the centre of a plane fitted to d + e, weighted by (dO/dd)^2 and the window,
+    without neighbours on another surface; it is unbiased on slopes and at sub-pixel positions (`_warp`). Brightness and
+    contrast of O are first matched locally to I. With strong noise, iterations after the first use a larger window.
 
-    The variance is the least-squares variance for a noise variance estimated from nearby residuals, or from the
-    residuals of the window itself if that estimate is larger. With strong noise, the iterations after the first use a
-    larger window. Image gradients dO/dd that noise alone can produce are not treated as texture. `measurement_sigma_px`
-    agrees with the standard deviation of the error to 15 % in clear water; the standard deviation of the error,
-    mismatches included, is 1.3 times `measurement_sigma_px` if the noise is one fifth of the image contrast, and 1.7
-    times if it is half of the contrast.
+    The noise variance is that of nearby residuals, or of the window's own if larger. `measurement_sigma_px` agrees with
+    the error to 15 % in clear water; the error is 1.3 times larger for noise of a fifth of the contrast, 1.7 times for
+    half.
 
     Args:
         reference, other: (H, W) float32 grey images.
@@ -205,11 +200,10 @@ def _noise_variance(residual: Map, visible: Mask) -> float:
 
 
 def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor by which the correlation of the noise of neighbouring pixels increases the variance of a fit.
+    """Returns the factor by which correlated noise of neighbouring pixels increases the variance of a fit.
 
-    It is computed from the correlation between neighbouring residuals that remain after the fit. The interpolated
-    colours of a Bayer sensor, for example, have correlated noise: with pixels treated as independent, the standard
-    deviation of the disparity was 1.6 times too small.
+    It follows from the correlation of the residuals that remain after the fit. Without it, the standard deviation was
+    1.6 times too small for the interpolated colours of a Bayer sensor.
     """
     along, across = _correlations(remaining, visible, variance)
     return (1 + 2 * max(along, 0.0)) * (1 + 2 * max(across, 0.0))
@@ -229,10 +223,8 @@ def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float,
 def _locking_factor(residual: Map, visible: Mask, variance: float) -> float:
     """Returns the factor, 0 to 1, by which the correlation of the noise of neighbouring pixels reduces pixel locking.
 
-    Let c^k be the correlation of the noise of pixels at a distance of k pixels. Interpolation then reduces the variance
-    of the noise less than for independent pixels: halfway between two pixels, the variance is multiplied by
-    1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3). The result is the expression in parentheses. c is the correlation
-    between neighbours in a column, because a stereo pair is not interpolated along the columns.
+    With the correlation c between neighbours in a column, which stereo does not interpolate, interpolation halfway
+    multiplies the variance of noise by 1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3); the result is the parenthesis.
     """
     c = float(np.clip(_correlations(residual, visible, variance)[1], 0.0, 1.0))
     return max(1 - 1.367 * c + 0.391 * c * c - 0.022 * c**3, 0.0)
@@ -248,16 +240,12 @@ def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
 def _warp(reference, other, disparity, matrix, epipole, warped, slope, locking):
     """Warps the other image O to the reference image, and returns a mask (H, W) of the pixels that are visible in O.
 
-    Writes the warped image to `warped`, its gradient dO/dd with respect to the disparity to `slope`, and the expected
-    product of residual and gradient due to noise alone, for a residual of variance 1, to `locking`, each (H, W). The
-    gradient is the mean of the gradients of both images, because the gradient of a single image is biased by its noise
-    and by interpolation.
+    Fills `warped`, `slope` (gradient dO/dd, the mean of both images', which is less biased by noise) and `locking`
+    (expected product of residual and gradient due to noise alone, per variance of the residual).
 
-    Interpolated noise n has the variance s^2 V at a position between pixels, with s^2 the variance of the noise of a
-    pixel and V the sum of the squared weights: 1 at a pixel, 0.64 halfway between two pixels in a row. The residual
-    contains -n and the gradient (dn/dd) / 2, and the residual has the variance s^2 (1 + V), so their product has the
-    mean -(dV/dd) / 4 / (1 + V) times the variance of the residual. Unless this mean is subtracted, least squares is
-    biased towards disparities at which the interpolation is halfway between two pixels.
+    Interpolated noise has V times the variance of a pixel, with V the sum of the squared weights (1 at a pixel, 0.64
+    halfway). The residual contains -n, the gradient (dn/dd) / 2; their product has the mean -(dV/dd) / 4 / (1 + V).
+    Unless it is subtracted, disparities halfway between two pixels are preferred.
     """
     height, width = reference.shape
     visible = np.zeros((height, width), np.bool_)

@@ -123,9 +123,6 @@ class EpipolarCalibration:
         The condition is that the row changes by more than 4 standard deviations and by more than 0.02 px in at least
         one corner of the image.
 
-        Args:
-            rig: calibration at full image size.
-
         Returns:
             Whether `removed` was changed.
         """
@@ -146,7 +143,6 @@ class EpipolarCalibration:
 
         Args:
             right: (H, W, 3) right image at full size.
-            rig: calibration at full image size.
         """
         if not self.removed.any():
             return right

@@ -159,13 +159,9 @@ class FrameToFrame:
     def _pyramid_levels(self, depth_m: Array) -> int:
         """Returns the number of pyramid levels above the full image that the error of the predicted positions requires.
 
-        The tracker finds a point at a distance of up to about half the side of its window; each level doubles this
-        distance. The variance of the predicted positions follows from the filter's variances of the rotation about the
-        x and y axes and of the translation across the optical axis, at the median depth. At 15 frames per second one
-        level is sufficient; at 5, the acceleration of the vehicle moves the points by about 10 px more than predicted.
-
-        Args:
-            depth_m: (n,) depths of the points [m].
+        The tracker finds points within half its window, and each level doubles this. The error follows from the
+        filter's variances of rotation about x and y and of translation across the optical axis, at the median of
+        `depth_m` (n,).
         """
         variance = np.diag(self.filter.cov)
         across = variance[3:5] / float(np.median(depth_m)) ** 2
@@ -207,14 +203,10 @@ class FrameToFrame:
 
 
 def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns normalised (x, y, disparity) (n, 3) of stereo points, with (x, y) of their pixels in the left image.
+    """Returns normalised (x, y, disparity) (n, 3) at the pixels of the left image, and their covariance (n, 3, 3).
 
-    `stereo.fuse` moves a point by half its row difference between the two images. Frames are matched with the left
-    image alone, however, and a systematic row difference (a pitch of one camera) must not appear as motion.
-
-    Returns:
-        The coordinates (n, 3) and their covariance (n, 3, 3). That of (x, y) is the covariance before the fusion, which
-        halves the variance of the row.
+    `stereo.fuse` moves a point by half its row difference; frames are matched with the left image alone, where this
+    would appear as motion. The covariance of (x, y) is that before the fusion.
     """
     measured, cov = points.measured.copy(), points.cov.copy()
     measured[:, :2] = rig.normalised(points.pixels)

@@ -22,7 +22,6 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
 
     Args:
         left, right: (height, width, 3) images of a stereo pair.
-        rig: calibration at full image size.
 
     Returns:
         Number of pixels along each side that are averaged to one.

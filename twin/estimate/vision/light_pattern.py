@@ -44,17 +44,13 @@ def pattern_fit(pair: tuple[Map, Map]) -> Array:
 def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern | None:
     """Returns the light pattern of a survey; None if it is not needed or not known.
 
-    A coefficient of the pattern is its mean m over the n keyframes, multiplied by max(0, 1 - v / m^2), a shrinkage as
-    in the positive-part estimator of James & Stein (1961), with v the variance of the mean. A coefficient whose mean
-    does not exceed the standard deviation of this mean is attributed to texture and relief, and is therefore left in
-    the images. Images of neighbouring keyframes overlap, so v = (s^2 / n) (1 + r) / (1 - r), with s^2 the variance of
-    the coefficient over the keyframes and r the correlation of consecutive keyframes, as in a first-order
-    autoregressive process.
+    A coefficient is its mean m over the n keyframes times max(0, 1 - v / m^2) (positive-part shrinkage, James & Stein
+    1961), which leaves texture and relief in the images. Images of neighbouring keyframes overlap, so the variance of
+    the mean is v = (s^2 / n) (1 + r) / (1 - r), with the variance s^2 over the keyframes and the correlation r of
+    consecutive ones.
 
-    The pattern misleads the matching only where it dominates the texture. The result is therefore None if the sum of
-    m^2 over all coefficients except the constant ones does not exceed the sum of s^2: an image then varies more by the
-    floor in view than by the light of the cameras, and the mean over the keyframes may be that of a part of the floor
-    which most of them show. The result is also None for fewer than two keyframes.
+    None for fewer than two keyframes, and if the sum of m^2 (without constants) does not exceed that of s^2: the floor
+    in view then dominates the light, and the mean may be that of a part of the floor.
 
     Args:
         fits: coefficients of the keyframes (`pattern_fit`), in chronological order.

@@ -120,8 +120,6 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
 
     Args:
         image: (height, width) normalised image.
-        count: largest number of points.
-        patch_px: side of the patches [px].
 
     Returns:
         (n, 2) float32 positions [px], those with the strongest texture first; none if no corner is found.
@@ -152,7 +150,6 @@ def track(
         source, target: normalised images of the same shape.
         points: (n, 2) positions in the source [px].
         guess: (n, 2) expected positions in the target [px].
-        patch_px: side of the window [px].
         levels: number of pyramid levels above the full image.
 
     Returns:
@@ -200,7 +197,6 @@ def variance_inflation(points: NDArray[np.floating], patch_px: int) -> float:
 
     Args:
         points: (n, 2) centres of the patches [px].
-        patch_px: side of the patches [px].
     """
     if len(points) == 0:
         return 1.0

@@ -67,7 +67,6 @@ class Mosaic:
             image: (height, width) normalised left image.
             depth_m: (height, width) depth [m], NaN where unknown.
             world_from_camera: (4, 4) pose of the keyframe.
-            rig: calibration at the scale of the image, with square pixels.
 
         Raises:
             OSError: a tile could not be read or written.
@@ -100,7 +99,6 @@ class Mosaic:
             depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
             half_window_m: half the side of the square of cells that is used, centred below the camera [m].
-            rig: calibration at the scale of the image, with square pixels.
 
         Returns:
             The pose correction with its covariance, or None if too few cells are textured, or too few of these are

@@ -80,16 +80,9 @@ class MotionFilter:
 def _acceleration_cov(interval_s: float) -> Array:
     """Returns the covariance (12, 12) of pose and velocity that unknown accelerations add within an interval.
 
-    The acceleration is white noise, also within the interval (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2). Its
-    density is such that the standard deviation of the change of velocity is `_ACCELERATION` times the interval.
-
-    An acceleration that is constant within the interval (section 6.3.2) would change the velocity by exactly twice the
-    change of position that it causes, divided by the interval. With exactly measured poses, the filter would then
-    reverse the sign of its velocity error at each frame instead of reducing it (an alpha-beta filter with beta = 2), so
-    that small irregular motions would add up.
-
-    Args:
-        interval_s: length of the interval [s].
+    White-noise acceleration (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2), with a standard deviation of the change
+    of velocity of `_ACCELERATION` times the interval. Constant acceleration within the interval (section 6.3.2) would
+    reverse the velocity error at each frame (an alpha-beta filter with beta = 2).
     """
     velocity = np.diag((_ACCELERATION * interval_s) ** 2)
     shared = velocity * (interval_s / 2)

@@ -87,7 +87,6 @@ def transfer(points_b, a_from_b, baseline):
     Args:
         points_b: (n, 3) normalised (x, y, disparity) in b.
         a_from_b: (4, 4) pose of b in a.
-        baseline: baseline of the rig [m].
 
     Returns:
         (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an
@@ -129,7 +128,6 @@ def linearise(measured, structure, a_from_b, baseline):
     Args:
         structure: (n, 3) points in b at which to linearise, normalised (x, y, disparity).
         a_from_b: (4, 4) motion at which to linearise.
-        baseline: baseline of the rig [m].
     """
     predicted, jacobian_point, jacobian_motion = transfer(structure, a_from_b, baseline)
     a, b, cov_a, cov_b = measured.a, measured.b, measured.cov_a, measured.cov_b

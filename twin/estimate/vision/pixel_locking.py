@@ -36,7 +36,6 @@ def shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:
     Args:
         pixels: (n, 2) matched positions in the target image [px].
         warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
-        patch_px: side of the patch [px].
     """
     varying = np.sinc(patch_px * (warp - np.eye(2)))  # numpy's sinc is sin(pi x) / (pi x)
     return -np.sin(2 * np.pi * pixels) * varying[:, :, 0] * varying[:, :, 1]

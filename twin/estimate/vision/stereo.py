@@ -127,7 +127,6 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
     Args:
         pixels: (n, 2) predicted patch centres [px].
         rig: calibration, for the image size.
-        patch_px: side of the patch.
     """
     return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
@@ -140,7 +139,6 @@ def corners_with_disparity(
     Args:
         left: (H, W) grey levels.
         dense_px: (H, W) disparity [px], NaN where unknown.
-        count: largest number of corners.
         patch_px: side of the patches, which lie inside the image [px].
     """
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
@@ -163,7 +161,6 @@ def match_stereo_points(
         left, right: (height, width) grey levels (`matching.gray`).
         dense_px: (height, width) initial disparity, NaN where unknown [px].
         rig: calibration at the scale of the images, with square pixels.
-        count: largest number of corners.
         patch_px: side of the matched patches (odd).
     """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)

@@ -128,7 +128,6 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
-        baseline_m: baseline of the rig [m].
         guess: (4, 4) initial pose of b in a.
 
     Returns:
@@ -149,25 +148,21 @@ def pair_motion(
 ) -> Motion | None:
     """Estimates the motion between two stereo pairs jointly with the structure, which avoids errors-in-variables bias.
 
-    Both pairs measure each point as z = (x, y, disparity) with covariance C; the true point in b is unknown. Let g be
-    the transfer of a point from b to a by the motion. With e = z_a - g(z_b) and G = dg/dz_b, the structure is
-    eliminated: the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed adjustment
-    model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003). The points have Huber weights, which are 0
-    beyond `CUTOFF` standard deviations.
+    Each pair measures z = (x, y, disparity) with covariance C; g transfers a point from b to a. With e = z_a - g(z_b)
+    and G = dg/dz_b, the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed
+    adjustment model, Mikhail 1976; eqs. 6 and 7 of Negahdaripour & Madjidi 2003), with Huber weights that are 0 beyond
+    `CUTOFF`.
 
-    If the estimated amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), the motion is
-    estimated without it. This happens over a level floor, where all points have nearly the same sub-pixel position: a
-    sine of amplitude 1 / (2 pi) px, whose slope is 1, then explains the noise of all measurements.
+    If the amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), as over a level floor where
+    all points have nearly the same sub-pixel position, the motion is estimated without it.
 
     Args:
         measured: points in the earlier pair a and the later pair b.
-        baseline_m: baseline of the rig [m].
         guess: (4, 4) initial pose of b in a.
         settings: stochastic model and number of iterations.
 
     Returns:
-        The motion, with its residual relative to the expected standard deviation (1 = as expected), or None if there
-        are too few points or inliers.
+        The motion, with its residual relative to the expected standard deviation; None if too few points or inliers.
     """
     if len(measured.a) < _MIN_POINTS:
         return None
@@ -271,15 +266,11 @@ def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -
 def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     """Returns the covariance (p, p) of the unknowns from the residuals of the individual points.
 
-    It is the sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, Robust Statistics, section
-    7.6; White 1980). S is the sum of the outer products of the points' scores w J' C^-1 e, with w the weight of a
-    point, J its Jacobian and C the covariance of its residual e. S therefore includes errors that C does not account
-    for, such as those at relief and occlusions. M is the normal matrix times the mean derivative of the Huber function:
-    a point in the linear part of this function contributes its weight times (k - 1) / k, the mean over the k measured
-    coordinates of its residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points
-    determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
-    counts as 50 points. The prior information is added to M; multiplied by the squared scale of the residuals, it is
-    added to S.
+    Sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, section 7.6; White 1980). S sums the
+    outer products of the scores w J' C^-1 e and so includes errors that C does not (relief, occlusions). M is the
+    normal matrix times the mean derivative of the Huber function, (k - 1) / k in its linear part for k measured
+    coordinates. S is scaled by k n / (k n - p) and averaged with its expectation for C times a common factor, which
+    counts as 50 points. Prior information is added to M and, times the squared scale, to S.
     """
     observations, weight, scale = normals.observations, normals.weight, normals.scale
     size, n, p = observations.normalised_residual, int(np.count_nonzero(weight)), len(normals.normal)

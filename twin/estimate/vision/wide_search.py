@@ -34,7 +34,6 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
 
     Args:
         range_px: largest error of a predicted position from which it is found [px].
-        points: stereo points of the node.
         cov: (6, 6) covariance of the predicted motion [rotation, translation] (rad, m), in the axes of the node.
     """
     x, y, disparity = np.ascontiguousarray(points.measured.T)
