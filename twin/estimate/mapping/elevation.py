@@ -214,7 +214,7 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest absolute second difference (rows, cols) of height over four directions [m]; 0 where unknown."""
+    """Returns the largest absolute second difference (rows, cols) of height in four directions [m]; 0: unknown."""
     step = np.zeros_like(height)
     if min(height.shape) < 3:
         return step

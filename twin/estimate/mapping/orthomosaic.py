@@ -144,7 +144,7 @@ def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> 
 
 
 def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
-    """Returns the grid of the pixels of a tile (smaller at the east and south edges) and of its margin of `_MARGIN_PX`."""
+    """Returns the grid of the pixels of a tile (smaller at east and south edges) and its margin of `_MARGIN_PX`."""
     rows, cols = min(side, grid.rows - row), min(side, grid.cols - col)
     return window(grid, row - _MARGIN_PX, col - _MARGIN_PX, rows + 2 * _MARGIN_PX, cols + 2 * _MARGIN_PX)
 
@@ -159,7 +159,7 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
 def _prepared(
     views: Views, numbers: NDArray[np.int64], factors: Array, restore: Restore | None
 ) -> Iterator[tuple[int, Colours]]:
-    """Yields numbers and colours of the images, the next one prepared by a second thread; `factors` (n, 3): exposure."""
+    """Yields numbers and colours of images, the next one prepared by a second thread; `factors` (n, 3): exposure."""
 
     def colours(k: int) -> Colours:
         image = views.load(k)
