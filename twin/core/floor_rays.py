@@ -87,10 +87,8 @@ def cast_camera_ray(field, pose, a, b):
 def cast_ray(field, ox, oy, oz, dx, dy, dz):
     """Returns the smallest t >= 0 at which the ray o + t d meets the floor; 0 if o lies below the floor.
 
-    The ray is traversed cell by cell (Amanatides & Woo 1987) between the heights of the highest and the lowest node. In
-    each cell it crosses at most two triangles; over each of them, its height above the floor is linear in t. The result
-    is inf if d does not point downwards, if the traversal starts outside the grid, or if it leaves the grid or enters a
-    cell without floor before the ray meets the floor.
+    Cell by cell (Amanatides & Woo 1987) between the highest and the lowest node. inf if d does not point downwards, or
+    if the ray starts outside the grid, leaves it or enters a cell without floor first.
     """
     if not dz < 0:
         return np.inf
