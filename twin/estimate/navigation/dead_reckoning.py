@@ -59,14 +59,12 @@ def dead_reckon(
     rpy_rad: Array,
     velocity_mps: Array,
 ) -> tuple[DeadReckoningState, Array]:
-    """Advances dead reckoning by one frame.
+    """Advances dead reckoning by one frame; the states of the DVL integration and of the gates are modified in place.
 
     Args:
-        aiding: error models of the sensors, and the states of the DVL integration and of the gates, modified in place.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
-        height_m: height measured by the pressure sensor at this frame [m]; NaN if there is no reading.
-        rpy_rad: (3,) roll, pitch and yaw measured by the AHRS [rad]; NaN if there is no reading.
-        velocity_mps: (3,) velocity measured by the DVL, in body axes [m/s]; NaN if there is no reading.
+        height_m, rpy_rad: readings of pressure sensor [m] and AHRS, roll, pitch and yaw (3,) [rad]; NaN without.
+        velocity_mps: (3,) reading of the DVL, in body axes [m/s]; NaN without.
 
     Returns:
         The new state, and the motion (4, 4) of this frame after fusion with the DVL.

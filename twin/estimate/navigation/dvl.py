@@ -42,17 +42,10 @@ class DvlState(NamedTuple):
 class DvlIntegrator:
     """Integrates DVL velocities, rotated into the body axes at the last node, by the trapezoidal rule.
 
-    Each reading contributes with half weight to the displacements of two consecutive frames, whose errors are therefore
-    correlated. The sum of n displacements has the variance (n - 1/2) (sigma dt)^2 in each component, with sigma the
-    standard deviation of a reading and dt the interval between frames. As an approximation, each displacement is given
-    the variance (sigma dt)^2 and treated as independent.
+    Each reading has half weight in two consecutive displacements. The variance of their sum, (n - 1/2) (sigma dt)^2 for
+    readings of deviation sigma, is approximated by independent displacements of variance (sigma dt)^2.
 
-    Args:
-        rig: believed calibration, for the pose of the camera in the body.
-        noise: believed noise of the navigation sensors.
-
-    Attributes:
-        state: integration since the last node.
+    Attributes:     state: integration since the last node.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
@@ -74,10 +67,9 @@ class DvlIntegrator:
         return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
 
     def displacement_at_node(self, number: int) -> Displacement | None:
-        """Returns the displacement from the last node to the current node, and restarts the integration.
+        """Returns the displacement from the last node to the node `number`, and restarts the integration.
 
-        Returns:
-            The displacement, or None if the reading at the last node or at a frame after it is missing.
+        None if the reading at the last node or at a frame after it is missing.
         """
         node, self._node, state = self._node, number, self.state
         complete = state.complete[0]
@@ -88,15 +80,10 @@ class DvlIntegrator:
 
 @kernel
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
-    """Computes the displacement of the body's origin that corresponds to a motion of the camera.
+    """Returns the displacement (3,) [m] of the body's origin for a motion of the camera, in the body axes before it.
 
-    Args:
-        a_from_b: (4, 4) motion of the camera: the pose of the later camera in the earlier camera.
-        body_from_camera: (4, 4) pose of the camera in the body.
-
-    Returns:
-        Displacement (3,) [m] in the body axes before the motion, and its Jacobian (3, 6) with respect to an increment
-        [rotation, translation] (rad, m) of the motion, in the axes of the later camera.
+    Also its Jacobian (3, 6) with respect to an increment [rotation, translation] (rad, m), in the axes of the later
+    camera.
     """
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
@@ -154,9 +141,8 @@ def _length(step):
 def _step_cov(state, model, step):
     """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
 
-    The scale error, of standard deviation s, accumulates along the path. After a path of length L since the node, a
-    displacement of length l therefore contributes the variance s^2 ((L + l)^2 - L^2) along its direction; these
-    contributions sum to s^2 times the squared length of the whole path.
+    The scale error s accumulates: a displacement of length l after a path L adds s^2 ((L + l)^2 - L^2) along its
+    direction.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
@@ -200,12 +186,10 @@ def _restart(state):
 
 @kernel
 def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera, gates):
-    """Updates a camera motion with a measured displacement of the body's origin (Kalman update).
+    """Updates a camera motion with a displacement of the body's origin (Kalman update).
 
     Args:
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
         step, step_cov: (3,), (3, 3) displacement [m] in the axes of the body before the motion, and its covariance.
-        body_from_camera: (4, 4) pose of the camera in the body.
 
     Returns:
         Motion (4, 4) and covariance (6, 6) after the update, and whether the displacement was used.

@@ -41,10 +41,6 @@ def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array
     The standard deviation includes the noise of both sensors, the bias of the gyroscope and the accelerations of the
     vehicle, not the bias of the accelerometer: a bias b adds an error of b / g, common to all readings.
 
-    Args:
-        readings: readings with increasing times, at least one.
-        noise: noise of the IMU.
-
     Returns:
         Unit vectors (n, 3) that point upwards, in the axes of the IMU, and standard deviations (n,) about each
         perpendicular axis [rad].
