@@ -77,11 +77,8 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
     pixel.
 
     Args:
-        old: filtered depth of the old keyframe.
-        new: stereo depth of the new keyframe.
         new_from_old: (4, 4) pose of the old camera in the new camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
-        rig: calibration of the images, with square pixels.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     args = (camera, rig.focal_px * rig.baseline_m, JUMP_PX)
@@ -107,10 +104,8 @@ def motion_depth(
 
     Args:
         gray, old_gray: (H, W) float32 grey levels of the left images of the new and the old keyframe.
-        current: depth of the new keyframe, used as prediction.
         old_from_new: (4, 4) pose of the new camera in the old camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
-        rig: calibration of the images, with square pixels.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)

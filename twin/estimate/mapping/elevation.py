@@ -46,9 +46,6 @@ class ElevationMapper:
     is common to them, so it is averaged. The result adds, with f the standard deviation of the lateral error per two
     cells, f^2 times the squared range of heights around the cell, f times the squared step across it if larger than a
     cell, and the variance of the choice between hypotheses.
-
-    Args:
-        grid: grid of the map.
     """
 
     def __init__(self, grid: MapGrid):
@@ -69,7 +66,6 @@ class ElevationMapper:
         this keyframe, and the two heights agree. The information on each cell therefore enters the map exactly once.
 
         Args:
-            patch: heights of a keyframe.
             successor: heights of the next keyframe; None for the last one, or if the next one is outside the grid.
             inherited: (H, W) bool, pixels of the next keyframe whose depth contains information from this keyframe
                 (`depth_filter.PropagatedDepth`).

@@ -51,13 +51,7 @@ def footprint_tiles(
 ) -> list[MapTile]:
     """Returns the tiles of the map with cells of three pixels that images show, if it has more than `most_cells` cells.
 
-    The list is empty for a smaller map, whose cells `footprint_grid` does not enlarge. The number of tiles grows with
-    the area that the images cover, not with that of the rectangle around it.
-
-    Args:
-        result: result of a survey with at least one keyframe.
-        most_cells: largest number of cells of an undivided map.
-        side: side of a tile in cells.
+    Empty for a smaller map, whose cells `footprint_grid` does not enlarge; `side` is the side of a tile in cells.
     """
     whole = footprint_grid(result, rig, np.inf)
     if whole.rows * whole.cols <= most_cells * (1 + 1e-3):  # of rounding to whole cells

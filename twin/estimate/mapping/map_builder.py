@@ -76,8 +76,6 @@ def build_map(
     """Returns the elevation map with its standard deviation and orthomosaic, built from the keyframes along the path.
 
     Args:
-        keyframes: stereo pairs along the path, read one at a time.
-        path: poses of the keyframes and their covariances.
         progress: called with the number of keyframes processed so far.
         pattern: light pattern of the images, which is subtracted before matching; None: it is not known.
     """

@@ -51,13 +51,11 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
     """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
 
-    It is the box around those parts of the rays through the four image corners that lie between the highest and the
-    lowest floor. If the camera is lower than the highest floor, these parts begin at the camera. The box is infinite if
-    the camera is not above the lowest floor, or if one of these rays does not point downwards.
+    It encloses the parts of the corner rays between the highest and the lowest floor (`heights_m`), from the camera if
+    that is lower; infinite if the camera is not above the lowest floor or a ray does not point downwards.
 
     Args:
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        heights_m: heights of the lowest and of the highest floor.
     """
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
     corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -90,7 +88,6 @@ def add_view(
 
     Args:
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        heights_m: heights of the lowest and of the highest floor.
     """
     grid = layers.grid
     bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)

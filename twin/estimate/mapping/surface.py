@@ -46,10 +46,9 @@ def rasterise(
 ) -> HeightPatch | None:
     """Returns the heights at the cell centres of a grid, interpolated linearly in triangles of pixels of a depth map.
 
-    Each square of four pixels is divided into two triangles. Triangles across a depth discontinuity, downward-facing
-    triangles and triangles seen at a grazing angle are omitted, so that no surface appears between the edge of a reef
-    and the floor behind it. The variance of the depth and the covariance of the pose are propagated to the height at
-    the cell centre; on a slope, this includes the effect of horizontal errors.
+    Triangles across a depth discontinuity, downward-facing and grazing ones are omitted, so that no surface appears
+    between the edge of a reef and the floor. The variances of depth and pose are propagated to the height at the cell
+    centre, with the effect of horizontal errors on slopes.
 
     Args:
         world_from_camera: (4, 4) pose of the left camera.
@@ -208,7 +207,6 @@ def pose_variance(px, py, pz, sx, sy, cov):
 
     Args:
         px, py, pz: point relative to the camera, in world axes [m].
-        sx, sy: slopes dz/dx and dz/dy of the surface at the point.
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
     """
     row = (-sx, -sy, 1.0)
