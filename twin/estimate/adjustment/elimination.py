@@ -62,7 +62,6 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
     """Returns the symbolic factor of a matrix of n x n blocks.
 
     Args:
-        n: number of nodes; each is one block row and one block column of the matrix.
         i, j: (m,) nodes of the off-diagonal blocks (i, j), i not equal to j; a pair may occur more than once.
     """
     permutation = _minimum_degree(n, i, j)

@@ -139,14 +139,10 @@ class Solution(NamedTuple):
 
 
 def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
-    """Returns the solution that the iteration reaches from `start`.
+    """Returns the solution reached from `start` by Gauss-Newton with Levenberg-Marquardt damping.
 
-    The method is Gauss-Newton with Levenberg-Marquardt damping. The solution is a local minimum of the cost, unless
-    `max_iterations` is reached first.
-
-    Args:
-        start: initial values of the unknowns.
-        max_iterations: largest number of steps, accepted or rejected; one step is always made.
+    It is a local minimum of the cost unless `max_iterations` steps, accepted or rejected, are reached; one is always
+    made.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -329,8 +325,6 @@ def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float
     """Returns binary factors of measured motions.
 
     Args:
-        links: measured motions between nodes.
-        index_of: index of the pose of each node, by node number.
         huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
     columns = Links.from_sequence(links)
