@@ -75,9 +75,6 @@ class SearchRange:
 
     The widest range is `MAX_DISPARITY_FRACTION` of the image width.
 
-    Args:
-        rig: calibration at the scale of the images.
-
     Attributes:
         max_disparity_px: largest disparity to search [px].
     """

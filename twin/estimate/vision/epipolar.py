@@ -105,7 +105,6 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
     Args:
         reference, other: (H, W) float32 grey images.
         disparity_px: (H, W) float32 initial disparity [px], NaN where unknown.
-        view: two-view geometry of the images.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
     sigma, gain, mean_square, noise_variance, inflation, window_px = fitted, fitted, fitted, 1.0, 1.0, WINDOW_PX

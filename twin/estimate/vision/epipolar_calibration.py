@@ -94,7 +94,6 @@ class EpipolarCalibration:
         """Adds the row differences of one stereo pair whose right image was rectified with `removed`.
 
         Args:
-            points: matched points of the pair.
             patch_px: side of the matched patches [px], for the correlation between overlapping patches.
         """
         x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]

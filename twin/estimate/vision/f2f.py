@@ -67,7 +67,6 @@ class FrameToFrame:
     the failure.
 
     Args:
-        rig: calibration at the scale of the images.
         patch_px: side of the tracking window [px].
 
     Attributes:
@@ -89,7 +88,6 @@ class FrameToFrame:
 
         Args:
             image: (height, width) normalised left image of the keyframe.
-            points: its matched points, strongest first.
         """
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
@@ -224,7 +222,6 @@ def constant_velocity_motion(
 
     Args:
         motion: (4, 4) predicted motion.
-        status: reason why the motion was not measured.
     """
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])

@@ -15,16 +15,12 @@ _MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning at which more than two thirds of the corners are matched.
+    """Returns the smallest binning [px] at which over two thirds of the corners are matched, else that with the most.
 
-    Without such a binning, returns the one at which the largest fraction of them is matched. Only binnings that divide
-    the width and the height of the images are tried.
+    Only binnings that divide the width and the height of the images are tried.
 
     Args:
         left, right: (height, width, 3) images of a stereo pair.
-
-    Returns:
-        Number of pixels along each side that are averaged to one.
     """
     best, best_fraction = 1, 0.0
     for binning in BINNINGS:

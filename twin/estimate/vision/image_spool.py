@@ -40,7 +40,6 @@ class ImageSpool:
         """Stores the stereo pair of a keyframe; another thread writes it to disk.
 
         Args:
-            row: index of the frame in the trajectories.
             left, right: (height, width, 3) RGB images at full size.
             gray: grey levels of both images at the binning of the spool (`matching.gray`).
 

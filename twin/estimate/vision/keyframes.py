@@ -42,7 +42,6 @@ class Keyframe:
         `accumulated_cov`.
 
         Args:
-            earlier: the other keyframe.
             world_from_camera: (4, 4) pose of the camera whose axes are used; by default the pose of this keyframe.
         """
         pose = self.world_from_camera if world_from_camera is None else world_from_camera

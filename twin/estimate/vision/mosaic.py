@@ -63,7 +63,6 @@ class Mosaic:
         """Fills empty cells of the mosaic from a keyframe; does nothing if no depth is known.
 
         Args:
-            number: number of the keyframe.
             image: (height, width) normalised left image.
             depth_m: (height, width) depth [m], NaN where unknown.
             world_from_camera: (4, 4) pose of the keyframe.

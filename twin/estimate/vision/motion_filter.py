@@ -17,15 +17,12 @@ _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it
 class MotionFilter:
     """Extended Kalman filter of the pose in a reference camera and of the velocity, with white-noise acceleration.
 
-    The acceleration of a vehicle is limited. Where the image determines a pose well, the filter follows the measured
-    pose; where it does not (few pixels, noise), the pose follows mainly from the velocity estimated over many frames. A
-    measurement that contradicts the prediction is rejected. The model is that of nearly constant velocity (Bar-Shalom,
-    Li & Kirubarajan 2001, Estimation with Applications to Tracking and Navigation, section 6.2.2). Errors of the pose
+    Nearly constant velocity (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2): where the image determines a pose
+    poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. Errors of the pose
     are motions [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
 
-    Attributes:
-        pose: (4, 4) pose of the last frame in the reference camera.
-        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    Attributes:     pose: (4, 4) pose of the last frame in the reference camera.     velocity: (6,) twist of the camera
+    in its own axes [rad/s, m/s].
     """
 
     def __init__(self):

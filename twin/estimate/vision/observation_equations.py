@@ -41,16 +41,9 @@ class LinearisedObservations(NamedTuple):
 
 @kernel
 def image_jacobian(x, y, depth):
-    """Returns the Jacobian of normalised image positions with respect to the twist of the camera [w, t] (rad, m).
+    """Returns the Jacobian (n, 2, 6) of normalised image positions with respect to the twist of the camera (rad, m).
 
-    This is eq. 1 of Negahdaripour & Madjidi 2003.
-
-    Args:
-        x, y: (n,) normalised image coordinates.
-        depth: (n,) depth [m].
-
-    Returns:
-        (n, 2, 6) Jacobian.
+    This is eq. 1 of Negahdaripour & Madjidi 2003; x, y and depth [m] are (n,).
     """
     jacobian = np.empty((len(x), 2, 6))
     for i in range(len(x)):

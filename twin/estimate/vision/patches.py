@@ -71,7 +71,6 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
     """Extracts the patches around points, at every level of a pyramid.
 
     Args:
-        images: pyramid of the source image.
         points: (n, 2) patch centres in the full image, at whole pixels.
         patch_px: side of the patch (odd), the same at every level.
 

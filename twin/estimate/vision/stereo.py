@@ -46,9 +46,8 @@ class StereoPoints(NamedTuple):
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Returns (x, y, disparity) of points and their covariance from their positions in both images of a rectified pair.
 
-    The left column determines x and is also part of the disparity, so x and disparity are correlated. The rows of both
-    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if the
-    errors of column and row are correlated.
+    The left column is in both x and disparity, so they are correlated. Equal rows are enforced by a Kalman update,
+    which also corrects the columns if the errors of column and row are correlated.
 
     Args:
         left, right: (n, 2) positions in the left and in the right image [px].
@@ -85,10 +84,9 @@ def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> 
 def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
     """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1.
 
-    A point has the same row in both images of a rectified pair, so the row differences of a stereo pair measure the
-    matching noise. Their median, which calibration errors cause, is subtracted first; the ratio is then 1.4826 times
-    the median of the absolute differences divided by their expected standard deviations. The result is 1 for fewer than
-    30 points, and for a ratio that does not exceed 1 by two standard errors of 1.17 / sqrt(n).
+    Row differences of a stereo pair, minus their median (calibration errors), measure the matching noise. The ratio is
+    1.4826 times the median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors
+    of 1.17 / sqrt(n).
 
     Args:
         left, right: (n, 2) positions of the patches in the left and in the right image [px].
@@ -118,15 +116,9 @@ def margin_px(patch_px: int) -> int:
 
 
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the patches that are far enough inside the image to stay there despite matching errors.
+    """Returns a mask (n,) of the patches, predicted at `pixels` (n, 2), that stay inside despite matching errors.
 
-    The predicted positions must be independent of the matching errors. A test of the measured positions would prefer
-    matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
-    this biased disparities near the border by -0.02 px and links over two keyframes by 0.16 mrad.
-
-    Args:
-        pixels: (n, 2) predicted patch centres [px].
-        rig: calibration, for the image size.
+    Measured positions would prefer errors that point away from the border (-0.02 px of disparity over coarse texture).
     """
     return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
@@ -184,9 +176,7 @@ def match_stereo_points(
 def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching.Gray) -> NDArray[np.float32]:
     """Returns disparities (H, W) [px] for the slopes of patches: refined ones, or the initial ones where that fails.
 
-    Slopes from semi-global matching are 8 to 12 % too small over coarse texture, because it prefers constant
-    disparities. A patch that is warped by a wrong slope covers another part of the floor in the other images, which
-    biased the rotation of links by 0.17 mrad per metre of displacement.
+    Semi-global matching makes slopes 8 to 12 % too small over coarse texture, which biased the rotation of links.
     """
     refined = epipolar.refine(left, right, dense_px, epipolar.STEREO).disparity_px
     return np.where(np.isfinite(refined), refined, dense_px)

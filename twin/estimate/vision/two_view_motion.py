@@ -159,7 +159,6 @@ def pair_motion(
     Args:
         measured: points in the earlier pair a and the later pair b.
         guess: (4, 4) initial pose of b in a.
-        settings: stochastic model and number of iterations.
 
     Returns:
         The motion, with its residual relative to the expected standard deviation; None if too few points or inliers.

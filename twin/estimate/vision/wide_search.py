@@ -27,13 +27,11 @@ _CHI2 = chi2.ppf(0.9999, 6)  # largest chi-square of the difference between a me
 
 
 def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig) -> bool:
-    """Returns whether the predicted image positions of the points may be wrong by more than a search range.
+    """Returns whether the predicted image positions of the points may be wrong by more than a search range [px].
 
-    This is so if three times the median standard deviation of the positions, along the direction in which it is
-    largest, exceeds the range.
+    That is, if three times the median standard deviation of the positions, along its largest direction, exceeds it.
 
     Args:
-        range_px: largest error of a predicted position from which it is found [px].
         cov: (6, 6) covariance of the predicted motion [rotation, translation] (rad, m), in the axes of the node.
     """
     x, y, disparity = np.ascontiguousarray(points.measured.T)
@@ -65,16 +63,12 @@ def coarse_motion(
 ) -> Array | None:
     """Returns the pose (4, 4) of the left camera of a node in that of another node; None if too few features agree.
 
-    SIFT features (Lowe 2004) of the left images are matched by their descriptors. The depth of a feature of the node
-    follows from the nearest matched stereo point at a distance of up to one patch side; features without such a point
-    are left out. The pose is computed from the 3-D features and their pixels in the other image (perspective-n-point
-    with RANSAC). Its error displaces points by one or two pixels, so it serves as a prediction for the measurement of a
-    link.
+    SIFT features (Lowe 2004) get their depth from the nearest stereo point within one patch side; the pose is that of
+    perspective-n-point with RANSAC. Its error of one or two pixels suffices to predict the measurement of a link.
 
     Args:
         node, other: (H, W) grey levels of the left images.
-        points: matched stereo points of the node.
-        patch_px: side of the patches, the largest distance of a feature from a stereo point [px].
+        patch_px: largest distance of a feature from a stereo point [px].
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
     node_px, node_descriptors = _features(sift, node)
