@@ -60,9 +60,8 @@ class FloorPlane(NamedTuple):
 def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | None = None) -> PairInspection:
     """Matches the stereo pair of a frame over the widest range of disparities, and again with the two images exchanged.
 
-    If the left and the right image were swapped in the recording, disparities are negative, so that almost no point is
-    matched in the given order, and many are in the other order. The images count as swapped if at least 30 points are
-    matched with the images exchanged, and at least three times as many as in the given order.
+    The images count as swapped if, exchanged, at least 30 points are matched and three times as many as in the given
+    order.
     """
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
     left, right = square_images(frame, rig)
@@ -73,11 +72,7 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
 
 
 def square_images(frame: Frame, rig: StereoRig) -> tuple[Image, Image]:
-    """Returns the left and the right image of a frame with both images, resampled to square pixels.
-
-    Args:
-        rig: believed calibration; that of the returned images is `rig.with_square_pixels()`.
-    """
+    """Returns the left and right image of a frame, resampled to square pixels (`rig.with_square_pixels()`)."""
     assert frame.right is not None
     scale = rig.fx_px / rig.fy_px
     left, right = (one if scale == 1 else matching.scaled_rows(one, scale) for one in (frame.left, frame.right))
@@ -97,14 +92,9 @@ def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSetti
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
     """Returns the plane of the floor, fitted to the matched points of a pair; None for fewer than 30 points.
 
-    Of the planes through 300 random triples of points, that with the smallest median distance of all points (least
-    median of squares, Rousseeuw 1984) is refined by least squares over the points within 2.5 robust standard
-    deviations of the best plane. The plane perpendicular to the optical axis at the median depth is returned instead if
-    the points scatter by more than 15 % of their median depth, or if the optical axis is inclined by more than 45
-    degrees to the perpendicular of the plane (a wall, a horizon).
-
-    Args:
-        points: matched points (`PairInspection.points`).
+    The least median of squares (Rousseeuw 1984) over 300 random triples is refined by least squares within 2.5 robust
+    standard deviations. If the points scatter by more than 15 % of their median depth or the plane is inclined by more
+    than 45 degrees (a wall, a horizon), it is perpendicular to the optical axis at the median depth.
     """
     xyz = points.xyz
     if len(xyz) < _MIN_POINTS:

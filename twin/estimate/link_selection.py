@@ -122,13 +122,8 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 def floor_share(motion: Motion) -> float:
     """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
 
-    With r the robust standard deviation of the residuals divided by the expected one (`Motion.residual`), the fraction
-    is 1 - 1 / r^2, or 0 if r does not exceed 1 by two standard errors. For n normally distributed residuals with three
-    coordinates, r is the median of n chi-distributed values divided by its expectation, and has a standard error of
+    1 - 1 / r^2 with r the relative residual (`Motion.residual`); 0 if r does not exceed 1 by two standard errors of
     0.56 / sqrt(n).
-
-    Args:
-        motion: motion from `two_view_motion.pair_motion`.
     """
     limit = 1 + 2 * _RESIDUAL_STANDARD_ERROR / max(motion.n_points, 1) ** 0.5
     return 1 - motion.residual**-2 if motion.residual > limit else 0.0

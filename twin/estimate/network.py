@@ -110,9 +110,6 @@ class KeyframeNetwork:
 
     Args:
         vision: source of the visual measurements, including the links.
-        rig: believed calibration.
-        noise: believed noise of the navigation sensors.
-        settings: settings of the estimators.
         stopwatch: returns the context manager that times the stage of a given name.
 
     Attributes:

@@ -72,8 +72,6 @@ class Navigator:
     """Estimates the trajectory of a stereo camera and the map from frames. Use as a context manager, or call `close`.
 
     Args:
-        rig: believed calibration.
-        settings: settings of the estimators.
         start: (4, 4) world_from_camera of the first frame, the reference position; by default the camera is at the
             origin with its optical axis along -z of the world. If the frames have readings of height or attitude, the
             z axis of the world must point up.

@@ -60,8 +60,6 @@ class StereoVision:
     Use as a context manager, or call `close`.
 
     Args:
-        rig: believed calibration.
-        settings: settings of the estimators.
         folder: folder for the images of keyframes and the tiles of the mosaic.
         cell_m: cell size of the mosaic for images of full size [m]; for binned images it is multiplied by the binning.
             By default, it is the ground sample distance of the first keyframe at full size.
