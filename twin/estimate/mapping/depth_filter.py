@@ -178,10 +178,8 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
     """Returns depth and variance at column x and row y, interpolated between the four neighbouring pixels.
 
-    Both are NaN if a neighbour is unknown, if the neighbours lie on different surfaces (disparities that differ by
-    `jump` [px] or more), and outside the image. Inverse depth is interpolated, because it is linear on planes. The
-    variance is interpolated linearly; it does not decrease as for independent errors, because the matching windows of
-    neighbouring pixels overlap.
+    NaN if a neighbour is unknown, on another surface (disparities differ by `jump` [px]) or outside. Inverse depth is
+    linear on planes. The variance is interpolated too, because neighbouring matching windows overlap.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -275,10 +273,8 @@ def _quadratic(row, cov):
 def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
     """Returns the variance (H, W) [px^2] of the disparity from motion that is due to the error of the relative pose.
 
-    A pose error displaces the image point; the component of this displacement along the epipolar line has the same
-    effect as an error of depth. The variance is J cov J', with J the derivative of the disparity with respect to the
-    pose. It is NaN where a change of depth does not displace the image point: at the epipole, and everywhere without
-    translation. It is 0 at pixels without disparity, and everywhere if `step_cov` is zero.
+    J cov J', with J the derivative along the epipolar line. NaN where depth does not displace the image point (epipole,
+    no translation); 0 without disparity, and everywhere if `step_cov` is zero.
     """
     height, width = disparity.shape
     focal, cx, cy = camera

@@ -142,14 +142,10 @@ class ElevationMapper:
 
 
 def _isolated(height: Map, other: Map) -> Mask:
-    """Returns a mask (rows, cols) of the cells whose neighbours do not support the chosen hypothesis but the other one.
+    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one.
 
-    These are the cells with two hypotheses and at least five known neighbours, where fewer than `_NEIGHBOURS_AT_CORNER`
-    of the neighbours are at least as near to `height` as to `other`. Such a height is usually a mismatch, because a
-    cell next to a real step has more neighbours on its own side of the step.
-
-    Args:
-        height, other: (rows, cols) chosen and other hypothesis [m]; NaN where unknown.
+    Of at least five known neighbours, fewer than `_NEIGHBOURS_AT_CORNER` are at least as near to `height` as to
+    `other`: usually a mismatch, because a cell next to a real step has more neighbours on its own side.
     """
     around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
     known, agreeing = np.zeros(height.shape, np.int8), np.zeros(height.shape, np.int8)
@@ -241,11 +237,10 @@ def _remove_propagated(
 def _fuse_cells(
     row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
 ):  # fmt: skip
-    """Fuses each height of a height patch (rows, cols) with one hypothesis of its cell, in place.
+    """Fuses each height of a patch with the hypothesis of its cell that fits best within the gate, in place.
 
-    The hypothesis is the one that fits best within the gate. A height that fits none becomes a hypothesis itself. If
-    the cell has two already, the height replaces the one with the larger depth variance, or is ignored if its own depth
-    variance is not smaller.
+    A height that fits none becomes a hypothesis, or replaces the one with the larger depth variance if its own is
+    smaller.
     """
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
