@@ -151,11 +151,10 @@ def _contrast(image: Map) -> Map:
 
 
 def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Map, Mask]:
-    """Warps the other image O to the reference image I, and adapts its local mean and standard deviation to those of I.
+    """Warps the other image O to the reference I, and adapts its local mean and standard deviation to those of I.
 
     Returns:
-        Residual I - O, 0 at pixels not visible in O; gradient dO/dd and pixel locking, both from `_warp`; and a mask
-        of the pixels that are visible in O. Each is (H, W).
+        Residual I - O (0 where not visible), gradient dO/dd and pixel locking (`_warp`), and mask of visible pixels.
     """
     warped, slope, locking = np.zeros_like(reference), np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope, locking)
@@ -286,10 +285,10 @@ def _interpolated_noise(t):
 
 @kernel(forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
-    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fit at each pixel.
+    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fits, in place.
 
-    `sums` is modified in place. `centre` (n,) are the disparities of the pixels; `disparity`, `residual`, `slope` and
-    `locking` (n,) are the values of their neighbours. The loop is written so that the compiler can vectorise it.
+    `centre` are the disparities of the pixels, the others belong to the neighbours; the compiler can vectorise the
+    loop.
     """
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11, s12 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11], sums[12]
@@ -319,13 +318,8 @@ def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight,
 def _fit_planes(disparity, residual, slope, locking, noise, window, support, priors):
     """Fits a plane to the disparities around each pixel.
 
-    The expected product of residual and slope due to noise alone is subtracted: `locking` times the mean squared
-    residual of the window, or times `noise` if that is smaller.
-
-    Args:
-        disparity, residual, slope, locking: (H, W) results of `_balanced_warp` and the current disparity [px].
-        noise: (H, W) noise variance [grey levels squared].
-        window: (n,) weights of the window along one axis.
+    The expected noise product of residual and slope is subtracted: `locking` times the mean squared residual of the
+    window, or times `noise` (H, W) if that is smaller.
 
     Returns:
         Disparity at the centre (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (see

@@ -196,10 +196,8 @@ def _extract(source, centres, half):
 
 @kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _prepare(source, u0, v0, half, rows):
-    """Prepares a patch of m pixels for matching: writes its nuisance basis and projected gradient to `rows` (8, m).
-
-    By Gram-Schmidt orthogonalisation, rows 0 to 5, the basis of the nuisance parameters (`PatchTemplates`), are
-    orthonormal, and rows 6 and 7, the gradients in column and in row, are orthogonal to them.
+    """Writes the nuisance basis (rows 0 to 5, orthonormal) and projected gradient (6 and 7) of a patch to `rows` (8,
+    m).
 
     Returns:
         The sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
@@ -251,12 +249,9 @@ def _dot(a, b):
 
 @kernel(forceinline=True, fastmath=True)
 def _sample(spline, u0, v0, warp, half, values):
-    """Writes the values of the target's cubic B-spline at the m pixels of a warped patch to `values` (m,).
+    """Writes the target's cubic B-spline at the m pixels of a warped patch, centred at (u0, v0), to `values` (m,).
 
-    The centre of the patch is at column u0 and row v0 of the target.
-
-    For speed, positions relative to the centre are in single precision, and unsigned indices avoid a check for
-    negative values.
+    For speed, relative positions are in single precision, and unsigned indices avoid a check for negative values.
     """
     side, width = 2 * half + 1, spline.shape[1]
     flat = spline.ravel()
@@ -291,12 +286,7 @@ def _sample(spline, u0, v0, warp, half, values):
 
 @kernel(fastmath=_REASSOCIATE)
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
-    """Matches patches at one pyramid level.
-
-    Args:
-        guess: (n, 2) expected positions [px of this level].
-        warps: (n, 2, 2) derivative of target pixels with respect to source pixels.
-        tolerance: the iteration ends at a step whose absolute column and row components sum to less [px of this level].
+    """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`.
 
     Returns:
         Positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where matching failed.
