@@ -97,17 +97,10 @@ def _draw_positions(solution: Solution) -> Array:
 
 
 def _independent_errors(draws: Array, covs: Array) -> float | None:
-    """Returns the number of independent position errors whose mean NEES varies as much as that of all nodes.
+    """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes.
 
-    The sum of 3 k squared independent standard normal numbers, divided by k, has the variance 6 / k. The errors of the
-    nodes of a survey are correlated, so k is much smaller than the number of nodes.
-
-    Args:
-        draws: (m, n, 3) errors of the positions of n nodes, drawn m times from their joint covariance [m].
-        covs: (n, 3, 3) covariances of the positions [m2].
-
-    Returns:
-        The number k; None without a node of known covariance.
+    Of 3 k squared normal numbers, the sum divided by k has the variance 6 / k. `draws` (m, n, 3) are errors drawn from
+    the joint covariance [m], `covs` (n, 3, 3) [m2]; None without a node of known covariance.
     """
     known = np.linalg.eigvalsh(covs)[:, 0] > 0
     if not known.any():

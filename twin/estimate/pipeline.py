@@ -395,10 +395,8 @@ class Navigator:
     def _is_keyframe(self, frame: Frame, status: str) -> bool:
         """Returns whether a frame is to become a keyframe by the rules of `update`, before its points are matched.
 
-        The motion from this stereo pair to the next is expected to equal the motion since the last pair. If, after this
-        motion, the next pair would overlap with the last keyframe by less than `settings.keyframe_overlap`, this pair
-        becomes a keyframe. Without this prediction, consecutive keyframes would overlap by less than this fraction
-        where pairs are far apart.
+        It does if, after a motion equal to that since the last pair, the next pair would overlap with the last keyframe
+        by less than `settings.keyframe_overlap`.
         """
         if frame.right is None or frame.keyframe is not None:
             return bool(frame.keyframe) and frame.right is not None
@@ -448,14 +446,10 @@ class Navigator:
         return status
 
     def _follow_chain(self, node: Keyframe) -> Link | None:
-        """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
+        """Measures the motion from the last node (None if it fails); it replaces the F2F motion in the online pose.
 
-        The motion from two stereo pairs is more accurate than the motion accumulated over the frames between them, and
-        gives the global alignment better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections of
-        the pose since the last node, by navigation sensors and by F2M, are kept.
-
-        Returns:
-            The link from the last node, or None if it could not be measured.
+        It is more accurate than accumulated F2F (Negahdaripour & Madjidi 2003, section IV-5). Corrections of the pose
+        since the last node, by navigation sensors and by F2M, are kept.
         """
         link = self.network.link_to_last_node(node)
         if link is None:
@@ -470,9 +464,8 @@ class Navigator:
     def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
         """Corrects the online pose by registration with the mosaic (F2M).
 
-        The mosaic contains the pose errors of the keyframes it was made from. The correction is therefore weighted by
-        the covariance of the motion since the keyframe that the compared cells come from, not by the covariance of the
-        pose.
+        The mosaic has the pose errors of its keyframes, so the correction is weighted by the covariance of the motion
+        since the keyframe that the compared cells come from.
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov

@@ -193,8 +193,7 @@ def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
 def _scale(quality: EstimationQuality) -> Iterator[Finding]:
     """Yields a finding if lengths from the images differ from those of the navigation sensors.
 
-    The scale along the optical axis is judged only where that across it is right: a rotation that images and a DVL of
-    different scales determine together is wrong, and with it the part of the DVL's displacement along the axis.
+    The scale along the optical axis is judged only where that across it is right, as the rotation is wrong otherwise.
     """
     for check, scale, which, cause in (
         ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),

@@ -187,12 +187,9 @@ class StereoVision:
         return _MatchedPair(right_image, right, dense_px, points)
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
-        """Returns the number of matched points, the image quality and the row differences of a stereo pair.
+        """Returns the matched points, the image quality and the row differences of a stereo pair.
 
-        Row differences are in pixels of the full image with square pixels.
-
-        Args:
-            left: (H, W, 3) left image of the frame, not resampled.
+        Row differences are in pixels of the full image with square pixels; `left` (H, W, 3) is not resampled.
         """
         contrast, saturated = matching.contrast(self._gray), matching.saturated_fraction(left)
         repeated = repetition(self._image, self.settings.patch_px)
@@ -248,12 +245,8 @@ class StereoVision:
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
         """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
 
-        With `settings.wide_search`, this is tried for every motion. Otherwise it is tried only where the predicted
-        poses are too uncertain for the matching of points, and a motion that contradicts these poses is rejected.
-
-        Returns:
-            The motion. None if the search is not tried, if the features do not give a prediction, if the measurement
-            fails, or if the motion is rejected.
+        Without `settings.wide_search`, only where the predicted poses are too uncertain for matching, and rejected if
+        it contradicts them. None if not tried, failed or rejected.
         """
         if node.points is None or not len(node.points.xyz):
             return None
@@ -294,10 +287,8 @@ class StereoVision:
         )
 
     def _light_pattern(self, rows: NDArray[np.int64]) -> LightPattern | None:
-        """Returns the light pattern of the images; None if it is not needed or not known (`light_pattern`).
-
-        Args:
-            rows: frame indices of the keyframes, of which at most `_PATTERN_PAIRS` are used.
+        """Returns the light pattern (`light_pattern`) of the keyframes at these frame indices, or of `_PATTERN_PAIRS`
+        of them.
         """
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
         return light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
