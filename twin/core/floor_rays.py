@@ -18,18 +18,14 @@ class HeightField(NamedTuple):
 
     Each cell is split along the diagonal from node (r, c) to (r + 1, c + 1), as in `terrains.Terrain`. There is no
     floor in cells with a NaN corner and outside the grid.
-
-    Args:
-        height_m: (ny, nx) heights of the nodes, row 0 = south, column 0 = west.
-        spacing_m: distance between neighbouring nodes.
-        west_m, south_m: position of node (0, 0).
-        lowest_m, highest_m: height of the lowest and of the highest node.
     """
 
-    height_m: Array
-    spacing_m: float
+    height_m: Array  #: (ny, nx) heights of the nodes, row 0 = south, column 0 = west
+    spacing_m: float  #: distance between neighbouring nodes
+    #: west_m, south_m: position of node (0, 0).
     west_m: float
     south_m: float
+    #: lowest_m, highest_m: height of the lowest and of the highest node.
     lowest_m: float
     highest_m: float
 
@@ -62,9 +58,7 @@ def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array)
     The depth is inf where the ray of a pixel does not meet the floor, see `cast_ray`.
 
     Args:
-        field: the floor.
         poses: (n, 4, 4) world_from_camera.
-        rig: calibration of the camera.
         pixels: (m, 2) column and row [px].
     """
     return _cast_directions(field, np.ascontiguousarray(poses, np.float64), rig.normalised(pixels))
@@ -93,10 +87,8 @@ def cast_camera_ray(field, pose, a, b):
 def cast_ray(field, ox, oy, oz, dx, dy, dz):
     """Returns the smallest t >= 0 at which the ray o + t d meets the floor; 0 if o lies below the floor.
 
-    The ray is traversed cell by cell (Amanatides & Woo 1987) between the heights of the highest and the lowest node. In
-    each cell it crosses at most two triangles; over each of them, its height above the floor is linear in t. The result
-    is inf if d does not point downwards, if the traversal starts outside the grid, or if it leaves the grid or enters a
-    cell without floor before the ray meets the floor.
+    Cell by cell (Amanatides & Woo 1987) between the highest and the lowest node. inf if d does not point downwards, or
+    if the ray starts outside the grid, leaves it or enters a cell without floor first.
     """
     if not dz < 0:
         return np.inf

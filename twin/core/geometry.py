@@ -110,19 +110,14 @@ def product(a: Array, b: Array) -> Array:
 def nearest_rigid(matrices: Array) -> Array:
     """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
 
-    Long products of motions accumulate rounding errors, so that their rotations are no longer orthogonal. `inverse`
-    transposes the rotation, which is exact only for an orthogonal matrix: if R deviates from orthogonality, R^T R
-    deviates from the identity by twice as much.
+    Products accumulate rounding errors, and `inverse`, a transpose, is exact only for an orthogonal rotation.
     """
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
 
 @kernel
 def _nearest_rigid(matrices):
-    """Compiled kernel of `nearest_rigid` for matrices (n, 4, 4).
-
-    Newton's iteration for the orthogonal polar factor, R <- (R + R^-T) / 2 (Higham 1986).
-    """
+    """Kernel of `nearest_rigid`: Newton's iteration R <- (R + R^-T) / 2 (Higham 1986)."""
     result = matrices.copy()
     for motion in result:
         change = np.inf
@@ -231,9 +226,8 @@ def log(a_from_b: Array) -> Array:
 def log_derivative(motion: Array) -> Array:
     """Returns the inverse right Jacobian J (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
 
-    With motion = [w, v], K = skew(w) and c from `_inverse_jacobian_coefficient`, both diagonal blocks are the inverse
-    right Jacobian of SO(3), I + K / 2 + c K^2. The lower left block (translation from rotation) is the derivative of
-    this matrix with respect to w in the direction v (Selig 2005).
+    For [w, v] and K = skew(w), the diagonal blocks are I + K / 2 + c K^2 (`_inverse_jacobian_coefficient`); the lower
+    left block is their derivative with respect to w in the direction v (Selig 2005).
     """
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
     c, slope = _inverse_jacobian_coefficient(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])

@@ -14,21 +14,15 @@ class Georeference:
 
     With the origin (E0, N0, H0) of the scene and k metres per unit of the CRS, a scene point (x, y, z) [m] lies at
     E = E0 + x / k, N = N0 + y / k and at the elevation H0 + z.
-
-    Args:
-        easting, northing: coordinates E0, N0 of the scene origin in the CRS, in its unit.
-        elevation_m: elevation H0 of the plane z = 0 above the zero of the vertical datum, positive upwards.
-        crs_wkt: CRS as WKT; None: the source has coordinates but does not name their CRS.
-        metres_per_unit: length k of the horizontal unit of the CRS.
-        vertical_datum: name of the vertical CRS; "" if the source does not name it.
     """
 
+    #: easting, northing: coordinates E0, N0 of the scene origin in the CRS, in its unit.
     easting: float
     northing: float
-    elevation_m: float = 0.0
-    crs_wkt: str | None = None
-    metres_per_unit: float = 1.0
-    vertical_datum: str = ""
+    elevation_m: float = 0.0  #: elevation H0 of the plane z = 0 above the zero of the vertical datum, positive upwards
+    crs_wkt: str | None = None  #: CRS as WKT; None: the source has coordinates but does not name their CRS
+    metres_per_unit: float = 1.0  #: length k of the horizontal unit of the CRS
+    vertical_datum: str = ""  #: name of the vertical CRS; "" if the source does not name it
 
     def to_scene(self, easting: ArrayLike, northing: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Returns the scene coordinates x and y [m] of points in the CRS."""

@@ -11,14 +11,9 @@ _INITIAL_CAPACITY = 2**17
 
 
 class GrowingArray:
-    """Contiguous array of rows of one shape; its capacity doubles when it is full.
+    """Contiguous array of rows of one shape (omitted for scalars); its capacity doubles when it is full.
 
-    The initial capacity is sufficient for most surveys. Memory pages that are never written occupy no RAM, so a large
-    initial buffer costs less than repeated copies of a small one.
-
-    Args:
-        shape: shape of one row; omitted for scalars.
-        dtype: type of the elements.
+    The initial capacity suffices for most surveys: pages that are never written occupy no RAM.
     """
 
     def __init__(self, *shape: int, dtype: DTypeLike = float):

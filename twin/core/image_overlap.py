@@ -20,18 +20,11 @@ HIDDEN_BEFORE = 1e-3
 def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRig) -> Array:
     """Returns the overlap (n,) of pairs of images: the share of the floor in the first that the second shows too.
 
-    The first image is tiled by a grid of cells. The floor point at the centre of each cell is found by ray casting; the
-    cell is weighted by the fraction of it that projects into the second image, or by 0 if this point is occluded there.
-    Cells whose ray meets no floor are left out. For two down-looking images of a level floor with the same heading and
-    altitude, the result is exactly the overlap of their footprints.
+    The floor at each cell of a grid over the first image (by ray casting) is weighted by the part of the cell that
+    projects into the second, 0 if occluded. Cells without floor are left out; NaN if there are no others.
 
     Args:
-        field: the floor.
         first, second: (n, 4, 4) world_from_camera of the images of each pair.
-        rig: calibration of the camera that takes both images.
-
-    Returns:
-        The overlaps, 0 to 1; NaN where the first image shows no floor.
     """
     pixels = ray_grid(rig, RAY_COLUMNS)
     cell = rig.width_px / RAY_COLUMNS, rig.height_px / (len(pixels) // RAY_COLUMNS)
@@ -64,7 +57,6 @@ def _share_seen(field, pose, camera, cell, x, y, z, depth):
     """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
 
     Args:
-        field: the floor.
         pose: (4, 4) world_from_camera of the second camera.
         camera: fx, fy, cx, cy, width and height [px].
         cell: width and height of a cell in the first image [px].

@@ -1,7 +1,4 @@
-"""Compiled kernels that interpolate between the pixels of an image.
-
-Fractions are positions between two neighbouring samples, in [0, 1).
-"""
+"""Compiled kernels that interpolate between the pixels of an image; fractions between two samples are in [0, 1)."""
 
 from __future__ import annotations
 

@@ -85,5 +85,4 @@ class StageGuard:
             self._waiting = [number]
 
     def _deliver(self, number: int, frame: FrameType | None) -> None:
-        """Calls the handler that was installed for a signal when the context was entered."""
         self._handlers[number](number, frame)

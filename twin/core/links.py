@@ -13,32 +13,25 @@ from twin.core.growing_array import GrowingArray
 
 
 class Link(NamedTuple):
-    """Measured motion between two nodes of the keyframe network.
+    """Measured motion between two nodes of the keyframe network."""
 
-    Args:
-        i, j: keyframe numbers, i < j.
-        i_from_j: (4, 4) pose of camera j in camera i.
-        cov: (6, 6) covariance of [rotation, translation] (rad, m) in camera j, as used by the alignment.
-        overlap: fraction of the matched points of node j that project into image i (0 to 1).
-        n_points: matched points used; 0 for frame-to-frame motion that replaces a failed measurement.
-        shared_by: effective number of links that share the errors of this one: those that share the stereo observation
-            of node j, times the factor for errors of the floor (`link_selection.inflate_for_shared_noise`). To account
-            for the correlation, `cov` is the covariance of the single measurement times this number.
-        closed_form: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as
-            exact; None: not computed.
-        floor_share: fraction (0 to 1) of the variance of the measurement that image noise does not explain. This part
-            of the variance is due to the relief within the matched patches, and is therefore correlated between links
-            that use the same patches. `Links` does not store `floor_share`.
-    """
-
+    #: i, j: keyframe numbers, i < j.
     i: int
     j: int
-    i_from_j: Array
-    cov: Array
-    overlap: float
-    n_points: int
+    i_from_j: Array  #: (4, 4) pose of camera j in camera i
+    cov: Array  #: (6, 6) covariance of [rotation, translation] (rad, m) in camera j, as used by the alignment
+    overlap: float  #: fraction of the matched points of node j that project into image i (0 to 1)
+    n_points: int  #: matched points used; 0 for frame-to-frame motion that replaces a failed measurement
+    #: effective number of links that share the errors of this one: those that share the stereo observation of node j,
+    #: times the factor for errors of the floor (`link_selection.inflate_for_shared_noise`). To account for the
+    #: correlation, `cov` is the covariance of the single measurement times this number.
     shared_by: float = 1.0
+    #: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as exact; None:
+    #: not computed.
     closed_form: Array | None = None
+    #: fraction (0 to 1) of the variance of the measurement that image noise does not explain. This part of the variance
+    #: is due to the relief within the matched patches, and is therefore correlated between links that use the same
+    #: patches. `Links` does not store `floor_share`.
     floor_share: float = 0.0
 
     @property
@@ -147,12 +140,10 @@ class Links(Sequence[Link]):
 
     @property
     def _table(self) -> NDArray[Any]:
-        """Returns all links as a structured array (n,)."""
         self._convert_pending()
         return self._rows.array
 
     def _convert_pending(self) -> None:
-        """Converts all links added since the last conversion to rows."""
         if self._pending:
             pending, self._pending = self._pending, []
             *columns, closed_forms, _ = zip(*pending, strict=True)

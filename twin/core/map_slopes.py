@@ -14,7 +14,6 @@ def map_slopes(height_m: Array, cell_m: float) -> tuple[Array, Array]:
 
     Args:
         height_m: (rows, cols) heights; row 0 is the northernmost, column 0 the westernmost.
-        cell_m: side of a cell.
     """
     south, east = (
         np.gradient(height_m, cell_m, axis=axis) if height_m.shape[axis] > 1 else np.zeros_like(height_m)

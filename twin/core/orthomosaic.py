@@ -14,18 +14,13 @@ TILE_PX = 2048
 
 
 class OrthoTile(NamedTuple):
-    """Rectangular part of an orthomosaic.
+    """Rectangular part of an orthomosaic."""
 
-    Args:
-        grid: grid of the pixels of the whole orthomosaic.
-        row, col: row and column of the first pixel of the tile in that grid.
-        rgba: (rows, cols, 4) uint8; the last band is 255 where the orthomosaic has a colour, otherwise 0.
-    """
-
-    grid: MapGrid
+    grid: MapGrid  #: grid of the pixels of the whole orthomosaic
+    #: row, col: row and column of the first pixel of the tile in that grid.
     row: int
     col: int
-    rgba: Image
+    rgba: Image  #: (rows, cols, 4) uint8; the last band is 255 where the orthomosaic has a colour, otherwise 0
 
     @property
     def known(self) -> np.ndarray:

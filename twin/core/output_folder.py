@@ -29,7 +29,6 @@ def sole_writer(folder: Path, option: str = "--out", used: bool = False, allowed
     are empty at the end are removed.
 
     Args:
-        folder: the folder.
         option: field of the errors.
         used: whether the folder may have contents.
         allowed: what the error of a folder with contents allows.

@@ -13,92 +13,70 @@ Array = NDArray[np.float64]
 
 
 class EpipolarError(NamedTuple):
-    """Errors of the rectification of the right image, estimated from row differences.
+    """Errors of the rectification of the right image, estimated from row differences."""
 
-    Args:
-        estimate: (4,) pitch, yaw, roll of the right camera [rad], with the signs of `calibration_error.right_*`, and
-            row offset [focal lengths].
-        sigma: (4,) standard deviations of `estimate`.
-        removed: (4,) errors corrected in the right images, in the same units; yaw is never corrected.
-        pattern: weighted RMS over the regions of the image of the mean row difference that `estimate` does not
-            explain, without the part due to matching noise [focal lengths].
-    """
-
+    #: (4,) pitch, yaw, roll of the right camera [rad], with the signs of `calibration_error.right_*`, and row offset
+    #: [focal lengths].
     estimate: Array
-    sigma: Array
-    removed: Array
+    sigma: Array  #: (4,) standard deviations of `estimate`
+    removed: Array  #: (4,) errors corrected in the right images, in the same units; yaw is never corrected
+    #: weighted RMS over the regions of the image of the mean row difference that `estimate` does not explain, without
+    #: the part due to matching noise [focal lengths].
     pattern: float = 0.0
 
 
 class DisparityOffset(NamedTuple):
-    """Offset that all disparities share, estimated from the motions between keyframes [focal lengths].
+    """Offset that all disparities share, estimated from the motions between keyframes [focal lengths]."""
 
-    Args:
-        estimate: measured minus true disparity.
-        sigma: standard deviation of `estimate`.
-    """
-
-    estimate: float
-    sigma: float
+    estimate: float  #: measured minus true disparity
+    sigma: float  #: standard deviation of `estimate`
 
 
 class LengthScale(NamedTuple):
-    """Lengths from the images divided by those of navigation sensors; 1 is expected.
+    """Lengths from the images divided by those of navigation sensors; 1 is expected."""
 
-    Args:
-        estimate, sigma: the ratio and its standard deviation.
-        sensors: names of the sensors that determine it.
-    """
-
+    #: estimate, sigma: the ratio and its standard deviation.
     estimate: float
     sigma: float
-    sensors: str
+    sensors: str  #: names of the sensors that determine it
 
 
 class EstimationQuality(NamedTuple):
-    """Consistency of the estimates of a survey, measured by the estimators without the truth.
+    """Consistency of the estimates of a survey, measured by the estimators without the truth."""
 
-    Args:
-        frames_lost: number of frames whose motion could not be measured and was predicted.
-        nodes_bridged: number of nodes linked to the previous node only by predicted or frame-to-frame motion.
-        links_tried, links_failed: number of attempted and of failed measurements of links between nodes.
-        link_residual: median over the links of the residual of the matched points (robust standard deviation),
-            divided by its expected value; None without a measured link.
-        link_chi2: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected;
-            None without an alignment.
-        alignment_converged: whether the last global alignment converged; True without an alignment.
-        epipolar: estimated errors of the rectification; None without images, unless a surrogate models them.
-        frame_sigma_m: standard deviation (3-D) of the position of a keyframe relative to the previous keyframe, by
-            frame-to-frame motion alone; 90th percentile over the keyframes [m]; None if it is not known at any
-            keyframe.
-        disparity_offset: offset common to all disparities, estimated from the links; None without images, or if
-            the offset is not observable.
-        length_scale, depth_scale: scale of the lengths from the images across and along the optical axis; None without
-            a sensor that determines it.
-        repeats: rows of the frames at which a camera was frozen, by status ("the left camera repeats its image").
-        independent_errors: number of independent errors to which the correlated position errors of the keyframes are
-            equivalent, by their joint covariance; None without a final alignment.
-        readings_rejected: number of readings of each navigation sensor that were not used, because they contradicted
-            the estimates.
-        readings_disputed: number of readings of each navigation sensor that contradicted the estimates but were used,
-            because many before them had done so in the same way.
-    """
-
-    frames_lost: int = 0
-    nodes_bridged: int = 0
+    frames_lost: int = 0  #: number of frames whose motion could not be measured and was predicted
+    nodes_bridged: int = 0  #: number of nodes linked to the previous node only by predicted or frame-to-frame motion
+    #: links_tried, links_failed: number of attempted and of failed measurements of links between nodes.
     links_tried: int = 0
     links_failed: int = 0
+    #: median over the links of the residual of the matched points (robust standard deviation), divided by its expected
+    #: value; None without a measured link.
     link_residual: float | None = None
+    #: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected; None without
+    #: an alignment.
     link_chi2: float | None = None
-    alignment_converged: bool = True
+    alignment_converged: bool = True  #: whether the last global alignment converged; True without an alignment
+    #: estimated errors of the rectification; None without images, unless a surrogate models them.
     epipolar: EpipolarError | None = None
+    #: standard deviation (3-D) of the position of a keyframe relative to the previous keyframe, by frame-to-frame
+    #: motion alone; 90th percentile over the keyframes [m]; None if it is not known at any keyframe.
     frame_sigma_m: float | None = None
+    #: offset common to all disparities, estimated from the links; None without images, or if the offset is not
+    #: observable.
     disparity_offset: DisparityOffset | None = None
+    #: number of independent errors to which the correlated position errors of the keyframes are equivalent, by their
+    #: joint covariance; None without a final alignment.
     independent_errors: float | None = None
+    #: length_scale, depth_scale: scale of the lengths from the images across and along the optical axis; None without a
+    #: sensor that determines it.
     length_scale: LengthScale | None = None
     depth_scale: LengthScale | None = None
+    #: rows of the frames at which a camera was frozen, by status ("the left camera repeats its image").
     repeats: Mapping[str, Sequence[int]] = MappingProxyType({})
+    #: number of readings of each navigation sensor that were not used, because they contradicted the estimates.
     readings_rejected: Mapping[str, int] = MappingProxyType({})
+    #: number of readings of each navigation sensor that contradicted the estimates but were used, because many before
+    #: them had done so in the same way.
     readings_disputed: Mapping[str, int] = MappingProxyType({})
 
     @property
@@ -118,19 +96,12 @@ def _spans(rows: Sequence[int], most: int = 5) -> str:
 
 
 class Finding(NamedTuple):
-    """A failed check of the estimates: a reason why the result of a survey must not be trusted.
+    """A failed check of the estimates: a reason why the result of a survey must not be trusted."""
 
-    Args:
-        check: short name of the check, as in log.jsonl.
-        value: measured value.
-        limit: largest (or smallest) value that passes the check.
-        sentence: the finding in words.
-    """
-
-    check: str
-    value: float
-    limit: float
-    sentence: str
+    check: str  #: short name of the check, as in log.jsonl
+    value: float  #: measured value
+    limit: float  #: largest (or smallest) value that passes the check
+    sentence: str  #: the finding in words
 
 
 class ActionTimes(NamedTuple):

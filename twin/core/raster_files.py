@@ -39,10 +39,8 @@ def open_raster(
     """Opens a raster file by one of the named drivers of GDAL; any exception within the context becomes a TwinError.
 
     Args:
-        file: the file.
         key: key of the scenario that names the file; "": the error names the file itself.
         allowed: the files that are allowed, for the error.
-        drivers: names of the drivers.
 
     Raises:
         TwinError: the file is missing, damaged or of another format, names another file, or has larger tiles than it

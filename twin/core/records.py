@@ -26,24 +26,19 @@ class StereoRig:
 
     Both cameras are pinhole cameras with the same intrinsics and parallel axes. The right camera is displaced along the
     +x axis of the left camera. The pair may look in any direction.
-
-    Args:
-        width_px, height_px: image size.
-        focal_px: focal length along the rows of the image (fx).
-        baseline_m: distance between the cameras.
-        frame_rate_hz: nominal number of frames per second; the times of the frames take precedence.
-        body_from_camera: (4, 4) pose of the left camera in the body frame of the vehicle.
-        focal_y_px: focal length along the columns of the image (fy); equal to `focal_px` by default.
-        principal_point_px: (cx, cy); by default the image centre ((width - 1) / 2, (height - 1) / 2).
     """
 
+    #: width_px, height_px: image size.
     width_px: int
     height_px: int
-    focal_px: float
-    baseline_m: float
-    frame_rate_hz: float = 30.0
+    focal_px: float  #: focal length along the rows of the image (fx)
+    baseline_m: float  #: distance between the cameras
+    frame_rate_hz: float = 30.0  #: nominal number of frames per second; the times of the frames take precedence
+    #: (4, 4) pose of the left camera in the body frame of the vehicle.
     body_from_camera: Array = field(default_factory=lambda: np.eye(4))
+    #: focal length along the columns of the image (fy); equal to `focal_px` by default.
     focal_y_px: float | None = None
+    #: (cx, cy); by default the image centre ((width - 1) / 2, (height - 1) / 2).
     principal_point_px: tuple[float, float] | None = None
 
     @property
@@ -121,30 +116,21 @@ class StereoRig:
 
 @dataclass(frozen=True)
 class SensorNoise:
-    """Believed noise of the navigation sensors: standard deviations from data sheets, and surveyed beacon positions.
+    """Believed noise of the navigation sensors: standard deviations from data sheets, and surveyed beacon positions."""
 
-    Args:
-        pressure_m: standard deviation of the height from the pressure sensor [m].
-        attitude_rad: standard deviation of roll and of pitch from the AHRS [rad].
-        heading_rad: standard deviation of the heading from the AHRS [rad].
-        dvl_mps: standard deviation of the white noise of each axis of the DVL velocity [m/s].
-        dvl_scale: standard deviation of the relative scale error of the DVL, which is constant over a survey (due to
-            errors of speed of sound and beam angles).
-        usbl_m: standard deviation of each axis of an acoustic position fix [m].
-        beacon_px: standard deviation of column and of row of a beacon in the image [px].
-        beacons_m: (x, y, z) of each beacon in the world [m], treated as exact.
-        up_rad: standard deviation of the direction of the vertical about each horizontal axis [rad]. It is that of an
-            error which all readings share: no number of readings reduces it.
-    """
-
-    pressure_m: float = 0.01
-    attitude_rad: float = float(np.deg2rad(0.2))
-    heading_rad: float = float(np.deg2rad(0.5))
-    dvl_mps: float = 0.005
+    pressure_m: float = 0.01  #: standard deviation of the height from the pressure sensor [m]
+    attitude_rad: float = float(np.deg2rad(0.2))  #: standard deviation of roll and of pitch from the AHRS [rad]
+    heading_rad: float = float(np.deg2rad(0.5))  #: standard deviation of the heading from the AHRS [rad]
+    dvl_mps: float = 0.005  #: standard deviation of the white noise of each axis of the DVL velocity [m/s]
+    #: standard deviation of the relative scale error of the DVL, which is constant over a survey (due to errors of
+    #: speed of sound and beam angles).
     dvl_scale: float = 0.002
-    usbl_m: float = 0.3
-    beacon_px: float = 0.2
+    usbl_m: float = 0.3  #: standard deviation of each axis of an acoustic position fix [m]
+    beacon_px: float = 0.2  #: standard deviation of column and of row of a beacon in the image [px]
+    #: (x, y, z) of each beacon in the world [m], treated as exact.
     beacons_m: tuple[tuple[float, float, float], ...] = ()
+    #: standard deviation of the direction of the vertical about each horizontal axis [rad]. It is that of an error
+    #: which all readings share: no number of readings reduces it.
     up_rad: float = float(np.deg2rad(1.2))
 
     @property
@@ -164,112 +150,72 @@ class ImuReadings(NamedTuple):
     """Readings of an inertial measurement unit (IMU) at the origin of the body, in the axes of the body.
 
     The specific force is the acceleration minus that of free fall: a body at rest measures 9.81 m/s2 upwards.
-
-    Args:
-        times_s: (n,) times [s], increasing.
-        rates_radps: (n, 3) angular rates of the body in its own axes [rad/s].
-        specific_forces_mps2: (n, 3) specific forces [m/s2].
     """
 
-    times_s: Array
-    rates_radps: Array
-    specific_forces_mps2: Array
+    times_s: Array  #: (n,) times [s], increasing
+    rates_radps: Array  #: (n, 3) angular rates of the body in its own axes [rad/s]
+    specific_forces_mps2: Array  #: (n, 3) specific forces [m/s2]
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Readings of the navigation sensors at a frame; None for a sensor that is not used or has no new reading.
+    """Readings of the navigation sensors at a frame; None for a sensor that is not used or has no new reading."""
 
-    Args:
-        pressure_z_m: height of the left camera above the reference plane z = 0, from pressure [m].
-        ahrs_rpy_rad: (3,) roll, pitch, yaw of the body in the world [rad].
-        dvl_mps: (3,) velocity of the body's origin over ground, in body axes [m/s].
-        usbl_m: (3,) position of the left camera in the world, at some keyframes [m].
-        beacons: beacons detected in the left image, at keyframes.
-        imu: readings of the IMU after the previous frame, up to the time of this frame.
-        up: (3,) unit vector that points vertically upwards, in body axes: an attitude without heading, as an IMU gives
-            it.
-    """
-
-    pressure_z_m: float | None = None
-    ahrs_rpy_rad: Array | None = None
-    dvl_mps: Array | None = None
-    usbl_m: Array | None = None
-    beacons: tuple[BeaconDetection, ...] | None = None
-    imu: ImuReadings | None = None
+    pressure_z_m: float | None = None  #: height of the left camera above the reference plane z = 0, from pressure [m]
+    ahrs_rpy_rad: Array | None = None  #: (3,) roll, pitch, yaw of the body in the world [rad]
+    dvl_mps: Array | None = None  #: (3,) velocity of the body's origin over ground, in body axes [m/s]
+    usbl_m: Array | None = None  #: (3,) position of the left camera in the world, at some keyframes [m]
+    beacons: tuple[BeaconDetection, ...] | None = None  #: beacons detected in the left image, at keyframes
+    imu: ImuReadings | None = None  #: readings of the IMU after the previous frame, up to the time of this frame
+    #: (3,) unit vector that points vertically upwards, in body axes: an attitude without heading, as an IMU gives it.
     up: Array | None = None
 
 
 class Displacement(NamedTuple):
-    """Displacement of the body's origin since a node, measured by the DVL, in the axes of the body at that node.
+    """Displacement of the body's origin since a node, measured by the DVL, in the axes of the body at that node."""
 
-    Args:
-        since: keyframe number of the node.
-        displacement_m: (3,) measured displacement [m]: (1 + s) times the true displacement, plus noise. The scale error
-            s is constant over the survey.
-        cov: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node,
-            without the scale error.
-    """
-
-    since: int
+    since: int  #: keyframe number of the node
+    #: (3,) measured displacement [m]: (1 + s) times the true displacement, plus noise. The scale error s is constant
+    #: over the survey.
     displacement_m: Array
+    #: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node, without the scale
+    #: error.
     cov: Array
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Input of the estimators at one time.
+    """Input of the estimators at one time."""
 
-    Args:
-        index: number of the frame, from 0.
-        time_s: time of the exposure [s].
-        left, right: rectified images (H, W, 3) uint8 RGB; the right one may be missing between keyframes.
-        readings: readings of the navigation sensors.
-        keyframe: whether the frame is to become a keyframe; None leaves the choice to the estimator.
-        exposure: linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)], 1 at full scale,
-            from the exposure time, gain and white balance that the cameras report; None if they report none.
-    """
-
-    index: int
-    time_s: float
+    index: int  #: number of the frame, from 0
+    time_s: float  #: time of the exposure [s]
+    #: left, right: rectified images (H, W, 3) uint8 RGB; the right one may be missing between keyframes.
     left: Image
     right: Image | None
-    readings: Readings = field(default_factory=Readings)
-    keyframe: bool | None = None
+    readings: Readings = field(default_factory=Readings)  #: readings of the navigation sensors
+    keyframe: bool | None = None  #: whether the frame is to become a keyframe; None leaves the choice to the estimator
+    #: linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)], 1 at full scale, from the
+    #: exposure time, gain and white balance that the cameras report; None if they report none.
     exposure: Exposure | None = None
 
 
 class Estimate(NamedTuple):
-    """Online estimate at one frame.
+    """Online estimate at one frame."""
 
-    Args:
-        time_s: time of the frame.
-        world_from_camera: (4, 4) online pose of the left camera.
-        f2f_from_start: (4, 4) world_from_camera from the start pose and frame-to-frame motion alone.
-        camera_velocity: (6,) twist of the left camera [rad/s, m/s] in camera axes.
-        sigma_m: standard deviation of the online position: root of the sum of the variances of x, y and z [m].
-        status: "ok", or the reason why vision failed at this frame.
-    """
-
-    time_s: float
-    world_from_camera: Array
-    f2f_from_start: Array
-    camera_velocity: Array
-    sigma_m: float
-    status: str
+    time_s: float  #: time of the frame
+    world_from_camera: Array  #: (4, 4) online pose of the left camera
+    f2f_from_start: Array  #: (4, 4) world_from_camera from the start pose and frame-to-frame motion alone
+    camera_velocity: Array  #: (6,) twist of the left camera [rad/s, m/s] in camera axes
+    sigma_m: float  #: standard deviation of the online position: root of the sum of the variances of x, y and z [m]
+    status: str  #: "ok", or the reason why vision failed at this frame
 
 
 @dataclass
 class Trajectory:
-    """Poses of the left camera over time.
+    """Poses of the left camera over time."""
 
-    Args:
-        times_s: (n,) times [s].
-        world_from_camera: (n, 4, 4) poses.
-    """
-
-    times_s: Array
-    world_from_camera: Array
+    times_s: Array  #: (n,) times [s]
+    world_from_camera: Array  #: (n, 4, 4) poses
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -297,48 +243,33 @@ class Trajectory:
 
 
 class Alignment(NamedTuple):
-    """Size and wall time of one global alignment.
+    """Size and wall time of one global alignment."""
 
-    Args:
-        track: last track of the window.
-        ms: wall time [ms].
-        nodes, edges: number of nodes (including fixed ones) and of links (including rejected ones).
-        dropped: number of links rejected as outliers.
-        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected; 0 without links.
-        converged: false if the iterations ended before the minimum was reached.
-    """
-
-    track: int
-    ms: float
+    track: int  #: last track of the window
+    ms: float  #: wall time [ms]
+    #: nodes, edges: number of nodes (including fixed ones) and of links (including rejected ones).
     nodes: int
     edges: int
-    dropped: int
+    dropped: int  #: number of links rejected as outliers
+    #: mean chi-square of the remaining links per degree of freedom; 1 is expected; 0 without links.
     link_chi2: float = 1.0
-    converged: bool = True
+    converged: bool = True  #: false if the iterations ended before the minimum was reached
 
 
 class StereoObservation(NamedTuple):
-    """Image quality of one stereo pair, whether or not its frame became a keyframe.
+    """Image quality of one stereo pair, whether or not its frame became a keyframe."""
 
-    Args:
-        row: row of the pair's frame in the trajectories.
-        n_points: number of matched points; with the surrogate, the number predicted by its error model.
-        contrast: local RMS contrast of the left image (`matching.contrast`); None without an image.
-        saturated: fraction of the pixel values of the left image at full scale; None without an image.
-        row_offset_px: median row difference of the matched points, right minus left [px]; None if not measured.
-        row_spread_px: robust standard deviation of the row differences [px]; None if not measured.
-        row_sigma_px: standard deviation of the row differences that is expected from the texture [px]; None if not
-            measured.
-        repetition: largest autocorrelation of the left image away from its main peak; None without an image.
-    """
-
-    row: int
-    n_points: int
-    contrast: float | None
+    row: int  #: row of the pair's frame in the trajectories
+    n_points: int  #: number of matched points; with the surrogate, the number predicted by its error model
+    contrast: float | None  #: local RMS contrast of the left image (`matching.contrast`); None without an image
+    #: fraction of the pixel values of the left image at full scale; None without an image.
     saturated: float | None = None
+    #: median row difference of the matched points, right minus left [px]; None if not measured.
     row_offset_px: float | None = None
-    row_spread_px: float | None = None
+    row_spread_px: float | None = None  #: robust standard deviation of the row differences [px]; None if not measured
+    #: standard deviation of the row differences that is expected from the texture [px]; None if not measured.
     row_sigma_px: float | None = None
+    #: largest autocorrelation of the left image away from its main peak; None without an image.
     repetition: float | None = None
 
     @property
@@ -349,39 +280,29 @@ class StereoObservation(NamedTuple):
 
 @dataclass
 class SurveyResult:
-    """Result of the estimators over a whole survey.
+    """Result of the estimators over a whole survey."""
 
-    Args:
-        f2f: trajectory from frame-to-frame motion alone.
-        online: trajectory of the online estimates.
-        final: trajectory after the last global alignment; `online` if `EstimatorSettings.use_ga` is false.
-        keyframe_rows: (n_keyframes,) row of each keyframe in the trajectories.
-        track_of_keyframe: (n_keyframes,) track number of each keyframe, from 1.
-        node_cov: (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the final pose of the latest node up
-            to it (its own pose if every keyframe is a node), [rotation, translation] (rad, m) in the camera axes of
-            that node; without a final alignment, the covariance of the last online pose for every keyframe.
-        keyframe_depth_m: (n_keyframes,) median depth of the matched points [m].
-        links: measured motions of the network.
-        alignments: size and wall time of each global alignment.
-        before_ga, after_ga: for each global alignment at the end of a track, positions (n, 3) of the keyframes so far,
-            just before and just after it [m].
-        stereo_observations: image quality of all stereo pairs, including those with too few points for a keyframe.
-        quality: consistency of the estimates, measured by the estimators.
-    """
-
-    f2f: Trajectory
-    online: Trajectory
-    final: Trajectory
-    keyframe_rows: NDArray[np.int64]
-    track_of_keyframe: NDArray[np.int64]
+    f2f: Trajectory  #: trajectory from frame-to-frame motion alone
+    online: Trajectory  #: trajectory of the online estimates
+    final: Trajectory  #: trajectory after the last global alignment; `online` if `EstimatorSettings.use_ga` is false
+    keyframe_rows: NDArray[np.int64]  #: (n_keyframes,) row of each keyframe in the trajectories
+    track_of_keyframe: NDArray[np.int64]  #: (n_keyframes,) track number of each keyframe, from 1
+    #: (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the final pose of the latest node up to it (its
+    #: own pose if every keyframe is a node), [rotation, translation] (rad, m) in the camera axes of that node; without
+    #: a final alignment, the covariance of the last online pose for every keyframe.
     node_cov: Array
+    #: (n_keyframes,) median depth of the matched points [m].
     keyframe_depth_m: Array = field(default_factory=lambda: np.zeros(0))
-    links: Links = field(default_factory=Links)
+    links: Links = field(default_factory=Links)  #: measured motions of the network
+    #: size and wall time of each global alignment.
     alignments: list[Alignment] = field(default_factory=list[Alignment])
+    #: before_ga, after_ga: for each global alignment at the end of a track, positions (n, 3) of the keyframes so far,
+    #: just before and just after it [m].
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
+    #: image quality of all stereo pairs, including those with too few points for a keyframe.
     stereo_observations: list[StereoObservation] = field(default_factory=list[StereoObservation])
-    quality: EstimationQuality = EstimationQuality()
+    quality: EstimationQuality = EstimationQuality()  #: consistency of the estimates, measured by the estimators
 
     @property
     def unlinked(self) -> NDArray[np.bool_]:
@@ -409,17 +330,13 @@ class SurveyResult:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """Regular grid of map cells.
+    """Regular grid of map cells."""
 
-    Args:
-        west_m, north_m: x and y of the north-west corner of cell (0, 0) [m].
-        cell_m: side of a cell [m].
-        rows, cols: numbers of rows and columns; row 0 is the northernmost.
-    """
-
+    #: west_m, north_m: x and y of the north-west corner of cell (0, 0) [m].
     west_m: float
     north_m: float
-    cell_m: float
+    cell_m: float  #: side of a cell [m]
+    #: rows, cols: numbers of rows and columns; row 0 is the northernmost.
     rows: int
     cols: int
 
@@ -433,19 +350,14 @@ class MapGrid:
 
 @dataclass
 class ElevationMap:
-    """Digital elevation model with its uncertainty, and an orthomosaic on the same grid.
+    """Digital elevation model with its uncertainty, and an orthomosaic on the same grid."""
 
-    Args:
-        grid: cells in x and y of the map frame.
-        height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m]; NaN where unknown.
-        mosaic: (rows, cols, 3) uint8 RGB orthomosaic, black where unknown.
-        map_from_world: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
-    """
-
-    grid: MapGrid
+    grid: MapGrid  #: cells in x and y of the map frame
+    #: height_m, sigma_m: (rows, cols) float32, height (z) and its standard deviation [m]; NaN where unknown.
     height_m: NDArray[np.float32]
     sigma_m: NDArray[np.float32]
-    mosaic: Image
+    mosaic: Image  #: (rows, cols, 3) uint8 RGB orthomosaic, black where unknown
+    #: (4, 4) pose of the world in the map frame; the identity for a rig that looks down.
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
 
     def to_world(self, points: Array) -> Array:
@@ -455,37 +367,26 @@ class ElevationMap:
 
 @dataclass
 class Truth:
-    """Ground truth of a survey, which no estimator receives.
+    """Ground truth of a survey, which no estimator receives."""
 
-    Args:
-        trajectory: true poses of the left camera, one per frame.
-        reference: (n_frames, 3) planned positions of the left camera [m].
-        holding: (n_frames,) bool, true during station keeping.
-        track: (n_frames,) number of the track, from 1.
-        height_m: (rows, cols) float32, true height at the cell centres of the map grid [m].
-        seen: (rows, cols) bool, cells that both cameras observed in at least one keyframe.
-        asked: (rows, cols) bool, cells whose centre lies in the asked area.
-        reference_yaw: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: constant, the
-            heading at the start.
-        albedo: function that returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from
-            above, 255 = white; NaN where there is no floor or an object lies on it. None: not known.
-        in_area: function that returns whether points (x, y) [m] lie in the asked area. None: not known.
-        objects: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a
-            height grid without objects and for the surrogate. `height_m` is the height of the highest surface, floor
-            or object.
-        overhung: (rows, cols) bool, cells whose floor is hidden below an overhanging object or part of a mesh floor;
-            None where `objects` is None.
-    """
-
-    trajectory: Trajectory
-    reference: Array
-    holding: NDArray[np.bool_]
-    track: NDArray[np.int64]
-    height_m: NDArray[np.float32]
-    seen: NDArray[np.bool_]
-    asked: NDArray[np.bool_]
+    trajectory: Trajectory  #: true poses of the left camera, one per frame
+    reference: Array  #: (n_frames, 3) planned positions of the left camera [m]
+    holding: NDArray[np.bool_]  #: (n_frames,) bool, true during station keeping
+    track: NDArray[np.int64]  #: (n_frames,) number of the track, from 1
+    height_m: NDArray[np.float32]  #: (rows, cols) float32, true height at the cell centres of the map grid [m]
+    seen: NDArray[np.bool_]  #: (rows, cols) bool, cells that both cameras observed in at least one keyframe
+    asked: NDArray[np.bool_]  #: (rows, cols) bool, cells whose centre lies in the asked area
+    #: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: constant, the heading at the
+    #: start.
     reference_yaw: Array | None = None
+    #: function that returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from above, 255 =
+    #: white; NaN where there is no floor or an object lies on it. None: not known.
     albedo: Callable[[MapGrid], NDArray[np.float32]] | None = None
+    #: function that returns whether points (x, y) [m] lie in the asked area. None: not known.
     in_area: Callable[[Array, Array], NDArray[np.bool_]] | None = None
+    #: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a height grid
+    #: without objects and for the surrogate. `height_m` is the height of the highest surface, floor or object.
     objects: NDArray[np.uint16] | None = None
+    #: (rows, cols) bool, cells whose floor is hidden below an overhanging object or part of a mesh floor; None where
+    #: `objects` is None.
     overhung: NDArray[np.bool_] | None = None

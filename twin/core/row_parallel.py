@@ -1,7 +1,6 @@
 """Parallel processing: an image in bands of rows, or the two images of a stereo pair at the same time.
 
-The result does not depend on the number of bands. Two images at a time take a tenth less processor time than the bands
-of one image after the other, as each processor keeps the data of its image in its caches, and waits only once.
+The result does not depend on the number of bands.
 """
 
 from __future__ import annotations
@@ -29,7 +28,6 @@ def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left,
     Meanwhile, `in_row_bands` does not split images.
 
     Args:
-        left: computes the left image.
         right: computes the right image; it must not modify data that `left` uses, and vice versa.
 
     Raises:
@@ -61,7 +59,6 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: in
 
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.
-        n_rows: number of rows.
         rows_per_row: number of image rows that each processed row represents.
 
     Raises:
@@ -88,5 +85,4 @@ def _thread_pool(process: int) -> ThreadPoolExecutor:
 
 @cache
 def _n_processors() -> int:
-    """Returns the number of processors that this process may run on."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -16,42 +16,33 @@ COMMON_BIAS_PX = 0.005
 class EstimatorSettings:
     """Settings of motion estimation, the keyframe network and global alignment.
 
-    Args:
-        window_tracks: number of previous tracks that the global alignment at the end of a track adjusts, in addition to
-            this track.
-        node_stride: every n-th keyframe is a node of the network.
-        min_overlap: smallest predicted overlap for a link from a node to an earlier one: the fraction of the node's
-            matched points that project into the earlier image. The link to the previous node is measured at any
-            overlap.
-        max_links: largest number of links from a node to earlier nodes with an overlap of at least `min_overlap`.
-        use_f2m: whether to register keyframes with the mosaic (F2M).
-        use_ga: whether to align the network globally (GA) at the end of each track and of the survey.
-        points: largest number of matched points of a keyframe.
-        patch_px: side of the matching window, the same for stereo and for motion [px]. Patches have an odd side: for an
-            even value, it is one pixel larger.
-        keyframe_overlap: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is
-            expected to be below this fraction, or if tracking has failed; used only if the caller does not choose the
-            keyframes.
-        wide_search: whether features are matched over the whole images wherever a link cannot be measured from the
-            predicted poses; for large or unpredictable motions between keyframes. It costs time only where links fail.
-            Otherwise this is done only where the covariance of the predicted poses exceeds the search range, and a link
-            must agree with this covariance.
-        noisy_images: whether the images have noise, so that no image of a live camera equals the image before it.
-
     Raises:
         TwinError: a value is out of range.
     """
 
+    #: number of previous tracks that the global alignment at the end of a track adjusts, in addition to this track.
     window_tracks: int = 4
-    node_stride: int = 1
+    node_stride: int = 1  #: every n-th keyframe is a node of the network
+    #: smallest predicted overlap for a link from a node to an earlier one: the fraction of the node's matched points
+    #: that project into the earlier image. The link to the previous node is measured at any overlap.
     min_overlap: float = 0.45
+    #: largest number of links from a node to earlier nodes with an overlap of at least `min_overlap`.
     max_links: int = 7
-    use_f2m: bool = True
-    use_ga: bool = True
-    points: int = 500
+    use_f2m: bool = True  #: whether to register keyframes with the mosaic (F2M)
+    use_ga: bool = True  #: whether to align the network globally (GA) at the end of each track and of the survey
+    points: int = 500  #: largest number of matched points of a keyframe
+    #: side of the matching window, the same for stereo and for motion [px]. Patches have an odd side: for an even
+    #: value, it is one pixel larger.
     patch_px: int = 11
+    #: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is expected to be below
+    #: this fraction, or if tracking has failed; used only if the caller does not choose the keyframes.
     keyframe_overlap: float = 0.9
+    #: whether features are matched over the whole images wherever a link cannot be measured from the predicted poses;
+    #: for large or unpredictable motions between keyframes. It costs time only where links fail. Otherwise this is done
+    #: only where the covariance of the predicted poses exceeds the search range, and a link must agree with this
+    #: covariance.
     wide_search: bool = False
+    #: whether the images have noise, so that no image of a live camera equals the image before it.
     noisy_images: bool = True
 
     def __post_init__(self) -> None:

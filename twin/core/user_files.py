@@ -1,7 +1,4 @@
-"""Gate for files that a user, a scenario, a study, a data set or a run folder names; they may be of strangers.
-
-A reader gets a regular file of bounded size, and whatever exception it raises becomes a TwinError of one line.
-"""
+"""Gate for files that a user names: bounded regular files; whatever a reader raises becomes a TwinError of one line."""
 
 from __future__ import annotations
 
@@ -26,7 +23,6 @@ def reading(file: Path, key: str = "", allowed: str = "", most_bytes: int = _MOS
     """Checks a file; within the context, any exception of its reader becomes a TwinError.
 
     Args:
-        file: the file.
         key: key of the scenario that names the file; "": the error names the file itself.
         allowed: the files that are allowed, for the error.
         most_bytes: largest size of the file.
@@ -90,7 +86,6 @@ def _limit(most_bytes: int, allowed: str) -> str:
 
 
 def _error(file: Path, key: str, problem: str, allowed: str = "") -> TwinError:
-    """Returns the error of a file, which names the key, or the file itself without a key."""
     if key:
         return TwinError(key, f"{file.name!r} {problem}", allowed)
     return TwinError(ascii(str(file))[1:-1] if not str(file).isprintable() else str(file), problem, allowed)

@@ -1,8 +1,7 @@
 """Global alignment: maximum-likelihood poses of the nodes, given the links between them and the sensor readings.
 
-Eliminating the Lagrange multipliers of the mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) leaves a
-least-squares problem with one residual block per link. Together with the readings of the navigation sensors, it is
-solved as a factor graph with a Huber loss on the links. Outlier links are removed and reported.
+The mixed adjustment model (Negahdaripour & Madjidi 2003, eq. 7) reduces to one residual block per link; solved as a
+factor graph with a Huber loss on the links. Outlier links are removed and reported.
 """
 
 from __future__ import annotations
@@ -33,24 +32,17 @@ _HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
 class AlignmentResult(NamedTuple):
-    """Result of a global alignment.
+    """Result of a global alignment."""
 
-    Args:
-        poses: (n, 4, 4) aligned world_from_camera of the nodes.
-        covs: (n, 6, 6) marginal covariances of the poses, [rotation, translation] (rad, m) in camera axes; zeros for
-            nodes whose covariance was not requested.
-        dropped: links that were removed as outliers.
-        link_chi2: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links.
-        converged: false if the iterations ended before the minimum was reached.
-        independent_errors: number of independent position errors to which those of all nodes are equivalent
-            (`_independent_errors`); None unless the covariances of all nodes were requested.
-    """
-
-    poses: Array
+    poses: Array  #: (n, 4, 4) aligned world_from_camera of the nodes
+    #: (n, 6, 6) marginal covariances of the poses, [rotation, translation] (rad, m) in camera axes; zeros for nodes
+    #: whose covariance was not requested.
     covs: Array
-    dropped: list[Link]
-    link_chi2: float
-    converged: bool
+    dropped: list[Link]  #: links that were removed as outliers
+    link_chi2: float  #: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links
+    converged: bool  #: false if the iterations ended before the minimum was reached
+    #: number of independent position errors to which those of all nodes are equivalent (`_independent_errors`); None
+    #: unless the covariances of all nodes were requested.
     independent_errors: float | None = None
 
 
@@ -69,8 +61,6 @@ def align(
         links: motions between nodes of the window.
         anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
             prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
-        rig: believed calibration of the stereo camera.
-        noise: believed noise of the navigation sensors.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
 
     Raises:
@@ -107,17 +97,10 @@ def _draw_positions(solution: Solution) -> Array:
 
 
 def _independent_errors(draws: Array, covs: Array) -> float | None:
-    """Returns the number of independent position errors whose mean NEES varies as much as that of all nodes.
+    """Returns the number k of independent position errors whose mean NEES varies as much as that of all nodes.
 
-    The sum of 3 k squared independent standard normal numbers, divided by k, has the variance 6 / k. The errors of the
-    nodes of a survey are correlated, so k is much smaller than the number of nodes.
-
-    Args:
-        draws: (m, n, 3) errors of the positions of n nodes, drawn m times from their joint covariance [m].
-        covs: (n, 3, 3) covariances of the positions [m2].
-
-    Returns:
-        The number k; None without a node of known covariance.
+    Of 3 k squared normal numbers, the sum divided by k has the variance 6 / k. `draws` (m, n, 3) are errors drawn from
+    the joint covariance [m], `covs` (n, 3, 3) [m2]; None without a node of known covariance.
     """
     known = np.linalg.eigvalsh(covs)[:, 0] > 0
     if not known.any():
@@ -136,17 +119,11 @@ def _mean_chi2(links: Links, chi2: Array) -> float:
 
 
 class _Window(NamedTuple):
-    """Factor graph of the nodes that are aligned together, and the links among its factors.
+    """Factor graph of the nodes that are aligned together, and the links among its factors."""
 
-    Args:
-        links: links between the nodes.
-        index_of: index of each node in the factor graph, by node number.
-        graph: factor graph; its first binary factors are the links.
-    """
-
-    links: Links
-    index_of: dict[int, int]
-    graph: FactorGraph
+    links: Links  #: links between the nodes
+    index_of: dict[int, int]  #: index of each node in the factor graph, by node number
+    graph: FactorGraph  #: factor graph; its first binary factors are the links
 
     def optimise(self, start: GraphState, max_iterations: int) -> Solution:
         """Returns the solution reached from `start`, at a local minimum of the cost or after `max_iterations` steps."""
@@ -189,10 +166,7 @@ def _factor_graph(
 
 
 def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
-    """Returns the marginal covariances (n, 6, 6) of the n nodes, in the order of `index_of`.
-
-    They are zero for nodes that are not in `numbers`; None computes all of them.
-    """
+    """Returns the marginal covariances (n, 6, 6) of the nodes, zero for those not in `numbers` (None: all)."""
     if numbers is None:
         return solution.marginals_in_place()
     covs = np.zeros((len(index_of), 6, 6))

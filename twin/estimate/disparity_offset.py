@@ -1,11 +1,7 @@
-"""Offset that all disparities share, estimated from the motions between keyframes.
+"""Offset that all disparities share (principal point, yaw of a camera), from the motions between keyframes.
 
-An error in the column of a camera's principal point adds the same offset to all disparities and does not change the
-rows of points. A small yaw of one camera has nearly the same effect. Depths, and with them the lengths of all motions,
-are then wrong. Over a floor with relief the offset is observable: the image motions of near and far points must be
-proportional to their disparities, and are not if there is an offset. Over a level floor the offset is not observable:
-errors of a hundredth of a pixel that all matches share then appear as an offset of several pixels, and the scatter of
-the offsets from single links does not reveal these errors.
+It is observable over relief, where the image motions of near and far points must be proportional to their disparities.
+Over a level floor it is not, and the scatter between links does not reveal that.
 """
 
 from __future__ import annotations
@@ -31,19 +27,13 @@ def combine(
 
     None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`).
 
-    The links of a node share the noise of its stereo points, so the variance of the mean is multiplied by the number of
-    links per node, if that exceeds 1. All nodes that see the same floor share part of the errors that its relief
-    causes, for example at the edges of an object. The variance is therefore also multiplied by 1 + c (m - 1), with m
-    the number of nodes that see a point of the floor and c = `link_selection.RECURRENCE`. Unlike in
-    `link_selection.inflate_for_shared_noise`, the fraction of the variance that image noise does not explain is not
-    known here, because few near points determine the offset; it is taken as 1. Finally, the variance is multiplied by
-    the mean chi-square of the offsets about their mean, if that exceeds 1.
+    The variance is multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes
+    that share the errors of relief, with c = `link_selection.RECURRENCE`, and by the mean chi-square (if above 1).
 
     Args:
         offsets: offset from each link, with a standard deviation that assumes independent links.
         n_nodes: number of nodes that can have links to earlier nodes.
         n_views: m, the mean number of nodes that see a point of the floor (`mean_views`).
-        focal_px: focal length [px].
     """
     if not offsets or n_nodes < 1:
         return None
@@ -67,7 +57,6 @@ def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> floa
     Args:
         world_from_camera: (n, 4, 4) poses of the nodes.
         depth_m: (n,) median depth of the floor in the image of each node [m].
-        rig: calibration of the images.
     """
     images_per_unit = np.array([rig.fx_px / rig.width_px, rig.fy_px / rig.height_px])
     views = []

@@ -23,38 +23,25 @@ _MAX_TILT_RAD = np.deg2rad(45.0)  # largest angle between the normal of the floo
 
 
 class PairInspection(NamedTuple):
-    """Stereo pair, resampled to square pixels, with its matches.
+    """Stereo pair, resampled to square pixels, with its matches."""
 
-    Args:
-        left, right: (H, W, 3) resampled images.
-        rig: calibration of these images.
-        disparity: dense disparity of the left image.
-        points: matched points.
-        swapped: whether the left and the right image seem to be exchanged (`inspect_pair`).
-    """
-
+    #: left, right: (H, W, 3) resampled images.
     left: Image
     right: Image
-    rig: StereoRig
-    disparity: Disparity
-    points: StereoPoints
-    swapped: bool
+    rig: StereoRig  #: calibration of these images
+    disparity: Disparity  #: dense disparity of the left image
+    points: StereoPoints  #: matched points
+    swapped: bool  #: whether the left and the right image seem to be exchanged (`inspect_pair`)
 
 
 class FloorPlane(NamedTuple):
-    """Plane of a floor in the axes of a camera: the points x with normal . x = -distance.
+    """Plane of a floor in the axes of a camera: the points x with normal . x = -distance."""
 
-    Args:
-        normal: (3,) unit normal that points from the floor to the side of the camera.
-        distance_m: distance of the camera from the plane [m].
-        scatter_m: robust standard deviation of the points about the plane [m].
-        fitted: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis, at the
-            median depth of the points.
-    """
-
-    normal: Array
-    distance_m: float
-    scatter_m: float
+    normal: Array  #: (3,) unit normal that points from the floor to the side of the camera
+    distance_m: float  #: distance of the camera from the plane [m]
+    scatter_m: float  #: robust standard deviation of the points about the plane [m]
+    #: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis, at the median
+    #: depth of the points.
     fitted: bool
 
     @property
@@ -73,14 +60,8 @@ class FloorPlane(NamedTuple):
 def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | None = None) -> PairInspection:
     """Matches the stereo pair of a frame over the widest range of disparities, and again with the two images exchanged.
 
-    If the left and the right image were swapped in the recording, disparities are negative, so that almost no point is
-    matched in the given order, and many are in the other order. The images count as swapped if at least 30 points are
-    matched with the images exchanged, and at least three times as many as in the given order.
-
-    Args:
-        frame: frame with both images.
-        rig: believed calibration.
-        settings: settings of the estimators, for the number of points and the patch size; None: the defaults.
+    The images count as swapped if, exchanged, at least 30 points are matched and three times as many as in the given
+    order.
     """
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
     left, right = square_images(frame, rig)
@@ -91,12 +72,7 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
 
 
 def square_images(frame: Frame, rig: StereoRig) -> tuple[Image, Image]:
-    """Returns the left and the right image of a frame with both images, resampled to square pixels.
-
-    Args:
-        frame: frame with both images.
-        rig: believed calibration; that of the returned images is `rig.with_square_pixels()`.
-    """
+    """Returns the left and right image of a frame, resampled to square pixels (`rig.with_square_pixels()`)."""
     assert frame.right is not None
     scale = rig.fx_px / rig.fy_px
     left, right = (one if scale == 1 else matching.scaled_rows(one, scale) for one in (frame.left, frame.right))
@@ -116,14 +92,9 @@ def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSetti
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
     """Returns the plane of the floor, fitted to the matched points of a pair; None for fewer than 30 points.
 
-    Of the planes through 300 random triples of points, that with the smallest median distance of all points (least
-    median of squares, Rousseeuw 1984) is refined by least squares over the points within 2.5 robust standard
-    deviations of the best plane. The plane perpendicular to the optical axis at the median depth is returned instead if
-    the points scatter by more than 15 % of their median depth, or if the optical axis is inclined by more than 45
-    degrees to the perpendicular of the plane (a wall, a horizon).
-
-    Args:
-        points: matched points (`PairInspection.points`).
+    The least median of squares (Rousseeuw 1984) over 300 random triples is refined by least squares within 2.5 robust
+    standard deviations. If the points scatter by more than 15 % of their median depth or the plane is inclined by more
+    than 45 degrees (a wall, a horizon), it is perpendicular to the optical axis at the median depth.
     """
     xyz = points.xyz
     if len(xyz) < _MIN_POINTS:
@@ -137,12 +108,7 @@ def floor_plane(points: StereoPoints) -> FloorPlane | None:
 
 
 def _fitted_plane(xyz: Array) -> tuple[Array, float, float]:
-    """Returns the plane fitted to points (n, 3) [m] in camera axes.
-
-    Returns:
-        Unit normal (3,) towards the camera, distance of the camera from the plane, and scatter of the points about it
-        [m].
-    """
+    """Returns the plane fitted to points (n, 3) [m]: unit normal (3,) to the camera, distance and scatter [m]."""
     rng, best = np.random.default_rng(_SEED), (np.inf, np.array([0.0, 0.0, -1.0]), 0.0)
     for _ in range(_TRIALS):
         a, b, c = xyz[rng.choice(len(xyz), 3, replace=False)]

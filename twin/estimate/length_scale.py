@@ -1,9 +1,7 @@
 """Scale of the lengths that the images give, compared with those of DVL, USBL and pressure.
 
-A relative error e of the baseline multiplies all lengths by 1 + e, one of the focal length only those along the optical
-axis: depth and motion towards the floor. The image shows motion across the axis in units of the baseline at any focal
-length. Two scales are therefore estimated: across the optical axis and along it. Sensors fix the second one only where
-the camera moves along its axis; over a path at constant height an error of the focal length is not observable.
+An error of the baseline scales all lengths, one of the focal length only those along the optical axis. Two scales are
+therefore estimated, across the axis and along it; the second is observable only where the camera moves along it.
 """
 
 from __future__ import annotations
@@ -40,8 +38,6 @@ def length_scales(
     Args:
         nodes: the nodes with their readings.
         links: measured motions between these nodes; those between consecutive nodes are used.
-        rig: believed calibration.
-        noise: believed noise of the readings.
     """
     number = np.array([node.number for node in nodes])
     at_i, at_j = np.searchsorted(number, links.i), np.searchsorted(number, links.j)
@@ -66,7 +62,6 @@ def _scale(k: int, factors: Array, cov: Array, fits: dict[str, _Fit]) -> LengthS
 def _fits(
     nodes: Sequence[Keyframe], steps: Sequence[Link | None], rig: StereoRig, noise: SensorNoise
 ) -> Iterator[tuple[str, _Fit | None]]:
-    """Yields the name and the fit of each sensor that knows lengths."""
     dvl = _dvl(nodes, steps, rig)
     yield "DVL", None if dvl is None else dvl._replace(cov=dvl.cov + noise.dvl_scale**2)
     across, along = _paths(nodes, steps)

@@ -23,20 +23,15 @@ class LightInspection(NamedTuple):
     """Light of a stereo camera, from n stereo pairs, and a pair whose light was made uniform.
 
     Lamps, vignetting and backscatter belong to the cameras and stay in the mean of many pairs; the floor averages out.
-
-    Args:
-        n_pairs: number of pairs n.
-        mean_left, mean_right: (H, W) mean grey levels of the pairs.
-        even_left: (H, W, 3) left image with the gain that the colours of the map get.
-        subtracted: whether the estimators subtract a light pattern before dense matching (`light_pattern`).
-        disparity: dense disparity of the left image as the map uses it: without the light pattern if it is subtracted.
     """
 
-    n_pairs: int
+    n_pairs: int  #: number of pairs n
+    #: mean_left, mean_right: (H, W) mean grey levels of the pairs.
     mean_left: Map
     mean_right: Map
-    even_left: Image
-    subtracted: bool
+    even_left: Image  #: (H, W, 3) left image with the gain that the colours of the map get
+    subtracted: bool  #: whether the estimators subtract a light pattern before dense matching (`light_pattern`)
+    #: dense disparity of the left image as the map uses it: without the light pattern if it is subtracted.
     disparity: Disparity
 
 

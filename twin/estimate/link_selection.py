@@ -28,22 +28,18 @@ _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
 class _View(NamedTuple):
-    """Camera intrinsics and image size, for projection in compiled code.
+    """Camera intrinsics and image size, for projection in compiled code."""
 
-    Args:
-        fx, fy: focal lengths along the rows (fx) and the columns (fy) of the image [px].
-        cx, cy: column and row of the principal point [px].
-        width, height: image size [px].
-        margin: smallest distance of a visible point from the image border [px].
-    """
-
+    #: fx, fy: focal lengths along the rows (fx) and the columns (fy) of the image [px].
     fx: float
     fy: float
+    #: cx, cy: column and row of the principal point [px].
     cx: float
     cy: float
+    #: width, height: image size [px].
     width: int
     height: int
-    margin: int
+    margin: int  #: smallest distance of a visible point from the image border [px]
 
 
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
@@ -80,13 +76,9 @@ def choose_links(
     directly precede or follow one selected from them earlier come last.
 
     Args:
-        node: the new node.
         earlier: candidate nodes in chronological order.
         poses: (n, 4, 4) world_from_camera of the candidates.
-        rig: believed calibration.
         min_overlap: smallest sufficient overlap, 0 to 1.
-        max_links: largest number of links.
-        patch_px: side of the matching window [px].
 
     Returns:
         The selected nodes with their overlaps (0 to 1).
@@ -106,19 +98,12 @@ def choose_links(
 def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
     """Returns the links of one new node with covariances inflated to account for their correlated errors.
 
-    All n links use the same stereo points of the node, and the noise of these points dominates the errors of the links.
-    If the links were treated as independent, one stereo observation would count n times, and the variances of the
-    positions would be underestimated. Therefore the covariance of each link is multiplied by n.
+    All n links use the same stereo points of the node, whose noise dominates, so each covariance is multiplied by n.
 
-    The fraction s of the variance that image noise does not explain (`Link.floor_share`) is caused by the floor: relief
-    within a patch shifts its match by M t, with t the translation between the images and M a property of the patch.
-    Suppose that the shift of a patch is the same in all links of the path while the patch is in view. With the overlap
-    q of consecutive nodes, links whose nodes are l steps apart have the fraction 1 - l (1 - q) of their patches in
-    common. The variance of the summed error is then that of independent errors times
-    1 + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q), summed over 1 <= l < m. Real shifts are only partly the same,
-    because not all corners are selected again and M changes with the viewing direction. The covariance is therefore
-    also multiplied by 1 + c s (m - 1), with c = `RECURRENCE`. Links that span several nodes have the same m, because
-    one such link starts at every node.
+    The fraction s that image noise does not explain (`Link.floor_share`) is due to relief within patches, and would be
+    the same in all links while a patch is in view. With the overlap q of consecutive nodes, the summed error then has 1
+    + 2 sum_l (1 - l (1 - q)) = m = 1 / (1 - q) times the variance of independent errors (1 <= l < m). Real shifts are
+    only partly the same, so the covariance is also multiplied by 1 + c s (m - 1), with c = `RECURRENCE`.
     """
     growth = RECURRENCE * (_links_over_a_footprint(links) - 1)
     factors = [len(links) * (1 + growth * link.floor_share) for link in links]
@@ -129,9 +114,6 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
     """Returns the number m = 1 / (1 - q) of consecutive links during which a patch of floor stays in view.
 
     q is the overlap of the link from the latest earlier node, limited to `_LARGEST_OVERLAP`; 0 without links.
-
-    Args:
-        links: links of one node.
     """
     overlap = max(links, key=lambda link: link.i).overlap if links else 0.0
     return 1 / (1 - min(overlap, _LARGEST_OVERLAP))
@@ -140,23 +122,15 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 def floor_share(motion: Motion) -> float:
     """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
 
-    With r the robust standard deviation of the residuals divided by the expected one (`Motion.residual`), the fraction
-    is 1 - 1 / r^2, or 0 if r does not exceed 1 by two standard errors. For n normally distributed residuals with three
-    coordinates, r is the median of n chi-distributed values divided by its expectation, and has a standard error of
+    1 - 1 / r^2 with r the relative residual (`Motion.residual`); 0 if r does not exceed 1 by two standard errors of
     0.56 / sqrt(n).
-
-    Args:
-        motion: motion from `two_view_motion.pair_motion`.
     """
     limit = 1 + 2 * _RESIDUAL_STANDARD_ERROR / max(motion.n_points, 1) ** 0.5
     return 1 - motion.residual**-2 if motion.residual > limit else 0.0
 
 
 def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the consecutive indices newest, newest - 1, ... with which the descending list `linked` begins.
-
-    These nodes lie on one swath. The result is empty if `linked` does not start with `newest`.
-    """
+    """Returns the consecutive indices newest, newest - 1, ... (one swath) with which the descending `linked` begins."""
     return [k for back, k in enumerate(linked) if k == newest - back]
 
 
@@ -168,8 +142,6 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
     Args:
         others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
-        earlier: candidate nodes in chronological order.
-        count: largest number of indices.
     """
     numbers = np.array([node.number for node in earlier])
     stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
@@ -181,24 +153,13 @@ def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[
 
 
 def _reach_m(points: Array, rig: StereoRig) -> float:
-    """Returns the distance between two cameras [m] from which on their overlap is taken as zero.
-
-    It is the diagonal of the footprint at the largest depth of the points (n, 3), which are in camera axes [m].
-    """
+    """Returns the distance between cameras beyond which their overlap is zero [m]: the diagonal of the footprint."""
     return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
 
 
 @kernel
 def _overlaps(world, position, poses, reach, view):
-    """Compiled kernel of `overlaps`; returns the overlaps (n,).
-
-    Args:
-        world: (m, 3) matched points of the node in the world [m].
-        position: (3,) position of the node's camera in the world [m].
-        poses: (n, 4, 4) poses of the other images.
-        reach: distance between the cameras at which the overlap is taken as zero [m].
-        view: `_View`.
-    """
+    """Kernel of `overlaps` (n,) for points `world` (m, 3) [m]; zero from the distance `reach` [m] on."""
     shares = np.zeros(len(poses))
     for k in range(len(poses)):
         pose, count = poses[k], 0

@@ -110,9 +110,6 @@ class KeyframeNetwork:
 
     Args:
         vision: source of the visual measurements, including the links.
-        rig: believed calibration.
-        noise: believed noise of the navigation sensors.
-        settings: settings of the estimators.
         stopwatch: returns the context manager that times the stage of a given name.
 
     Attributes:
@@ -181,7 +178,6 @@ class KeyframeNetwork:
         """Adds a node and queues the measurement of its links to earlier nodes other than the last one.
 
         Args:
-            node: the new node.
             chain: measured link from the last node; None if the measurement failed or this is the first node.
             bridge: link from the last node that consists of the F2F motion, fused with the DVL; it replaces a `chain`
                 that could not be measured; otherwise None.
@@ -286,12 +282,7 @@ class KeyframeNetwork:
         )
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[Link]:
-        """Returns the links from earlier nodes that could be measured, and adds the results to the history.
-
-        Args:
-            node: the new node.
-            others: earlier nodes with their predicted overlaps, 0 to 1.
-        """
+        """Returns the links from earlier nodes that could be measured, and adds the results to the history."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         self.history.link_residuals += [np.nan if motion is None else motion.residual for motion in motions]
         offsets = [motion.disparity_offset for motion in motions if motion is not None]
@@ -324,8 +315,6 @@ class KeyframeNetwork:
         relative to the preceding node. Links rejected as outliers are removed from the network.
 
         Args:
-            nodes: nodes to align, in chronological order, up to the newest node.
-            track: number of the track, stored in the history.
             marginals: numbers of the nodes whose marginal covariances are computed; None for all nodes.
 
         Returns:
@@ -360,10 +349,7 @@ class KeyframeNetwork:
         return aligned
 
     def _move(self, poses: dict[int, Array]) -> None:
-        """Sets the poses (4, 4) of nodes, given by number.
-
-        Later keyframes that are not nodes keep their pose relative to the preceding node.
-        """
+        """Sets the poses of nodes, by number; later keyframes that are not nodes follow the preceding node."""
         moving = self.keyframes[min(poses) :]
         old = np.array([keyframe.world_from_camera for keyframe in moving])
         numbers = {node.number for node in self.nodes}

@@ -61,25 +61,17 @@ _SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equa
 
 
 class MotionSinceNode(NamedTuple):
-    """Motion since the last node of the network, from frame-to-frame motion fused with the DVL.
+    """Motion since the last node of the network, from frame-to-frame motion fused with the DVL."""
 
-    Args:
-        motion: (4, 4) pose of the camera at the current frame in the camera at the node.
-        cov: (6, 6) covariance of `motion` [rotation, translation] (rad, m), in the axes of the current camera.
-        cov_at_node: (6, 6) covariance of the online pose at the node, in the camera axes of the node.
-    """
-
-    motion: Array
-    cov: Array
-    cov_at_node: Array
+    motion: Array  #: (4, 4) pose of the camera at the current frame in the camera at the node
+    cov: Array  #: (6, 6) covariance of `motion` [rotation, translation] (rad, m), in the axes of the current camera
+    cov_at_node: Array  #: (6, 6) covariance of the online pose at the node, in the camera axes of the node
 
 
 class Navigator:
     """Estimates the trajectory of a stereo camera and the map from frames. Use as a context manager, or call `close`.
 
     Args:
-        rig: believed calibration.
-        settings: settings of the estimators.
         start: (4, 4) world_from_camera of the first frame, the reference position; by default the camera is at the
             origin with its optical axis along -z of the world. If the frames have readings of height or attitude, the
             z axis of the world must point up.
@@ -331,7 +323,6 @@ class Navigator:
         return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress)
 
     def _quality(self) -> EstimationQuality:
-        """Returns the quality of the estimation: lost frames, failed links, residuals and rectification errors."""
         history = self.network.history
         residuals = np.array(history.link_residuals)
         failed = np.isnan(residuals)
@@ -404,10 +395,8 @@ class Navigator:
     def _is_keyframe(self, frame: Frame, status: str) -> bool:
         """Returns whether a frame is to become a keyframe by the rules of `update`, before its points are matched.
 
-        The motion from this stereo pair to the next is expected to equal the motion since the last pair. If, after this
-        motion, the next pair would overlap with the last keyframe by less than `settings.keyframe_overlap`, this pair
-        becomes a keyframe. Without this prediction, consecutive keyframes would overlap by less than this fraction
-        where pairs are far apart.
+        It does if, after a motion equal to that since the last pair, the next pair would overlap with the last keyframe
+        by less than `settings.keyframe_overlap`.
         """
         if frame.right is None or frame.keyframe is not None:
             return bool(frame.keyframe) and frame.right is not None
@@ -422,11 +411,6 @@ class Navigator:
         """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
 
         If too few points are matched in stereo, the frame does not become a keyframe and only position fixes are fused.
-
-        Args:
-            frame: frame with both images.
-            track: number of its track.
-            status: "ok", or the reason why tracking failed at this frame.
 
         Returns:
             `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
@@ -462,14 +446,10 @@ class Navigator:
         return status
 
     def _follow_chain(self, node: Keyframe) -> Link | None:
-        """Measures the motion since the last node, and replaces the F2F motion in the online pose by this measurement.
+        """Measures the motion from the last node (None if it fails); it replaces the F2F motion in the online pose.
 
-        The motion from two stereo pairs is more accurate than the motion accumulated over the frames between them, and
-        gives the global alignment better initial values (Negahdaripour & Madjidi 2003, section IV-5). Corrections of
-        the pose since the last node, by navigation sensors and by F2M, are kept.
-
-        Returns:
-            The link from the last node, or None if it could not be measured.
+        It is more accurate than accumulated F2F (Negahdaripour & Madjidi 2003, section IV-5). Corrections of the pose
+        since the last node, by navigation sensors and by F2M, are kept.
         """
         link = self.network.link_to_last_node(node)
         if link is None:
@@ -484,9 +464,8 @@ class Navigator:
     def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
         """Corrects the online pose by registration with the mosaic (F2M).
 
-        The mosaic contains the pose errors of the keyframes it was made from. The correction is therefore weighted by
-        the covariance of the motion since the keyframe that the compared cells come from, not by the covariance of the
-        pose.
+        The mosaic has the pose errors of its keyframes, so the correction is weighted by the covariance of the motion
+        since the keyframe that the compared cells come from.
         """
         nodes, keyframes = self.network.nodes, self.network.keyframes
         pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
@@ -502,21 +481,13 @@ class Navigator:
                 keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
 
     def _accumulate(self, keyframe: Keyframe, step_cov: Array) -> None:
-        """Sets `accumulated_cov` of a keyframe from that of the last node and the motion since then.
-
-        Args:
-            keyframe: keyframe that is not yet a node.
-            step_cov: (6, 6) covariance of the motion since the last node, in the axes of the current camera.
-        """
+        """Sets `accumulated_cov` of a keyframe from that of the last node and `step_cov` (6, 6) since then."""
         if self.network.nodes:
             to_world = geometry.adjoint(self.filter.world_from_camera)
             keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
 
     def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Adds a node to the network, linked to the last node by `chain`, or by the F2F motion if `chain` is None.
-
-        The motion since the last node is then counted from this node.
-        """
+        """Adds a node to the network, linked to the last node by `chain` or, if None, by the F2F motion since then."""
         bridge = None
         if self.network.nodes and chain is None:
             cov = self.since_node.cov + np.eye(6) * 1e-10
@@ -525,11 +496,8 @@ class Navigator:
         self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
 
     def _follow_last_keyframe(self, before: Array, node_cov: Array) -> None:
-        """Applies to the online pose the correction that an alignment made to the last keyframe.
-
-        Args:
-            before: (4, 4) pose of the last keyframe before the alignment.
-            node_cov: (6, 6) covariance of the aligned pose of the last node [rotation, translation] (rad, m).
+        """Applies to the online pose the correction that an alignment made to the last keyframe, whose pose was
+        `before`.
         """
         last = self.network.keyframes[-1]
         last_from_now = geometry.inverse(before) @ self.filter.world_from_camera

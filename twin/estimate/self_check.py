@@ -1,9 +1,7 @@
 """Checks of a survey that need no truth; a failed check is a reason not to trust the result.
 
-Each check compares a quantity that the estimators measure with a limit. The limits lie between the values of ordinary
-surveys, whose errors agree with their covariances (generated and photographed floors, Jerlov types I to 3C), and the
-values of surveys with gross errors of the trajectory; docs/findings.md (section 9) lists both. An error of disparities
-above its limit is a finding only if positions or heights are wrong by more than their standard deviations cover.
+The limits lie between the values of ordinary surveys and those of surveys with gross errors (docs/findings.md, section
+9). An error of disparities is a finding only if positions or heights are wrong by more than their standard deviations.
 """
 
 from __future__ import annotations
@@ -46,8 +44,6 @@ def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
     The findings are in the order of tracking, navigation sensors, stereo, rectification and consistency.
 
     Args:
-        result: output of the estimators.
-        rig: believed calibration.
         elevation: map of the survey; None if none was built.
     """
     return [
@@ -88,13 +84,11 @@ def _effects(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | Non
 
 
 def _effect(name: str, error_m: float, sigma_m: float, where: str) -> _Effect:
-    """Returns an effect with its words."""
     text = f"{name} may be off by {1000 * error_m:.2g} mm {where}, their standard deviation is {1000 * sigma_m:.2g} mm"
     return _Effect(error_m, _COVERED * sigma_m, text)
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields findings for lost frames, for nodes without a link to the previous node or to any, for failed links."""
     quality = result.quality
     lost = quality.frames_lost / max(len(result.online), 1)
     if lost > MAX_FRAMES_LOST:
@@ -119,7 +113,6 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _readings(result: SurveyResult) -> Iterator[Finding]:
-    """Yields a finding for each navigation sensor that contradicted the estimates for long."""
     for sensor, count in result.quality.readings_disputed.items():
         if count:
             text = f"{sensor} readings contradicted the estimates for long, and {count} were believed in the end"
@@ -127,7 +120,6 @@ def _readings(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _stereo(result: SurveyResult) -> Iterator[Finding]:
-    """Yields a finding if many stereo pairs have too few matched points, and one if the texture repeats."""
     pairs = result.stereo_observations
     if not pairs:
         return
@@ -142,11 +134,7 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _rectification(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None) -> Iterator[Finding]:
-    """Yields a finding for each rectification error above its limit: row offset, yaw, pattern of row differences.
-
-    The scatter of row differences within a region of the image is not a finding: the covariances of matches include it
-    (`stereo.row_noise_ratio`).
-    """
+    """Yields a finding for each rectification error above its limit: row offset, yaw, pattern of row differences."""
     offset = _median(pair.row_offset_px for pair in result.stereo_observations)
     if offset is not None and abs(offset) > MAX_ROW_OFFSET_PX:
         text = f"the rows of the right image are offset by {offset:+.2f} px"
@@ -169,12 +157,7 @@ def _rectification(result: SurveyResult, rig: StereoRig, elevation: ElevationMap
 
 
 def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None) -> Iterator[Finding]:
-    """Yields a finding for each quantity that shows inconsistent links or a large uncertainty.
-
-    These are the residuals of the matched points, the offset of all disparities, the chi-square of the links, an
-    alignment that did not converge, and the standard deviations of keyframe positions, both relative to the previous
-    keyframe and in the world.
-    """
+    """Yields a finding for each quantity that shows inconsistent links or a large uncertainty."""
     quality = result.quality
     if quality.link_residual is not None and quality.link_residual > MAX_LINK_RESIDUAL:
         text = f"residuals of points matched between keyframes are {quality.link_residual:.1f} times their noise"
@@ -210,8 +193,7 @@ def _consistency(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
 def _scale(quality: EstimationQuality) -> Iterator[Finding]:
     """Yields a finding if lengths from the images differ from those of the navigation sensors.
 
-    The scale along the optical axis is judged only where that across it is right: a rotation that images and a DVL of
-    different scales determine together is wrong, and with it the part of the DVL's displacement along the axis.
+    The scale along the optical axis is judged only where that across it is right, as the rotation is wrong otherwise.
     """
     for check, scale, which, cause in (
         ("length_scale", quality.length_scale, "", "the baseline or the scale of the sensors"),
@@ -225,6 +207,5 @@ def _scale(quality: EstimationQuality) -> Iterator[Finding]:
 
 
 def _median(values: Iterator[float | None]) -> float | None:
-    """Returns the median of the values that are not None; None if there are none."""
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None

@@ -46,19 +46,12 @@ _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern
 
 
 class _MatchedPair(NamedTuple):
-    """Result of the matching of one stereo pair.
+    """Result of the matching of one stereo pair."""
 
-    Args:
-        right_image: (H, W, 3) right image at full size, without the known rectification errors.
-        right: grey levels of the right image at the image scale.
-        dense_px: (H, W) disparity by semi-global matching [px], NaN where unknown.
-        points: matched points.
-    """
-
-    right_image: Image
-    right: matching.Gray
-    dense_px: NDArray[np.float32]
-    points: StereoPoints
+    right_image: Image  #: (H, W, 3) right image at full size, without the known rectification errors
+    right: matching.Gray  #: grey levels of the right image at the image scale
+    dense_px: NDArray[np.float32]  #: (H, W) disparity by semi-global matching [px], NaN where unknown
+    points: StereoPoints  #: matched points
 
 
 class StereoVision:
@@ -67,8 +60,6 @@ class StereoVision:
     Use as a context manager, or call `close`.
 
     Args:
-        rig: believed calibration.
-        settings: settings of the estimators.
         folder: folder for the images of keyframes and the tiles of the mosaic.
         cell_m: cell size of the mosaic for images of full size [m]; for binned images it is multiplied by the binning.
             By default, it is the ground sample distance of the first keyframe at full size.
@@ -111,7 +102,6 @@ class StereoVision:
         self.matcher.close()
 
     def _configure(self, binning: int) -> None:
-        """Creates the image spool, the tracker, the matcher and the search range for images of this binning."""
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self._pattern_fits: dict[int, Array] = {}  # by frame index
@@ -130,7 +120,6 @@ class StereoVision:
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
 
     def _square(self, image: Image) -> Image:
-        """Returns the image resampled to square pixels."""
         return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
 
     def _interval_s(self, time_s: float) -> float | None:
@@ -145,10 +134,7 @@ class StereoVision:
         return self._plane_from_world @ world_from_camera
 
     def _choose_scale(self, left: Image, right: Image) -> None:
-        """Chooses the binning from a stereo pair, before the first keyframe is stored, and applies it if it changed.
-
-        The current left image is then processed again at the new binning.
-        """
+        """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
         binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
@@ -201,14 +187,9 @@ class StereoVision:
         return _MatchedPair(right_image, right, dense_px, points)
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
-        """Returns the number of matched points, the image quality and the row differences of a stereo pair.
+        """Returns the matched points, the image quality and the row differences of a stereo pair.
 
-        Row differences are in pixels of the full image with square pixels.
-
-        Args:
-            row: index of the frame in the trajectories.
-            left: (H, W, 3) left image of the frame, not resampled.
-            points: matched points.
+        Row differences are in pixels of the full image with square pixels; `left` (H, W, 3) is not resampled.
         """
         contrast, saturated = matching.contrast(self._gray), matching.saturated_fraction(left)
         repeated = repetition(self._image, self.settings.patch_px)
@@ -264,12 +245,8 @@ class StereoVision:
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
         """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
 
-        With `settings.wide_search`, this is tried for every motion. Otherwise it is tried only where the predicted
-        poses are too uncertain for the matching of points, and a motion that contradicts these poses is rejected.
-
-        Returns:
-            The motion. None if the search is not tried, if the features do not give a prediction, if the measurement
-            fails, or if the motion is rejected.
+        Without `settings.wide_search`, only where the predicted poses are too uncertain for matching, and rejected if
+        it contradicts them. None if not tried, failed or rejected.
         """
         if node.points is None or not len(node.points.xyz):
             return None
@@ -310,10 +287,8 @@ class StereoVision:
         )
 
     def _light_pattern(self, rows: NDArray[np.int64]) -> LightPattern | None:
-        """Returns the light pattern of the images; None if it is not needed or not known (`light_pattern`).
-
-        Args:
-            rows: frame indices of the keyframes, of which at most `_PATTERN_PAIRS` are used.
+        """Returns the light pattern (`light_pattern`) of the keyframes at these frame indices, or of `_PATTERN_PAIRS`
+        of them.
         """
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
         return light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
@@ -347,7 +322,6 @@ def check_image_sizes(frame: Frame, size_px: tuple[int, int]) -> None:
     """Checks the sizes of the images of a frame.
 
     Args:
-        frame: frame to check; a missing image passes.
         size_px: width and height that the calibration states [px].
 
     Raises:

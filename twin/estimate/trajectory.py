@@ -41,7 +41,6 @@ def interpolate_between_keyframes(
 
 @kernel
 def _motions(twists):
-    """Returns the motions (n, 4, 4) of twists (n, 6)."""
     motions = np.empty((len(twists), 4, 4))
     for k in range(len(twists)):
         geometry.copy_into(motions[k], geometry.exp(twists[k]))

@@ -14,11 +14,8 @@ _MAX_TILT_RAD = np.deg2rad(45.0)
 def viewing_plane(world_from_camera: Array) -> Array:
     """Returns plane_from_world (4, 4), the transformation from the world to axes in which heights are measured along z.
 
-    This is the identity if the optical axis of the camera is within 45 degrees of straight down; otherwise it is the
-    smallest rotation about the origin that turns the optical axis to -z.
-
-    Args:
-        world_from_camera: (4, 4) pose of the camera.
+    The identity if the optical axis is within 45 degrees of straight down, else the smallest rotation that turns it to
+    -z.
     """
     axis = world_from_camera[:3, 2]
     angle = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))

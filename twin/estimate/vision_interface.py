@@ -43,7 +43,6 @@ class Vision(Protocol):
         """Matches a stereo pair.
 
         Args:
-            frame: frame with both images.
             row: index of the frame in the trajectories.
 
         Returns:
@@ -101,7 +100,6 @@ class Vision(Protocol):
 
         Args:
             result: result of the survey, with the final trajectory.
-            grid: grid of the map.
             step_cov: (n_keyframes, 6, 6) covariance of the pose of each keyframe relative to the previous keyframe.
             progress: called with the number of keyframes processed so far.
         """

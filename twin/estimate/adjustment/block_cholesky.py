@@ -1,17 +1,13 @@
 """Supernodal Cholesky factorisation of a sparse symmetric matrix of 6 x 6 blocks, and blocks of its inverse.
 
-The columns are grouped into panels (see `elimination`). Factorisation is right-looking (Davis 2006, chapter 4): the
-outer product of a finished panel is subtracted from later panels at once, so no update matrices are stored. A finished
-panel stores L1^-1 above L2, where L1 is the lower triangular block in the panel's own rows, and L2 holds the nonzero
-rows below them.
+Right-looking (Davis 2006, chapter 4). A finished panel (see `elimination`) stores L1^-1 above L2: L1 is the lower
+triangular block in the panel's own rows, L2 the nonzero rows below.
 
-Blocks of the inverse are computed from the last panel to the first (Takahashi et al. 1973). Let cov be the inverse,
-"own" the rows of the panel, "below" the rows of L2, and W = L2 L1^-1. Then cov(below, own) = -cov(below) W and
-cov(own) = (L1 L1')^-1 + W' cov(below) W. The later panels already hold blocks of the inverse, among them
-cov(below), in place of the factor.
+Blocks of the inverse cov are computed from the last panel to the first, in place (Takahashi et al. 1973): with W = L2
+L1^-1, cov(below, own) = -cov(below) W and cov(own) = (L1 L1')^-1 + W' cov(below) W.
 
-In the kernels, s is the `SymbolicFactor`, `panels` the array of the same name in `CholeskyFactor` and `BlockMatrix`, p
-the number of a panel, and `_D` the number of rows of a block.
+In the kernels, s is the `SymbolicFactor`, `panels` the values of all panels, p the number of a panel, and `_D` the
+number of rows of a block.
 """
 
 from __future__ import annotations
@@ -30,15 +26,10 @@ _MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smalle
 
 
 class CholeskyFactor(NamedTuple):
-    """Cholesky factor of a symmetric block matrix.
+    """Cholesky factor of a symmetric block matrix."""
 
-    Args:
-        symbolic: sparsity pattern and memory layout.
-        panels: values of all panels in one long array; a panel holds L1^-1 above L2.
-    """
-
-    symbolic: SymbolicFactor
-    panels: Array
+    symbolic: SymbolicFactor  #: sparsity pattern and memory layout
+    panels: Array  #: values of all panels in one long array; a panel holds L1^-1 above L2
 
     def solve(self, right: Array) -> Array:
         """Returns the solution (n, 6) of the linear system of the factorised matrix with a right-hand side (n, 6)."""
@@ -91,15 +82,10 @@ class CholeskyFactor(NamedTuple):
 
 
 class BlockMatrix(NamedTuple):
-    """Symmetric block matrix, stored with the memory layout of its Cholesky factor.
+    """Symmetric block matrix, stored with the memory layout of its Cholesky factor."""
 
-    Args:
-        symbolic: sparsity pattern and memory layout.
-        panels: values of all panels in one long array, modified in place.
-    """
-
-    symbolic: SymbolicFactor
-    panels: Array
+    symbolic: SymbolicFactor  #: sparsity pattern and memory layout
+    panels: Array  #: values of all panels in one long array, modified in place
 
     @classmethod
     def allocate(cls, symbolic: SymbolicFactor) -> BlockMatrix:
@@ -136,7 +122,6 @@ class BlockMatrix(NamedTuple):
 
 @kernel
 def _set_diagonal(s, diagonal, panels):
-    """Copies the diagonal blocks (n, 6, 6) into the panels."""
     for k in range(len(diagonal)):
         p = s.panel_of[s.permutation[k]]
         x = s.permutation[k] - s.panel_start[p]
@@ -160,19 +145,13 @@ def _add(s, start, blocks, panels):
 
 @kernel
 def _panel_matrix(s, panels, p):
-    """Returns the panel p as a matrix, a view of `panels`."""
     return panels[s.offset[p] : s.offset[p + 1]].reshape(-1, _D * (s.panel_start[p + 1] - s.panel_start[p]))
 
 
 @kernel
 def _factorise(s, original, panels):
-    """Factorises the matrix in the panels: each then holds L1^-1 above L2 (see the module).
-
-    Returns whether the matrix is numerically positive definite; if it is not, the factorisation is incomplete.
-
-    Args:
-        s, panels: see the module.
-        original: (6 n,) diagonal entries of the matrix before elimination, in elimination order.
+    """Factorises the matrix in place; False if it is not positive definite. `original` (6 n,): diagonal before
+    elimination.
     """
     for p in range(len(s.panel_start) - 1):
         n, panel = _D * (s.panel_start[p + 1] - s.panel_start[p]), _panel_matrix(s, panels, p)
@@ -194,14 +173,9 @@ def _factorise(s, original, panels):
 
 @kernel
 def _invert_root(matrix, original, inverse):
-    """Computes the inverse of the lower Cholesky factor of a dense matrix, row by row.
+    """Fills `inverse` (n, n) with that of the lower Cholesky factor of a dense matrix; False if not positive definite.
 
-    Returns whether the matrix is numerically positive definite; if it is not, `inverse` is incomplete.
-
-    Args:
-        matrix: (n, n) symmetric matrix, of which only the lower triangle is read.
-        original: (n,) diagonal before elimination; a pivot that is tiny relative to its diagonal entry counts as zero.
-        inverse: (n, n) zeros, filled with the lower triangular inverse.
+    A pivot that is tiny relative to `original` (n,), the diagonal before elimination, counts as zero.
     """
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):
@@ -227,17 +201,9 @@ def _invert_root(matrix, original, inverse):
 
 @kernel
 def _next_ancestor(s, positions, start):
-    """Finds the panel that holds positions[start], and the block rows of positions[start:] in this panel.
+    """Finds the panel p that holds positions[start]: returns `end`, p and block rows.
 
-    Args:
-        s: see the module.
-        positions: (m,) positions of the rows below an earlier panel, ascending.
-        start: index of the first position to process.
-
-    Returns:
-        end: positions[start:end] are the found panel's own positions; positions[end:] are below it.
-        p: number of the found panel.
-        at: (m - start,) block row in the found panel of each of positions[start:].
+    positions[start:end] are its own positions, positions[end:] below it; the block rows are those of positions[start:].
     """
     p, end = s.panel_of[positions[start]], start
     while end < len(positions) and positions[end] < s.panel_start[p + 1]:
@@ -255,13 +221,7 @@ def _next_ancestor(s, positions, start):
 
 @kernel
 def _subtract(product, at, panel):
-    """Subtracts the lower block triangle of `product` from a panel.
-
-    Args:
-        product: (6 m, 6 w) matrix of m x w blocks.
-        at: (m,) block rows in the panel; the first w are also the block columns.
-        panel: matrix of the panel, changed in place.
-    """
+    """Subtracts the lower block triangle of `product` (6 m, 6 w) from a panel, at its block rows `at` (m,)."""
     for b in range(len(at)):
         for a in range(min(b + 1, product.shape[1] // _D)):
             for i in range(_D):
@@ -283,12 +243,7 @@ def _gather(panel, at, width):
 
 @kernel
 def _invert(s, panels, diagonal):
-    """Replaces the factor by the blocks of the inverse that lie within its sparsity pattern.
-
-    Args:
-        s, panels: see the module.
-        diagonal: (n, 6, 6), filled with the diagonal blocks of the inverse, in elimination order.
-    """
+    """Replaces the factor by the blocks of the inverse in its sparsity pattern; fills `diagonal` (n, 6, 6)."""
     for p in range(len(s.panel_start) - 2, -1, -1):
         panel, width = _panel_matrix(s, panels, p), s.panel_start[p + 1] - s.panel_start[p]
         n = _D * width

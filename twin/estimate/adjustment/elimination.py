@@ -1,8 +1,7 @@
 """Symbolic analysis of a sparse symmetric block matrix: elimination order, fill-in and storage of its Cholesky factor.
 
-The elimination order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path of the elimination tree
-whose columns have nearly the same sparsity pattern below the diagonal form a supernode. The nodes of a supernode are
-renumbered to be consecutive, and their columns are stored as one dense matrix, a panel.
+The order is SuperLU's multiple minimum degree order of A' + A. Nodes on a path of the elimination tree with nearly the
+same pattern below the diagonal form a supernode, whose columns are one dense matrix, a panel.
 """
 
 from __future__ import annotations
@@ -27,28 +26,22 @@ class SymbolicFactor(NamedTuple):
     """Sparsity pattern and memory layout of a Cholesky factor.
 
     The position of a node is its index in the elimination order, from 0.
-
-    Args:
-        permutation: (n,) position of each node.
-        panel_start: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1.
-        row_start, rows: (s + 1,), (r,) the positions of the nonzero block rows below panel p are
-            rows[row_start[p] : row_start[p + 1]], ascending.
-        offset: (s + 1,) index of the first element of each panel in one long array, and the length of this array. A
-            panel is a row-major matrix; its block rows are the panel's own positions and those below it, its block
-            columns are its own positions.
-        panel_of: (n,) number of the panel that holds each position.
-        off_diagonal: (m, 2) row and column position of each off-diagonal block, row > column.
-        transposed: (m,) true where the off-diagonal block (i, j) given to `analyse` has to be transposed, because node
-            i is eliminated before node j.
     """
 
-    permutation: Indices
-    panel_start: Indices
+    permutation: Indices  #: (n,) position of each node
+    panel_start: Indices  #: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1
+    #: row_start, rows: (s + 1,), (r,) the positions of the nonzero block rows below panel p are rows[row_start[p] :
+    #: row_start[p + 1]], ascending.
     row_start: Indices
     rows: Indices
+    #: (s + 1,) index of the first element of each panel in one long array, and the length of this array. A panel is a
+    #: row-major matrix; its block rows are the panel's own positions and those below it, its block columns are its own
+    #: positions.
     offset: Indices
-    panel_of: Indices
-    off_diagonal: Indices
+    panel_of: Indices  #: (n,) number of the panel that holds each position
+    off_diagonal: Indices  #: (m, 2) row and column position of each off-diagonal block, row > column
+    #: (m,) true where the off-diagonal block (i, j) given to `analyse` has to be transposed, because node i is
+    #: eliminated before node j.
     transposed: NDArray[np.bool_]
 
     def rows_below(self, panel: int) -> Indices:
@@ -69,7 +62,6 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
     """Returns the symbolic factor of a matrix of n x n blocks.
 
     Args:
-        n: number of nodes; each is one block row and one block column of the matrix.
         i, j: (m,) nodes of the off-diagonal blocks (i, j), i not equal to j; a pair may occur more than once.
     """
     permutation = _minimum_degree(n, i, j)
@@ -96,7 +88,6 @@ def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
 
 
 def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:
-    """Returns the position (n,) of each node in the minimum-degree order."""
     off = sparse.coo_matrix((np.ones(len(i)), (i, j)), shape=(n, n))
     pattern = ((off + off.T) > 0).astype(np.float64)
     dominant = sparse.diags_array(np.asarray(pattern.sum(axis=1)).ravel() + 1.0)
@@ -108,7 +99,6 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
     """Returns, for each supernode in elimination order, its nodes and the nodes of the nonzero rows below it.
 
     Args:
-        n: number of nodes.
         early, late: (m,) the two nodes of each off-diagonal block, numbered in elimination order, early < late.
     """
     order = np.argsort(early, kind="stable")
@@ -131,13 +121,11 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
 
 @kernel
 def _fill_in(n, start, later):
-    """Returns the nonzero rows below the diagonal of each column of the factor (Davis 2006, chapter 4).
+    """Returns the rows below the diagonal of each column k of the factor: below[at[k] : at[k + 1]] (Davis 2006, chapter
+    4).
 
-    They are the later neighbours of node k in the matrix, later[start[k] : start[k + 1]], and the rows of the columns
-    of its children in the elimination tree, except k itself (the fill-in).
-
-    Returns:
-        The arrays `at` (n + 1,) and `below`: the rows of column k are below[at[k] : at[k + 1]], ascending.
+    They are the later neighbours later[start[k] : start[k + 1]] of node k, and the rows of its children in the
+    elimination tree.
     """
     at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
     last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists

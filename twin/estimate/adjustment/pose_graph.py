@@ -1,14 +1,11 @@
 """Factor graph of poses and its maximum-likelihood solution, the core of the global alignment.
 
-The cost F of the poses X is the sum of rho(r) over the binary factors and of r^2 / 2 over the unary factors, where r is
-the norm of a factor's residual, whitened by the covariance of that residual. The residual of a measured motion Z_ij is
-log(Z_ij^-1 X_i^-1 X_j). rho(r) is r^2 / 2 or Huber's loss. F is minimised by Gauss-Newton, with Levenberg-Marquardt
-damping after a step that increased the cost. The increment d of a pose X is a motion in the camera's own axes: X exp(d)
-replaces X.
+The cost F is the sum of rho(r) over the binary and of r^2 / 2 over the unary factors, with r the norm of a whitened
+residual, log(Z_ij^-1 X_i^-1 X_j) for a measured motion Z_ij, and rho either r^2 / 2 or Huber's loss. It is minimised by
+Gauss-Newton, with Levenberg-Marquardt damping after a step that increased F; X exp(d) replaces X.
 
-One scalar parameter may be shared by binary factors (the scale error of the DVL); F then includes its zero-mean
-Gaussian prior. The parameter adds one row and one column, the border, to the normal equations of the poses. The
-bordered system is solved by the Schur complement of the block of the poses.
+A scalar with a zero-mean prior may be shared by binary factors (scale error of the DVL). It adds a row and a column,
+the border, to the normal equations, which the Schur complement of the block of the poses solves.
 """
 
 from __future__ import annotations
@@ -35,55 +32,39 @@ _BATCH = 4096  # number of binary factors whose Jacobians are in memory at the s
 
 
 class UnaryFactors(NamedTuple):
-    """Factors of one kind that each constrain one pose.
+    """Factors of one kind that each constrain one pose."""
 
-    Args:
-        pose_index: (m,) index of the constrained pose.
-        information: (m, d, d) information matrices.
-        residuals: function of the poses (m, 4, 4) that returns residuals (m, d).
-        jacobians: function of poses and residuals that returns the Jacobians (m, d, 6) with respect to the increment of
-            the pose.
-    """
-
-    pose_index: Indices
-    information: Array
-    residuals: Callable[[Array], Array]
+    pose_index: Indices  #: (m,) index of the constrained pose
+    information: Array  #: (m, d, d) information matrices
+    residuals: Callable[[Array], Array]  #: function of the poses (m, 4, 4) that returns residuals (m, d)
+    #: function of poses and residuals that returns the Jacobians (m, d, 6) with respect to the increment of the pose.
     jacobians: Callable[[Array, Array], Array]
 
 
 class BinaryFactors(NamedTuple):
-    """Factors of one kind that each constrain the relative pose of two nodes.
+    """Factors of one kind that each constrain the relative pose of two nodes."""
 
-    Args:
-        i, j: (m,) indices of the two poses of each factor.
-        information: (m, d, d) information matrices.
-        residuals: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
-        jacobians: function of i_from_j, the shared parameter and the residuals that returns two Jacobians: with respect
-            to the increment of pose j (m, d, 6), and with respect to the shared parameter (m, d), None if the factors
-            do not depend on it. It is called for a part of the factors at a time.
-        huber: residual [standard deviations] above which the loss is linear; None: least squares.
-    """
-
+    #: i, j: (m,) indices of the two poses of each factor.
     i: Indices
     j: Indices
-    information: Array
+    information: Array  #: (m, d, d) information matrices
+    #: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
     residuals: Callable[[Array, float], Array]
+    #: function of i_from_j, the shared parameter and the residuals that returns two Jacobians: with respect to the
+    #: increment of pose j (m, d, 6), and with respect to the shared parameter (m, d), None if the factors do not depend
+    #: on it. It is called for a part of the factors at a time.
     jacobians: Callable[[Array, float, Array], tuple[Array, Array | None]]
-    huber: float | None = None
+    huber: float | None = None  #: residual [standard deviations] above which the loss is linear; None: least squares
 
 
 class FactorGraph(NamedTuple):
-    """Factor graph of poses and, optionally, one parameter shared by binary factors.
+    """Factor graph of poses and, optionally, one parameter shared by binary factors."""
 
-    Args:
-        n_poses: number of poses.
-        unary, binary: the factors, grouped by kind.
-        shared_sigma: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
-    """
-
-    n_poses: int
+    n_poses: int  #: number of poses
+    #: unary, binary: the factors, grouped by kind.
     unary: Sequence[UnaryFactors]
     binary: Sequence[BinaryFactors]
+    #: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
     shared_sigma: float | None = None
 
 
@@ -95,60 +76,39 @@ class GraphState(NamedTuple):
 
 
 class _Evaluation(NamedTuple):
-    """A factor graph evaluated at a state.
+    """A factor graph evaluated at a state."""
 
-    Args:
-        state: state at which the graph is evaluated.
-        cost: value of F.
-        unary: residuals (m, d) of each kind of unary factors.
-        binary: residuals (m, d) and robust weights (m,) of each kind of binary factors.
-        chi2: squared norms (m,) of the whitened residuals of each kind of binary factors.
-    """
-
-    state: GraphState
-    cost: float
-    unary: list[Array]
-    binary: list[tuple[Array, Array]]
-    chi2: list[Array]
+    state: GraphState  #: state at which the graph is evaluated
+    cost: float  #: value of F
+    unary: list[Array]  #: residuals (m, d) of each kind of unary factors
+    binary: list[tuple[Array, Array]]  #: residuals (m, d) and robust weights (m,) of each kind of binary factors
+    chi2: list[Array]  #: squared norms (m,) of the whitened residuals of each kind of binary factors
 
 
 class _NormalEquations(NamedTuple):
-    """Normal equations, without the off-diagonal blocks of the poses, which are stored in a `BlockMatrix`.
+    """Normal equations, without the off-diagonal blocks of the poses, which are stored in a `BlockMatrix`."""
 
-    Args:
-        diagonal: (n, 6, 6) diagonal blocks.
-        gradient: (n, 6) gradient of F with respect to the poses.
-        border: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter. All second
-            derivatives are in the Gauss-Newton approximation.
-        corner: second derivative of F with respect to the shared parameter; 0 if there is no such parameter.
-        shared_gradient: derivative of F with respect to the shared parameter.
-    """
-
-    diagonal: Array
-    gradient: Array
+    diagonal: Array  #: (n, 6, 6) diagonal blocks
+    gradient: Array  #: (n, 6) gradient of F with respect to the poses
+    #: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter. All second derivatives
+    #: are in the Gauss-Newton approximation.
     border: Array
-    corner: float
-    shared_gradient: float
+    corner: float  #: second derivative of F with respect to the shared parameter; 0 if there is no such parameter
+    shared_gradient: float  #: derivative of F with respect to the shared parameter
 
 
 class Solution(NamedTuple):
-    """Minimum of the cost of a factor graph; if not converged, the last accepted state of the iteration.
+    """Minimum of the cost of a factor graph; if not converged, the last accepted state of the iteration."""
 
-    Args:
-        state: poses and shared parameter at the minimum.
-        cost: F at the minimum.
-        chi2: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
-        converged: false if the iterations ended before the minimum was reached.
-        cholesky: factor of the normal matrix of the poses, undamped, at the last linearisation.
-        border: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal
-            information of this parameter; None if there is no shared parameter.
-    """
-
-    state: GraphState
-    cost: float
+    state: GraphState  #: poses and shared parameter at the minimum
+    cost: float  #: F at the minimum
+    #: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
     chi2: list[Array]
-    converged: bool
+    converged: bool  #: false if the iterations ended before the minimum was reached
+    #: factor of the normal matrix of the poses, undamped, at the last linearisation.
     cholesky: block_cholesky.CholeskyFactor
+    #: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal information of
+    #: this parameter; None if there is no shared parameter.
     border: tuple[Array, float] | None
 
     def marginals_in_place(self) -> Array:
@@ -179,15 +139,10 @@ class Solution(NamedTuple):
 
 
 def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
-    """Returns the solution that the iteration reaches from `start`.
+    """Returns the solution reached from `start` by Gauss-Newton with Levenberg-Marquardt damping.
 
-    The method is Gauss-Newton with Levenberg-Marquardt damping. The solution is a local minimum of the cost, unless
-    `max_iterations` is reached first.
-
-    Args:
-        graph: factors of the graph.
-        start: initial values of the unknowns.
-        max_iterations: largest number of steps, accepted or rejected; one step is always made.
+    It is a local minimum of the cost unless `max_iterations` steps, accepted or rejected, are reached; one is always
+    made.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -215,29 +170,18 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
 
 
 class _Step(NamedTuple):
-    """Solution of the damped normal equations.
+    """Solution of the damped normal equations."""
 
-    Args:
-        damping: the diagonal of the pose block was multiplied by 1 + damping.
-        poses: (n, 6) increments of the poses.
-        shared: increment of the shared parameter.
-        cholesky, border: as in `Solution`, but of the damped equations.
-    """
-
-    damping: float
-    poses: Array
-    shared: float
+    damping: float  #: the diagonal of the pose block was multiplied by 1 + damping
+    poses: Array  #: (n, 6) increments of the poses
+    shared: float  #: increment of the shared parameter
+    #: cholesky, border: as in `Solution`, but of the damped equations.
     cholesky: block_cholesky.CholeskyFactor
     border: tuple[Array, float] | None
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
     """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites `matrix`.
-
-    Args:
-        matrix: off-diagonal blocks of the poses.
-        equations: the other parts of the normal equations.
-        damping: the diagonal of the pose block is multiplied by 1 + damping.
 
     Raises:
         LinAlgError: the factors do not constrain every pose.
@@ -261,7 +205,6 @@ def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damp
 
 
 def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
-    """Returns cost, residuals, robust weights and squared norms of a factor graph at a state."""
     cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
     unary, binary, chi2 = [], [], []
     for factors in graph.unary:
@@ -278,10 +221,7 @@ def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
 
 
 def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Returns the losses rho (m,) and robust weights (m,), given the squared norms (m,) of the whitened residuals.
-
-    `huber` is the norm above which the loss is linear; None: least squares.
-    """
+    """Returns losses rho (m,) and robust weights (m,) of squared whitened norms; `huber` None: least squares."""
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)
@@ -367,13 +307,8 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
 
 @kernel
 def _add_border(first, second, by_j, weighted, i_from_j, border):
-    """Adds the mixed second derivatives (poses and shared parameter) of binary factors to the border.
-
-    Args:
-        first, second, by_j: see `_add_binary`.
-        weighted: (m, d) Jacobian with respect to the shared parameter, times information and robust weight.
-        i_from_j: (m, 4, 4) poses of camera j in camera i.
-        border: (n, 6), changed in place.
+    """Adds the mixed derivatives of poses and shared parameter to `border`; `weighted` (m, d): weighted shared
+    Jacobian.
     """
     for m in range(len(first)):
         slope = np.zeros(6)
@@ -390,8 +325,6 @@ def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float
     """Returns binary factors of measured motions.
 
     Args:
-        links: measured motions between nodes.
-        index_of: index of the pose of each node, by node number.
         huber: residual [standard deviations] above which the loss is linear; None: least squares.
     """
     columns = Links.from_sequence(links)
@@ -444,7 +377,6 @@ def pose_residual_jacobians(residuals):
 
 @kernel
 def _retract(poses, increments):
-    """Returns the poses (n, 4, 4), each moved by its increment (n, 6) in its own axes."""
     moved = np.empty_like(poses)
     for k in range(len(poses)):
         geometry.copy_into(moved[k], geometry.compose(poses[k], geometry.exp(increments[k])))
@@ -453,7 +385,6 @@ def _retract(poses, increments):
 
 @kernel
 def _relative_poses(poses, i, j):
-    """Returns the relative poses i_from_j (m, 4, 4) of the pairs of poses with the indices i and j (m,)."""
     relative = np.empty((len(i), 4, 4))
     for k in range(len(i)):
         geometry.copy_into(relative[k], geometry.compose(geometry.inverse(poses[i[k]]), poses[j[k]]))

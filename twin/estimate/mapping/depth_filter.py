@@ -1,9 +1,7 @@
-"""Kalman depth filter along the path: one scalar filter per pixel of the current keyframe.
+"""Kalman depth filter along the path: depth (H, W) [m] and variance [m^2] of each pixel of the newest keyframe.
 
-State: depth Z (H, W) [m] and its variance P (H, W) [m^2] in the left camera of the newest keyframe. Each step
-propagates the state to the next keyframe and fuses it with the stereo depth of that keyframe and with the depth from
-the motion between the two keyframes. The depths of pixels that are not propagated are fused into the map (`elevation`),
-so that each depth enters the map exactly once.
+The depths of pixels that are not propagated to the next keyframe are fused into the map (`elevation`), so that each
+depth enters the map exactly once.
 """
 
 from __future__ import annotations
@@ -34,27 +32,17 @@ MOTION_MIN_SIGMA_PX = 0.03
 
 
 class DepthMap(NamedTuple):
-    """Depth of every pixel of a left image, with its variance.
+    """Depth of every pixel of a left image, with its variance."""
 
-    Args:
-        depth_m: (H, W) float32 depth [m], NaN where unknown.
-        variance_m2: (H, W) float32 variance of the depth [m^2], NaN where unknown.
-    """
-
-    depth_m: Map
-    variance_m2: Map
+    depth_m: Map  #: (H, W) float32 depth [m], NaN where unknown
+    variance_m2: Map  #: (H, W) float32 variance of the depth [m^2], NaN where unknown
 
 
 class PropagatedDepth(NamedTuple):
-    """Result of `propagate`.
+    """Result of `propagate`."""
 
-    Args:
-        fused: depth map of the new keyframe.
-        inherited: (H, W) bool, true where the depth contains information from the old map.
-    """
-
-    fused: DepthMap
-    inherited: Mask
+    fused: DepthMap  #: depth map of the new keyframe
+    inherited: Mask  #: (H, W) bool, true where the depth contains information from the old map
 
 
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
@@ -83,19 +71,14 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
     """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth (as `fuse` does).
 
-    For each pixel of the new image, the propagation is linearised at the point given by its new stereo depth. This
-    point is projected into the old image, where the old map is interpolated bilinearly, except across depth
-    discontinuities (backward warping leaves no holes and needs no rounding). The difference between the old depth and
-    the depth of the point in the old camera is converted, with the surface normal at the point, to a difference of the
-    depth in the new camera along the ray of the pixel. For a pixel without new stereo depth, the linearisation point
-    has the smallest depth in the new camera of the old points that project to the pixel.
+    Backward warping: each new pixel is linearised at its stereo depth (or, without one, at the smallest depth of the
+    old points that project there) and projected into the old image, whose map is interpolated except across
+    discontinuities. The difference of depth is converted, with the surface normal, to one along the ray of the new
+    pixel.
 
     Args:
-        old: filtered depth of the old keyframe.
-        new: stereo depth of the new keyframe.
         new_from_old: (4, 4) pose of the old camera in the new camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
-        rig: calibration of the images, with square pixels.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     args = (camera, rig.focal_px * rig.baseline_m, JUMP_PX)
@@ -115,23 +98,14 @@ def motion_depth(
 ) -> DepthMap:
     """Returns the depth of the new keyframe from the optical flow between it and the old keyframe.
 
-    This is the exact two-view form of eq. 1 of Negahdaripour & Madjidi (2003). The relative pose and the current depth
-    predict the flow. The difference between the actual and the predicted flow along the epipolar line is measured with
-    the same window as stereo disparity; it is linear in the error of the inverse depth. The covariance of the relative
-    pose contributes to the variance of the depth.
-
-    In rendered sequences (noise of 2 grey levels, true poses), the error of depth from motion, expressed as stereo
-    disparity, was 0.044 px over a reef and 0.063 px over a fractal floor, in both cases 0.9 times the computed standard
-    deviation; the bias was 0.001 px. Fusing depth from motion reduced the error of the filter from 0.045 to 0.035 px
-    (reef) and from 0.040 to 0.029 px (fractal floor). Dense two-dimensional flow is not used: its bias of
-    about 0.1 px is common to the whole image and would remain in the map.
+    Exact two-view form of eq. 1 of Negahdaripour & Madjidi (2003): the difference between actual and predicted flow
+    along the epipolar line, measured with the window of stereo, is linear in the error of the inverse depth. Dense
+    two-dimensional flow is not used: its bias of about 0.1 px is common to the whole image and would remain in the map.
 
     Args:
         gray, old_gray: (H, W) float32 grey levels of the left images of the new and the old keyframe.
-        current: depth of the new keyframe, used as prediction.
         old_from_new: (4, 4) pose of the new camera in the old camera.
         step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
-        rig: calibration of the images, with square pixels.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
@@ -170,16 +144,7 @@ def _fuse(depth, variance, measured, measured_variance, gate):
 
 @kernel
 def _forward_project(old, rotation, translation, guess, camera):
-    """Fills unknown pixels of the new depth map `guess` (H, W), in place, from the old depth map.
-
-    A pixel receives the smallest depth, in the new camera, of the old points that project to it.
-
-    Args:
-        old: (H, W) old depth map [m].
-        rotation, translation: (3, 3), (3,) pose of the old camera in the new one [m].
-        guess: (H, W) depth map of the new image [m], NaN where unknown.
-        camera: focal length, column and row of the principal point [px].
-    """
+    """Fills unknown pixels of `guess` (H, W), in place, with the smallest depth of old points that project there."""
     height, width = old.shape
     focal, cx, cy = camera
     filled = np.zeros(old.shape, np.bool_)
@@ -200,10 +165,7 @@ def _forward_project(old, rotation, translation, guess, camera):
 
 @kernel(inline="always")
 def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
-    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth `depth` [m] in the first camera.
-
-    `rotation` and `translation` are the pose of the first camera in the other one.
-    """
+    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth [m] in the first."""
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
         rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],
@@ -216,10 +178,8 @@ def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
     """Returns depth and variance at column x and row y, interpolated between the four neighbouring pixels.
 
-    Both are NaN if a neighbour is unknown, if the neighbours lie on different surfaces (disparities that differ by
-    `jump` [px] or more), and outside the image. Inverse depth is interpolated, because it is linear on planes. The
-    variance is interpolated linearly; it does not decrease as for independent errors, because the matching windows of
-    neighbouring pixels overlap.
+    NaN if a neighbour is unknown, on another surface (disparities differ by `jump` [px]) or outside. Inverse depth is
+    linear on planes. The variance is interpolated too, because neighbouring matching windows overlap.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -313,10 +273,8 @@ def _quadratic(row, cov):
 def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
     """Returns the variance (H, W) [px^2] of the disparity from motion that is due to the error of the relative pose.
 
-    A pose error displaces the image point; the component of this displacement along the epipolar line has the same
-    effect as an error of depth. The variance is J cov J', with J the derivative of the disparity with respect to the
-    pose. It is NaN where a change of depth does not displace the image point: at the epipole, and everywhere without
-    translation. It is 0 at pixels without disparity, and everywhere if `step_cov` is zero.
+    J cov J', with J the derivative along the epipolar line. NaN where depth does not displace the image point (epipole,
+    no translation); 0 without disparity, and everywhere if `step_cov` is zero.
     """
     height, width = disparity.shape
     focal, cx, cy = camera

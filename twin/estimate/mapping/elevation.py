@@ -34,35 +34,18 @@ _SUPPORT = 3
 class ElevationMapper:
     """Fuses height patches into the cells of a grid. Memory depends on the grid only, not on the length of the survey.
 
-    A cell keeps up to two hypotheses of its height, because a steep cell is measured at its lower edge in one view and
-    at its upper edge in another. The height z in a patch, of variance R, updates the best-fitting hypothesis h, of
-    variance P, if the innovation passes the gate (z - h)^2 < GATE (P + R). Otherwise z becomes another hypothesis; if
-    the cell has two already, z replaces the one with the larger depth variance if that of z is smaller. The lower
-    hypothesis is the result unless the depth variance of the higher one is more than ten times smaller, because a
-    matching window at an edge often assigns the height of the nearer surface to the floor behind it. In the cells of
-    the horseshoe reef with two hypotheses, the lower one was right in 82 %, the one with the smaller variance in 67 %,
-    and the one chosen by this rule in 84 %. Where fewer than three of the neighbours support this choice, the other
-    hypothesis is the result (`_isolated`).
+    A cell keeps up to two hypotheses, because a steep cell is measured at its lower edge in one view and at its upper
+    edge in another. A height z of variance R updates the best-fitting hypothesis h of variance P if (z - h)^2 < GATE (P
+    + R). Otherwise it becomes another one, or replaces the one with the larger depth variance if its own is smaller.
+    The lower one is the result unless the higher one has less than a tenth of its depth variance (right in 84 % of the
+    cells of the horseshoe reef) or too few neighbours support it (`_isolated`). Hypotheses that their last camera
+    cannot have seen are dropped (`visibility`), and cells that contradict all neighbours have no result
+    (`_contradicted`).
 
-    A hypothesis is dropped if the camera that measured it last cannot have seen it, because the line of sight passes
-    below the connected surface of the map (`visibility`).
-
-    The variance of a hypothesis is the sum of two parts. Errors of depth are independent between patches, so their
-    part, the depth variance, decreases with each fusion. Errors due to the pose and to the smoothing of slopes are
-    common to all patches of a leg and mostly to all legs, so their part is the weighted mean of the variances of the
-    patches, which does not decrease with the number of patches.
-
-    The variance of the result has three further terms. With f the standard deviation of the lateral error divided by
-    two cell sizes, these are f^2 times the squared range of heights around the cell, f times the squared height step
-    across the cell (only for steps larger than a cell, where the cell may be on the wrong side of an edge), and the
-    variance due to the choice between two hypotheses. Without the term for steps, the standard deviation was 1.9 times
-    too small over the whole map of a reef, because 1 % of the cells, all at edges, had the height of the wrong side of
-    the edge.
-
-    Cells whose heights contradict those of all their neighbours have no result (`_contradicted`).
-
-    Args:
-        grid: grid of the map.
+    The depth variance is independent between patches and decreases with each fusion; the variance of pose and smoothing
+    is common to them, so it is averaged. The result adds, with f the standard deviation of the lateral error per two
+    cells, f^2 times the squared range of heights around the cell, f times the squared step across it if larger than a
+    cell, and the variance of the choice between hypotheses.
     """
 
     def __init__(self, grid: MapGrid):
@@ -83,7 +66,6 @@ class ElevationMapper:
         this keyframe, and the two heights agree. The information on each cell therefore enters the map exactly once.
 
         Args:
-            patch: heights of a keyframe.
             successor: heights of the next keyframe; None for the last one, or if the next one is outside the grid.
             inherited: (H, W) bool, pixels of the next keyframe whose depth contains information from this keyframe
                 (`depth_filter.PropagatedDepth`).
@@ -122,11 +104,7 @@ class ElevationMapper:
         return np.where(_isolated(first, second), 1 - chosen, chosen)
 
     def _drop_hidden(self) -> None:
-        """Drops the hypotheses that their cameras cannot have seen.
-
-        The surface consists of the chosen hypotheses in large connected groups. Hypotheses in small groups are checked,
-        those that were chosen and the others.
-        """
+        """Drops hypotheses in small groups that their cameras cannot have seen behind large groups of chosen ones."""
         chosen, surface = self._choice(), None
         for which in (chosen, 1 - chosen):
             height, depth_m2, systematic, camera = (
@@ -164,14 +142,10 @@ class ElevationMapper:
 
 
 def _isolated(height: Map, other: Map) -> Mask:
-    """Returns a mask (rows, cols) of the cells whose neighbours do not support the chosen hypothesis but the other one.
+    """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one.
 
-    These are the cells with two hypotheses and at least five known neighbours, where fewer than `_NEIGHBOURS_AT_CORNER`
-    of the neighbours are at least as near to `height` as to `other`. Such a height is usually a mismatch, because a
-    cell next to a real step has more neighbours on its own side of the step.
-
-    Args:
-        height, other: (rows, cols) chosen and other hypothesis [m]; NaN where unknown.
+    Of at least five known neighbours, fewer than `_NEIGHBOURS_AT_CORNER` are at least as near to `height` as to
+    `other`: usually a mismatch, because a cell next to a real step has more neighbours on its own side.
     """
     around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
     known, agreeing = np.zeros(height.shape, np.int8), np.zeros(height.shape, np.int8)
@@ -183,10 +157,7 @@ def _isolated(height: Map, other: Map) -> Mask:
 
 
 def _small_groups(known: Mask) -> Mask:
-    """Returns a mask (rows, cols) of the known cells in connected groups of fewer than `MIN_CELLS` known cells.
-
-    Such groups are usually mismatches at image borders.
-    """
+    """Returns a mask of known cells in groups of fewer than `MIN_CELLS`, usually mismatches at image borders."""
     _, label, stats, _ = cv2.connectedComponentsWithStats(known.astype(np.uint8), connectivity=8)
     small = np.asarray(stats)[:, cv2.CC_STAT_AREA] < MIN_CELLS
     return known & small[np.asarray(label, np.int64)]
@@ -195,18 +166,10 @@ def _small_groups(known: Mask) -> Mask:
 def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
     """Returns a mask (rows, cols) of the known cells, alone or in twos and threes, that contradict their neighbours.
 
-    Heights h and k of neighbouring cells agree if (h - k)^2 < GATE (P + Q + E), with P and Q the `variance` of the two
-    cells, and E the square of `edge_fraction` times the range of heights around the cell. A cell is supported if at
-    least `_SUPPORT` neighbours agree with it, or if one of those that agree is supported so. A cell that is not
-    supported, and contradicts a neighbour, is a mismatch: beside a real step, a cell has neighbours on its own side.
-
-    By the range of heights, a mismatch would excuse itself, so it is that of the neighbours, without the two highest
-    and the two lowest ones. It is computed for the cells only that are not supported without it.
-
-    Args:
-        height: (rows, cols) heights [m]; NaN where unknown.
-        variance: (rows, cols) variance of the difference from a level floor [m^2].
-        edge_fraction: standard deviation of a height due to lateral errors, as a fraction of the range of heights.
+    Heights h and k agree if (h - k)^2 < GATE (P + Q + E), with their variances P and Q, and E the square of
+    `edge_fraction` times the range of the neighbours' heights without the two highest and lowest (only for cells that
+    are not supported without it). A cell is supported if `_SUPPORT` neighbours agree, or one that is supported so; a
+    cell that is not, and contradicts a neighbour, is a mismatch.
     """
     rows, cols = height.shape
     near, near_variance = (np.pad(layer, 1, constant_values=np.nan) for layer in (height, variance))
@@ -229,17 +192,13 @@ def _contradicted(height: Map, variance: Map, edge_fraction: float) -> Mask:
 
 
 def _trimmed_range(heights: Map) -> Map:
-    """Returns the range (n,) of the known heights in each row (n, 8) without the two highest and the two lowest ones.
-
-    It is 0 with fewer than six known heights.
-    """
+    """Returns the range (n,) of the known heights (n, 8) without the two highest and lowest; 0 with fewer than six."""
     ordered, known = np.sort(heights, axis=1), np.isfinite(heights).sum(axis=1)  # NaN last
     highest = np.take_along_axis(ordered, np.maximum(known - 3, 0)[:, None], axis=1)[:, 0]
     return np.where(known >= 6, highest - ordered[:, 2], np.float32(0))
 
 
 def _relief(height: Map) -> Map:
-    """Returns the range (rows, cols) of the known heights in the 3 x 3 cells around each cell [m]; 0 without any."""
     block = np.ones((3, 3), np.uint8)
     far = np.float32(1e6)
     high = cv2.dilate(np.where(np.isnan(height), -far, height), block)
@@ -247,11 +206,7 @@ def _relief(height: Map) -> Map:
 
 
 def _step(height: Map) -> Map:
-    """Returns the largest absolute second difference (rows, cols) of height across each cell, over four directions [m].
-
-    Directions in which a height is unknown are left out; the result is 0 if all are, and at the edge of the grid. All
-    cells of a grid with fewer than three rows or columns are at its edge.
-    """
+    """Returns the largest absolute second difference (rows, cols) of height in four directions [m]; 0: unknown."""
     step = np.zeros_like(height)
     if min(height.shape) < 3:
         return step
@@ -267,11 +222,7 @@ def _remove_propagated(
     row, col, height, variance, systematic, new_row, new_col, new_height, new_variance, new_systematic, pixel,
     inherited, gate, remaining,
 ):  # fmt: skip
-    """Sets to NaN, in place, the cells of `remaining` (rows, cols) that were propagated to the next keyframe.
-
-    The arguments from `row` to `systematic` and from `new_row` to `pixel` are fields of the patches of this keyframe
-    and of the next one (`HeightPatch`); `inherited` is as in `ElevationMapper.fuse`.
-    """
+    """Sets the cells of `remaining` that were propagated to the next keyframe to NaN (see `ElevationMapper.fuse`)."""
     for i in range(max(row, new_row), min(row + height.shape[0], new_row + new_height.shape[0])):
         for j in range(max(col, new_col), min(col + height.shape[1], new_col + new_height.shape[1])):
             a, b, c, e = i - row, j - col, i - new_row, j - new_col
@@ -286,11 +237,10 @@ def _remove_propagated(
 def _fuse_cells(
     row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
 ):  # fmt: skip
-    """Fuses each height of a height patch (rows, cols) with one hypothesis of its cell, in place.
+    """Fuses each height of a patch with the hypothesis of its cell that fits best within the gate, in place.
 
-    The hypothesis is the one that fits best within the gate. A height that fits none becomes a hypothesis itself. If
-    the cell has two already, the height replaces the one with the larger depth variance, or is ignored if its own depth
-    variance is not smaller.
+    A height that fits none becomes a hypothesis, or replaces the one with the larger depth variance if its own is
+    smaller.
     """
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
@@ -321,9 +271,8 @@ def _fuse_cells(
 
 @kernel
 def _add_colours(row, col, height, pixel, rgb, gain, colour):
-    """Adds the weighted image colour of each cell with a height to `colour` (grid rows, grid cols, 4).
-
-    The last channel of `colour` is the sum of the weights. `colour` is modified in place.
+    """Adds the weighted image colour of each cell with a height to `colour` (rows, cols, 4); the last channel is the
+    weight.
     """
     rows, cols = rgb.shape[0] - 1, rgb.shape[1] - 1
     for i in range(height.shape[0]):

@@ -1,14 +1,12 @@
 """Relative exposures of the images of an orthomosaic, so that an exposure step leaves no seam.
 
-If the cameras report their exposures, each image is multiplied by the geometric mean of all exposures divided by its
-own exposure. Otherwise the factors are estimated where images overlap: let y_kc be the logarithm of the mean colour of
-a patch c of the floor in image k, where the patch is at the normalised image coordinates (u, v). It is modelled as
+Exposures that the cameras do not report are estimated where images overlap. The logarithm of the mean colour of a patch
+c of the floor, at the normalised coordinates (u, v) of image k, is modelled as
 
-    y_kc = a_c + g_k + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2,
+    y_kc = a_c + g_k + b1 u + b2 v + b3 u^2 + b4 u v + b5 v^2
 
-with a_c the logarithm of the colour of the patch, g_k the logarithm of the exposure, and b1 to b5 the coefficients of
-the illumination pattern of the lamps, which is the same in all images. The sum of squared residuals is minimised, with
-weak priors of mean 0 on g_k and on b1 to b5, for each colour band separately.
+with the colour a_c, the exposure g_k and the pattern b of the lamps, common to all images: least squares with weak
+zero-mean priors on g and b, for each colour band.
 """
 
 from __future__ import annotations
@@ -33,17 +31,11 @@ _MIN_LEVEL = 4.0  # darkest mean colour that is used [grey levels]
 
 
 class PatchColours(NamedTuple):
-    """Mean colours of n patches of the floor in one image.
+    """Mean colours of n patches of the floor in one image."""
 
-    Args:
-        patch: (n,) number of each patch.
-        log_colour: (n, 3) natural logarithm of the mean colour of each patch [grey levels].
-        position: (n, 2) normalised image coordinates of the centre of each patch.
-    """
-
-    patch: NDArray[np.int64]
-    log_colour: Array
-    position: Array
+    patch: NDArray[np.int64]  #: (n,) number of each patch
+    log_colour: Array  #: (n, 3) natural logarithm of the mean colour of each patch [grey levels]
+    position: Array  #: (n, 2) normalised image coordinates of the centre of each patch
 
 
 def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
@@ -79,7 +71,6 @@ def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points
     Args:
         image: (H, W, 3) image.
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        rig: calibration of the image.
         points: (n, 3) centres of the patches in the axes of the map [m] (`patch_points`).
     """
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)

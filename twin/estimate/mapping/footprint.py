@@ -19,18 +19,13 @@ _MARGIN = 0.25  # fraction of its size by which an image on the floor may be lar
 
 
 class MapTile(NamedTuple):
-    """Part of a map: a square of cells, cut off at the east and south edges of the map.
+    """Part of a map: a square of cells, cut off at the east and south edges of the map."""
 
-    Args:
-        row, col: number of the tile from the north and from the west, from 0.
-        grid: its cells, which are cells of the grid of the whole map.
-        keyframes: (n,) numbers of the keyframes whose images may show it.
-    """
-
+    #: row, col: number of the tile from the north and from the west, from 0.
     row: int
     col: int
-    grid: MapGrid
-    keyframes: NDArray[np.int64]
+    grid: MapGrid  #: its cells, which are cells of the grid of the whole map
+    keyframes: NDArray[np.int64]  #: (n,) numbers of the keyframes whose images may show it
 
 
 def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MOST_CELLS) -> MapGrid:
@@ -41,8 +36,6 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MO
 
     Args:
         result: result of a survey with at least one keyframe, whose final trajectory is in the axes of the map.
-        rig: calibration of the images.
-        most_cells: largest number of cells.
     """
     seen = _corners(result, rig).reshape(-1, 2)
     cell = _CELL_PX * float(np.median(result.keyframe_depth_m)) / rig.focal_px
@@ -58,14 +51,7 @@ def footprint_tiles(
 ) -> list[MapTile]:
     """Returns the tiles of the map with cells of three pixels that images show, if it has more than `most_cells` cells.
 
-    The list is empty for a smaller map, whose cells `footprint_grid` does not enlarge. The number of tiles grows with
-    the area that the images cover, not with that of the rectangle around it.
-
-    Args:
-        result: result of a survey with at least one keyframe.
-        rig: calibration of the images.
-        most_cells: largest number of cells of an undivided map.
-        side: side of a tile in cells.
+    Empty for a smaller map, whose cells `footprint_grid` does not enlarge; `side` is the side of a tile in cells.
     """
     whole = footprint_grid(result, rig, np.inf)
     if whole.rows * whole.cols <= most_cells * (1 + 1e-3):  # of rounding to whole cells

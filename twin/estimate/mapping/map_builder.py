@@ -32,60 +32,37 @@ MAX_RELATIVE_SIGMA = 0.2
 
 
 class KeyframeImages(NamedTuple):
-    """Stereo pair of a keyframe.
+    """Stereo pair of a keyframe."""
 
-    Args:
-        left: (H, W, 3) uint8 RGB left image.
-        right: (H, W, 3) uint8 RGB right image.
-    """
-
-    left: Image
-    right: Image
+    left: Image  #: (H, W, 3) uint8 RGB left image
+    right: Image  #: (H, W, 3) uint8 RGB right image
 
 
 class KeyframePath(NamedTuple):
-    """Poses of the n keyframes of a map, with their covariances.
+    """Poses of the n keyframes of a map, with their covariances."""
 
-    Args:
-        world_from_camera: (n, 4, 4) poses of the left camera.
-        pose_cov: (n, 6, 6) covariance of each pose [rotation, translation] (rad, m), in camera axes.
-        step_cov: (n, 6, 6) covariance of each pose relative to the previous pose, in the same units and axes (the first
-            is not used); None if the relative poses are exact.
-    """
-
-    world_from_camera: Array
-    pose_cov: Array
+    world_from_camera: Array  #: (n, 4, 4) poses of the left camera
+    pose_cov: Array  #: (n, 6, 6) covariance of each pose [rotation, translation] (rad, m), in camera axes
+    #: (n, 6, 6) covariance of each pose relative to the previous pose, in the same units and axes (the first is not
+    #: used); None if the relative poses are exact.
     step_cov: Array | None = None
 
 
 class _StereoDepth(NamedTuple):
-    """Stereo pair with its stereo depth, before the depth is fused by the filter.
+    """Stereo pair with its stereo depth, before the depth is fused by the filter."""
 
-    Args:
-        pair: colour images.
-        gray: (H, W) float32 grey levels of the left image, without the light pattern.
-        depth: depth map of the left image, from this stereo pair alone.
-    """
-
-    pair: KeyframeImages
-    gray: Map
-    depth: DepthMap
+    pair: KeyframeImages  #: colour images
+    gray: Map  #: (H, W) float32 grey levels of the left image, without the light pattern
+    depth: DepthMap  #: depth map of the left image, from this stereo pair alone
 
 
 class _FilterState(NamedTuple):
-    """State of the depth filter at a keyframe.
+    """State of the depth filter at a keyframe."""
 
-    Args:
-        depth: filtered depth map.
-        gray: (H, W) float32 grey levels of the left image, without the light pattern.
-        pose: (4, 4) world_from_camera.
-        patch: heights of the depth map on the grid; None if the depth map does not overlap the grid.
-    """
-
-    depth: DepthMap
-    gray: Map
-    pose: Array
-    patch: HeightPatch | None
+    depth: DepthMap  #: filtered depth map
+    gray: Map  #: (H, W) float32 grey levels of the left image, without the light pattern
+    pose: Array  #: (4, 4) world_from_camera
+    patch: HeightPatch | None  #: heights of the depth map on the grid; None if the depth map does not overlap the grid
 
 
 def build_map(
@@ -99,10 +76,6 @@ def build_map(
     """Returns the elevation map with its standard deviation and orthomosaic, built from the keyframes along the path.
 
     Args:
-        keyframes: stereo pairs along the path, read one at a time.
-        path: poses of the keyframes and their covariances.
-        rig: calibration of the images, with square pixels.
-        grid: grid of the map.
         progress: called with the number of keyframes processed so far.
         pattern: light pattern of the images, which is subtracted before matching; None: it is not known.
     """
@@ -131,7 +104,6 @@ def build_map(
 
 
 def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    """Yields the items in order, while a second thread computes the following item."""
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, None)
         while (item := coming.result()) is not None:
@@ -148,7 +120,6 @@ def gray_levels(pair: KeyframeImages) -> tuple[Map, Map]:
 def _measure_depth(
     pair: KeyframeImages, search_range: disparity.SearchRange, rig: StereoRig, pattern: LightPattern | None
 ) -> _StereoDepth:
-    """Computes the stereo depth of a pair and updates the search range for the next pair."""
     left, right = gray_levels(pair)
     if pattern is not None:
         left, right = left - pattern.left, right - pattern.right

@@ -1,9 +1,7 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
-It is made in tiles of about 2048 x 2048 pixels (`twin.core.orthomosaic.tile_side_px`), one after the other. An image is
-read once for each tile that it touches, and once more if its exposure has to be estimated. One tile and two images are
-in memory at a time, whatever the size of the survey; the layers of a tile and its margin (`orthophoto.OrthoLayers`)
-take 24 bytes per pixel, 114 MB for a whole tile.
+It is made tile by tile (`twin.core.orthomosaic.tile_side_px`); one tile (24 bytes per pixel) and two images are in
+memory at a time, whatever the size of the survey.
 """
 
 from __future__ import annotations
@@ -30,18 +28,12 @@ _FILLED_CELLS = 3
 
 
 class Views(NamedTuple):
-    """Images from which an orthomosaic is made.
+    """Images from which an orthomosaic is made."""
 
-    Args:
-        world_from_camera: (n, 4, 4) poses of the cameras in the axes of the map.
-        depth_m: (n,) median depth of the floor in each image [m].
-        exposures: exposure of each image, None where the cameras did not report it.
-        load: function that returns the image (H, W, 3) with a given number, from 0; its pixels are square.
-    """
-
-    world_from_camera: Array
-    depth_m: Array
-    exposures: Sequence[Exposure | None]
+    world_from_camera: Array  #: (n, 4, 4) poses of the cameras in the axes of the map
+    depth_m: Array  #: (n,) median depth of the floor in each image [m]
+    exposures: Sequence[Exposure | None]  #: exposure of each image, None where the cameras did not report it
+    #: function that returns the image (H, W, 3) with a given number, from 0; its pixels are square.
     load: Callable[[int], Image]
 
 
@@ -67,9 +59,6 @@ def orthomosaic(
     The pixels divide the cells of the map and are not larger than the median ground sample distance of the images.
 
     Args:
-        views: the images.
-        elevation: the estimated map.
-        rig: calibration of the images, with square pixels.
         restore: function that removes the effects of lamps and water. None: colours as seen, at equal exposure.
         progress: called with the finished fraction, 0 to 1.
     """
@@ -108,7 +97,6 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
     are NaN.
 
     Args:
-        elevation: the map.
         part: grid whose pixels divide the cells of the map; it may extend beyond the map.
     """
     grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
@@ -127,9 +115,8 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
 
 
 def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
-    """Returns heights with NaN replaced by the nearest known height, and a mask of known cells and small holes.
-
-    Without a known height, all heights are 0 and the mask is false.
+    """Returns heights with NaN replaced by the nearest known one (0 if none), and a mask of known cells and small
+    holes.
     """
     unknown = np.isnan(height)
     if unknown.all():
@@ -157,24 +144,13 @@ def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> 
 
 
 def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
-    """Returns the grid of the pixels of a tile and of a margin of `_MARGIN_PX` on all its sides.
-
-    Args:
-        grid: grid of the whole orthomosaic.
-        row, col: first pixel of the tile.
-        side: side of a tile [px]; tiles at the east and south edges of the grid are smaller.
-    """
+    """Returns the grid of the pixels of a tile (smaller at east and south edges) and its margin of `_MARGIN_PX`."""
     rows, cols = min(side, grid.rows - row), min(side, grid.cols - col)
     return window(grid, row - _MARGIN_PX, col - _MARGIN_PX, rows + 2 * _MARGIN_PX, cols + 2 * _MARGIN_PX)
 
 
 def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
-    """Returns the indices of the images whose footprints overlap a part of the grid.
-
-    Args:
-        boxes: (n, 4) bounding boxes of the footprints, see `orthophoto.footprint`.
-        part: the part of the grid.
-    """
+    """Returns the indices of the images whose footprints `boxes` (n, 4) overlap a part of the grid."""
     west, south, east, north = boxes.T
     east_m, south_m = part.west_m + part.cols * part.cell_m, part.north_m - part.rows * part.cell_m
     return np.flatnonzero((west < east_m) & (east > part.west_m) & (south < part.north_m) & (north > south_m))
@@ -183,14 +159,7 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
 def _prepared(
     views: Views, numbers: NDArray[np.int64], factors: Array, restore: Restore | None
 ) -> Iterator[tuple[int, Colours]]:
-    """Yields the number and the colours of each of the images `numbers`, while a second thread prepares the next one.
-
-    Args:
-        views: all images.
-        numbers: numbers of the images to prepare.
-        factors: (n, 3) factors by which to multiply the images; not used with `restore`.
-        restore: see `orthomosaic`.
-    """
+    """Yields numbers and colours of images, the next one prepared by a second thread; `factors` (n, 3): exposure."""
 
     def colours(k: int) -> Colours:
         image = views.load(k)

@@ -1,15 +1,9 @@
 """Rectification of single images onto the pixels of an orthomosaic, by the estimated heights and poses.
 
-Every pixel of the orthomosaic is projected, at its height, into the image, whose colour there is interpolated
-bicubically. Where several images show a pixel, their colours are averaged with the weights
-
-    w = r exp(-K tan^2(n)),
-
-with n the angle of the line of sight from the vertical (zero at nadir) and r a factor that rises from 0.001 at the
-border of the image to 1 at a distance of 12 pixels from it. K (`SHARPNESS`) is so large that a pixel shows the view
-nearest to nadir, except in a narrow seam between two views, where they are blended. Near nadir, errors of the height
-displace a colour least. The weight of a saturated pixel is multiplied by exp(-60), so that it is used only where other
-images do not show the floor, or show it far from nadir. An image is not used for pixels hidden in it by nearer floor.
+The colours of all views of a pixel are averaged with the weights w = r exp(-K tan^2(n)): n is the angle of the line of
+sight from the vertical; r rises from 0.001 at the border of the image to 1 at 12 pixels from it; K (`SHARPNESS`) is so
+large that the view nearest to nadir, where errors of height displace least, dominates. Saturated pixels have exp(-60)
+times the weight. Pixels hidden by nearer floor are not used.
 """
 
 from __future__ import annotations
@@ -38,21 +32,13 @@ _HIDDEN_SHARE = 0.02
 
 
 class OrthoLayers(NamedTuple):
-    """Part of an orthomosaic in progress.
+    """Part of an orthomosaic in progress."""
 
-    Args:
-        grid: grid of the pixels of this part.
-        height_m: (rows, cols) height of each pixel, NaN where unknown.
-        colour: (rows, cols, 3) sum of the colours, multiplied by their weights w / exp(-best).
-        weight: (rows, cols) sum of the weights w / exp(-best).
-        best: (rows, cols) smallest value of -log w so far; inf without a view.
-    """
-
-    grid: MapGrid
-    height_m: Map
-    colour: Map
-    weight: Map
-    best: Map
+    grid: MapGrid  #: grid of the pixels of this part
+    height_m: Map  #: (rows, cols) height of each pixel, NaN where unknown
+    colour: Map  #: (rows, cols, 3) sum of the colours, multiplied by their weights w / exp(-best)
+    weight: Map  #: (rows, cols) sum of the weights w / exp(-best)
+    best: Map  #: (rows, cols) smallest value of -log w so far; inf without a view
 
 
 def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
@@ -65,14 +51,11 @@ def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
     """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
 
-    It is the box around those parts of the rays through the four image corners that lie between the highest and the
-    lowest floor. If the camera is lower than the highest floor, these parts begin at the camera. The box is infinite if
-    the camera is not above the lowest floor, or if one of these rays does not point downwards.
+    It encloses the parts of the corner rays between the highest and the lowest floor (`heights_m`), from the camera if
+    that is lower; infinite if the camera is not above the lowest floor or a ray does not point downwards.
 
     Args:
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        rig: calibration, with square pixels.
-        heights_m: heights of the lowest and of the highest floor.
     """
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
     corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -86,15 +69,11 @@ def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, 
 
 
 class Colours(NamedTuple):
-    """Colours of an image.
+    """Colours of an image."""
 
-    Args:
-        rgb: (H, W, 3) float32 red, green and blue, 0 to 255 (values above are possible).
-        saturated: (H, W) uint8, 1 where the colour is not reliable because the image is saturated there or at a
-            neighbouring pixel, else 0.
-    """
-
-    rgb: Map
+    rgb: Map  #: (H, W, 3) float32 red, green and blue, 0 to 255 (values above are possible)
+    #: (H, W) uint8, 1 where the colour is not reliable because the image is saturated there or at a neighbouring pixel,
+    #: else 0.
     saturated: NDArray[np.uint8]
 
 
@@ -108,11 +87,7 @@ def add_view(
     """Adds an image to the layers, in place.
 
     Args:
-        layers: part of the orthomosaic.
-        colours: the image.
         world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        rig: calibration, with square pixels.
-        heights_m: heights of the lowest and of the highest floor.
     """
     grid = layers.grid
     bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)
@@ -134,11 +109,8 @@ def add_view(
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
-    """Returns first row, end row, first column and end column of the pixels of a grid within a box; ends are exclusive.
-
-    Args:
-        box_m: (4,) west, south, east, north [m] (`footprint`).
-        grid: grid of the pixels.
+    """Returns first row, end row, first column and end column of the pixels within a box (west, south, east, north)
+    [m].
     """
     west, south, east, north = box_m
     rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
@@ -148,10 +120,9 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
 
 @kernel(error_model="numpy")
 def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
-    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each pixel of an image shows.
+    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each image pixel shows, inf if none.
 
-    An orthomosaic pixel is shown by the 2 x 2 image pixels around its projection. `nearest` remains infinite where no
-    orthomosaic pixel is shown. The other arguments are those of `_blend`.
+    An orthomosaic pixel is shown by the 2 x 2 image pixels around its projection.
     """
     focal, cx, cy = camera
     for i in range(first, end):
@@ -177,14 +148,12 @@ def _blend(
     """Adds the colours of an image to `colour`, `weight` and `best`, see `OrthoLayers`.
 
     Args:
-        height, colour, weight, best: see `OrthoLayers`.
         first, end, left, right: first row, end row, first column and end column of the pixels to process; ends are
             exclusive.
         steps: (3, 3) columns: displacement in camera axes per column, per row and per metre of height [m].
         origin: (3,) position of pixel (0, 0) at height 0, in camera axes [m].
         camera_at: (4,) x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].
         camera: focal length, column and row of the principal point [px].
-        image, clipped: see `Colours`.
         nearest: (H, W) smallest depth in each pixel of the image [m], from `_mark_nearest`.
     """
     focal, cx, cy = camera

@@ -24,28 +24,21 @@ LATERAL_SIGMA_PX = 0.35
 
 
 class HeightPatch(NamedTuple):
-    """Heights computed from one depth map, in a rectangular window of the grid.
+    """Heights computed from one depth map, in a rectangular window of the grid."""
 
-    Args:
-        row, col: row and column, in the grid, of the first (north-west) cell of the window.
-        height_m: (rows, cols) height at the cell centres, NaN where the surface does not cover them.
-        variance_m2: (rows, cols) variance due to errors of depth. These are independent between the heights that
-            different keyframes add to the map, because each depth enters the map only once.
-        systematic_m2: (rows, cols) variance due to the errors of the pose and to the smoothing of slopes, which are
-            common to all views.
-        pixel: (rows, cols, 2) position (u, v) of the cell centre in the image [px].
-        lateral_m: standard deviation of the lateral error at the mean depth of the depth map [m].
-        camera_m: (3,) position of the camera in the frame of the map [m]; None if it is not known.
-    """
-
+    #: row, col: row and column, in the grid, of the first (north-west) cell of the window.
     row: int
     col: int
-    height_m: Map
+    height_m: Map  #: (rows, cols) height at the cell centres, NaN where the surface does not cover them
+    #: (rows, cols) variance due to errors of depth. These are independent between the heights that different keyframes
+    #: add to the map, because each depth enters the map only once.
     variance_m2: Map
+    #: (rows, cols) variance due to the errors of the pose and to the smoothing of slopes, which are common to all
+    #: views.
     systematic_m2: Map
-    pixel: Map
-    lateral_m: float
-    camera_m: Array | None = None
+    pixel: Map  #: (rows, cols, 2) position (u, v) of the cell centre in the image [px]
+    lateral_m: float  #: standard deviation of the lateral error at the mean depth of the depth map [m]
+    camera_m: Array | None = None  #: (3,) position of the camera in the frame of the map [m]; None if it is not known
 
 
 def rasterise(
@@ -53,17 +46,13 @@ def rasterise(
 ) -> HeightPatch | None:
     """Returns the heights at the cell centres of a grid, interpolated linearly in triangles of pixels of a depth map.
 
-    Each square of four pixels is divided into two triangles. Triangles across a depth discontinuity, downward-facing
-    triangles and triangles seen at a grazing angle are omitted, so that no surface appears between the edge of a reef
-    and the floor behind it. The variance of the depth and the covariance of the pose are propagated to the height at
-    the cell centre; on a slope, this includes the effect of horizontal errors.
+    Triangles across a depth discontinuity, downward-facing and grazing ones are omitted, so that no surface appears
+    between the edge of a reef and the floor. The variances of depth and pose are propagated to the height at the cell
+    centre, with the effect of horizontal errors on slopes.
 
     Args:
-        depth_map: depth in the left camera.
         world_from_camera: (4, 4) pose of the left camera.
         pose_cov: (6, 6) covariance of the pose [rotation, translation] (rad, m), in camera axes.
-        rig: calibration of the image, with square pixels.
-        grid: grid of the map.
 
     Returns:
         The patch, or None if the surface does not overlap the grid.
@@ -96,23 +85,15 @@ def rasterise(
 
 
 class _ViewGeometry(NamedTuple):
-    """Pose of the camera relative to the grid, and constants of the rasterisation.
+    """Pose of the camera relative to the grid, and constants of the rasterisation."""
 
-    Args:
-        position: (3,) position of the camera relative to the north-west corner of the grid at height 0 [m].
-        axis: (3,) optical axis in the world.
-        cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
-        cell_m: cell size [m].
-        focal_px: focal length [px].
-        max_jump: largest difference of inverse depth between the corners of a triangle [1/m]; with a larger one, the
-            triangle is omitted.
-    """
-
-    position: Array
-    axis: Array
-    cov: Array
-    cell_m: float
-    focal_px: float
+    position: Array  #: (3,) position of the camera relative to the north-west corner of the grid at height 0 [m]
+    axis: Array  #: (3,) optical axis in the world
+    cov: Array  #: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m)
+    cell_m: float  #: cell size [m]
+    focal_px: float  #: focal length [px]
+    #: largest difference of inverse depth between the corners of a triangle [1/m]; with a larger one, the triangle is
+    #: omitted.
     max_jump: float
 
 
@@ -123,12 +104,7 @@ def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
-    """Returns first row, first column, number of rows and number of columns of the cells within `bounds`; None if none.
-
-    Args:
-        bounds: (4,) lowest row and column, highest row and column, from `_grid_points`.
-        grid: grid of the map.
-    """
+    """Returns first row, first column, numbers of rows and columns of the cells within `bounds`; None if none."""
     if not np.isfinite(bounds).all():
         return None
     low = np.maximum(np.ceil(bounds[:2]), 0)
@@ -139,17 +115,8 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 
 @kernel
 def _grid_points(depth, pose, camera, west, north, cell):
-    """Converts a depth map to grid coordinates.
-
-    Args:
-        depth: (H, W) depth [m].
-        pose: (4, 4) world_from_camera.
-        camera: focal length, column and row of the principal point [px].
-        west, north, cell: north-west corner and cell size of the grid [m].
-
-    Returns:
-        Points (H, W, 3) as row, column (in cells from the centre of cell (0, 0)) and height [m]; bounds (4,) of the
-        points: lowest row and column, highest row and column.
+    """Returns points (H, W, 3) as row, column (0 at the centre of the first cell) and height [m], and their bounds
+    (4,).
     """
     (focal, cx, cy), (height, width) = camera, depth.shape
     points = np.empty((height, width, 3))
@@ -170,21 +137,12 @@ def _grid_points(depth, pose, camera, west, north, cell):
 
 @kernel(inline="always")
 def _contains_integer(a, b, c, e):
-    """Returns whether an integer lies between the smallest and the largest of four numbers."""
     return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
 
 
 @kernel
 def _triangles(points, depth, variance, view, row, col, height, height_variance, systematic, pixel):
-    """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch.
-
-    Args:
-        points: (H, W, 3) points of the depth map in grid coordinates (`_grid_points`).
-        depth, variance: (H, W) depth map [m] and its variance [m^2].
-        view: `_ViewGeometry`.
-        row, col, height, height_variance, systematic, pixel: fields of the `HeightPatch`; the last four are changed in
-            place.
-    """
+    """Writes the triangles of a depth map, except those that `rasterise` omits, to the layers of a patch, in place."""
     out = (points, depth, variance, view, row, col, height, height_variance, systematic, pixel)
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):
@@ -205,10 +163,7 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
 def _triangle(
     va, ua, vb, ub, vc, uc, points, depth, variance, view, row, col, height, height_variance, systematic, pixel
 ):
-    """Writes the cells inside the triangle of the pixels a, b, c, given as rows v and columns u, unless it is omitted.
-
-    Where triangles overlap, the greatest height is kept. The other arguments are those of `_triangles`.
-    """
+    """Writes the cells in the triangle of the pixels a, b, c (rows v, columns u); the greatest height is kept."""
     a, b, c = points[va, ua], points[vb, ub], points[vc, uc]
     j0, j1 = np.ceil(min(a[1], b[1], c[1]) - 1e-9), np.floor(max(a[1], b[1], c[1]) + 1e-9)
     i0, i1 = np.ceil(min(a[0], b[0], c[0]) - 1e-9), np.floor(max(a[0], b[0], c[0]) + 1e-9)
@@ -252,7 +207,6 @@ def pose_variance(px, py, pz, sx, sy, cov):
 
     Args:
         px, py, pz: point relative to the camera, in world axes [m].
-        sx, sy: slopes dz/dx and dz/dy of the surface at the point.
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
     """
     row = (-sx, -sy, 1.0)

@@ -1,8 +1,6 @@
 """Heights of a map that their camera cannot have seen, because the line of sight passes below the mapped surface.
 
-A mismatch of stereo is usually too far away: where the true match lies outside the other image, or the floor has little
-texture. A group of such pixels becomes an island in the map, far below the surface around it. A real pit is seen
-through its opening, so that no line of sight to its floor passes below the surface beside it.
+A mismatch of stereo is usually too far away; a group of them becomes an island far below the surface around it.
 """
 
 from __future__ import annotations
@@ -50,7 +48,6 @@ def hidden(
         camera: (rows, cols) row of `cameras_m` for each height; negative where it is not known: such a height passes.
         cameras_m: (n, 3) positions of cameras in the frame of the map [m].
         surface: heights of the surface (rows, cols) [m], NaN where there is none, and their variance [m2].
-        grid: grid of the map.
     """
     low, variance = surface
     if not len(cameras_m):
@@ -112,7 +109,6 @@ def _blocked(height, camera, cameras_m, low, variance, highest, corner):
     """Compiled kernel of `hidden`.
 
     Args:
-        height, camera, cameras_m, variance: see `hidden`.
         low: (rows, cols) from `_lowest`.
         highest: greatest height of the surface [m]; a line of sight is free above it.
         corner: west, north and cell size of the grid [m].

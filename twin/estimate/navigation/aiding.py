@@ -1,10 +1,6 @@
 """Factors of the navigation sensors in the graph of the global alignment.
 
-A reading of pressure, position (USBL), attitude or vertical constrains the pose of one node. Beacons have surveyed
-positions, so their image coordinates also constrain the pose of one node. The DVL constrains the displacement between
-two nodes. The scale error of the DVL is estimated as one parameter shared by all displacements: if it were modelled as
-independent noise of each displacement, its effect would average out along the path, whereas the actual error
-accumulates.
+The scale error of the DVL is one parameter shared by all displacements: as noise of each, it would average out.
 """
 
 from __future__ import annotations
@@ -31,8 +27,6 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
 
     Args:
         nodes: nodes, in the order of the poses in the graph.
-        rig: believed calibration.
-        noise: believed noise of the navigation sensors.
     """
     return [
         _height_factors(nodes, noise),
@@ -44,7 +38,6 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
 
 
 def _height_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the heights measured by the pressure sensor."""
     index = [k for k, node in enumerate(nodes) if node.readings.pressure_z_m is not None]
     height_m = np.array([nodes[k].readings.pressure_z_m for k in index], dtype=np.float64)
 
@@ -60,7 +53,6 @@ def _height_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFacto
 
 
 def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the camera rotations measured by the AHRS."""
     index = [k for k, node in enumerate(nodes) if node.readings.ahrs_rpy_rad is not None]
     angles = np.array([nodes[k].readings.ahrs_rpy_rad for k in index]).reshape(-1, 3)
     camera_from_body = geometry.inverse(rig.body_from_camera)
@@ -91,7 +83,6 @@ def _camera_poses_at_origin(angles, body_from_camera):
 
 
 def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the camera positions measured by acoustic positioning (USBL)."""
     index = [k for k, node in enumerate(nodes) if node.readings.usbl_m is not None]
     position_m = np.array([nodes[k].readings.usbl_m for k in index]).reshape(-1, 3)
 
@@ -159,7 +150,6 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
     Args:
         nodes: nodes, in the order of the poses in the graph.
-        rig: believed calibration.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     with_dvl = [(k, node.dvl_displacement) for k, node in enumerate(nodes) if node.dvl_displacement is not None]

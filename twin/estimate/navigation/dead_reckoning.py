@@ -18,34 +18,24 @@ class DeadReckoningState(NamedTuple):
     """State of dead reckoning after a frame. The arrays are not modified in place.
 
     The covariances refer to [rotation, translation] (rad, m) in the axes of the current camera.
-
-    Args:
-        f2f: (4, 4) world_from_camera from frame-to-frame motion alone.
-        online, cov: (4, 4), (6, 6) online estimate of world_from_camera, and its covariance.
-        since_node, since_node_cov: (4, 4), (6, 6) motion since the last node from vision and DVL, and its covariance.
     """
 
-    f2f: Array
+    f2f: Array  #: (4, 4) world_from_camera from frame-to-frame motion alone
+    #: online, cov: (4, 4), (6, 6) online estimate of world_from_camera, and its covariance.
     online: Array
     cov: Array
+    #: since_node, since_node_cov: (4, 4), (6, 6) motion since the last node from vision and DVL, and its covariance.
     since_node: Array
     since_node_cov: Array
 
 
 class FrameAiding(NamedTuple):
-    """Error models of the sensors that are read at every frame, and the state of the DVL integration.
+    """Error models of the sensors that are read at every frame, and the state of the DVL integration."""
 
-    Args:
-        pressure_ahrs: error model of the pressure sensor and the AHRS.
-        dvl: error model of the DVL.
-        dvl_state: state of the DVL integration; its arrays are modified in place.
-        gates: states of the gates that reject readings; their arrays are modified in place.
-    """
-
-    pressure_ahrs: PressureAhrsModel
-    dvl: DvlModel
-    dvl_state: DvlState
-    gates: ReadingGates
+    pressure_ahrs: PressureAhrsModel  #: error model of the pressure sensor and the AHRS
+    dvl: DvlModel  #: error model of the DVL
+    dvl_state: DvlState  #: state of the DVL integration; its arrays are modified in place
+    gates: ReadingGates  #: states of the gates that reject readings; their arrays are modified in place
 
 
 def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
@@ -69,15 +59,12 @@ def dead_reckon(
     rpy_rad: Array,
     velocity_mps: Array,
 ) -> tuple[DeadReckoningState, Array]:
-    """Advances dead reckoning by one frame.
+    """Advances dead reckoning by one frame; the states of the DVL integration and of the gates are modified in place.
 
     Args:
-        last: state at the previous frame.
-        aiding: error models of the sensors, and the states of the DVL integration and of the gates, modified in place.
         a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
-        height_m: height measured by the pressure sensor at this frame [m]; NaN if there is no reading.
-        rpy_rad: (3,) roll, pitch and yaw measured by the AHRS [rad]; NaN if there is no reading.
-        velocity_mps: (3,) velocity measured by the DVL, in body axes [m/s]; NaN if there is no reading.
+        height_m, rpy_rad: readings of pressure sensor [m] and AHRS, roll, pitch and yaw (3,) [rad]; NaN without.
+        velocity_mps: (3,) reading of the DVL, in body axes [m/s]; NaN without.
 
     Returns:
         The new state, and the motion (4, 4) of this frame after fusion with the DVL.

@@ -15,57 +15,37 @@ from twin.kernels import kernel
 
 
 class DvlModel(NamedTuple):
-    """Error model of the DVL.
+    """Error model of the DVL."""
 
-    Args:
-        body_from_camera: (4, 4) pose of the left camera in the body.
-        step_s: time since the previous frame [s].
-        white_m2: variance of each component of a frame's displacement due to white noise [m^2].
-        scale_variance: variance of the scale error (a relative error of the velocity).
-    """
-
-    body_from_camera: Array
-    step_s: float
-    white_m2: float
-    scale_variance: float
+    body_from_camera: Array  #: (4, 4) pose of the left camera in the body
+    step_s: float  #: time since the previous frame [s]
+    white_m2: float  #: variance of each component of a frame's displacement due to white noise [m^2]
+    scale_variance: float  #: variance of the scale error (a relative error of the velocity)
 
 
 class DvlState(NamedTuple):
-    """Integration of DVL velocities since the last node. All arrays are modified in place.
+    """Integration of DVL velocities since the last node. All arrays are modified in place."""
 
-    Args:
-        velocity: (3,) last reading, in body axes [m/s]; NaN if the last frame had none.
-        node_from_body, rotation_cov: (3, 3), (3, 3) rotation of the body since the node, and its covariance in the body
-            axes at the node [rad^2].
-        displacement_m, cov: (3,), (3, 3) displacement of the body's origin since the node, in the body axes at the node
-            [m], and its covariance due to white noise [m^2].
-        path_m: (1,) path length since the node [m].
-        complete: (1,) false if the reading at the node or at a frame after it is missing.
-    """
-
-    velocity: Array
+    velocity: Array  #: (3,) last reading, in body axes [m/s]; NaN if the last frame had none
+    #: node_from_body, rotation_cov: (3, 3), (3, 3) rotation of the body since the node, and its covariance in the body
+    #: axes at the node [rad^2].
     node_from_body: Array
     rotation_cov: Array
+    #: displacement_m, cov: (3,), (3, 3) displacement of the body's origin since the node, in the body axes at the node
+    #: [m], and its covariance due to white noise [m^2].
     displacement_m: Array
     cov: Array
-    path_m: Array
-    complete: NDArray[np.bool_]
+    path_m: Array  #: (1,) path length since the node [m]
+    complete: NDArray[np.bool_]  #: (1,) false if the reading at the node or at a frame after it is missing
 
 
 class DvlIntegrator:
     """Integrates DVL velocities, rotated into the body axes at the last node, by the trapezoidal rule.
 
-    Each reading contributes with half weight to the displacements of two consecutive frames, whose errors are therefore
-    correlated. The sum of n displacements has the variance (n - 1/2) (sigma dt)^2 in each component, with sigma the
-    standard deviation of a reading and dt the interval between frames. As an approximation, each displacement is given
-    the variance (sigma dt)^2 and treated as independent.
+    Each reading has half weight in two consecutive displacements. The variance of their sum, (n - 1/2) (sigma dt)^2 for
+    readings of deviation sigma, is approximated by independent displacements of variance (sigma dt)^2.
 
-    Args:
-        rig: believed calibration, for the pose of the camera in the body.
-        noise: believed noise of the navigation sensors.
-
-    Attributes:
-        state: integration since the last node.
+    Attributes:     state: integration since the last node.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
@@ -87,13 +67,9 @@ class DvlIntegrator:
         return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
 
     def displacement_at_node(self, number: int) -> Displacement | None:
-        """Returns the displacement from the last node to the current node, and restarts the integration.
+        """Returns the displacement from the last node to the node `number`, and restarts the integration.
 
-        Args:
-            number: number of the current node.
-
-        Returns:
-            The displacement, or None if the reading at the last node or at a frame after it is missing.
+        None if the reading at the last node or at a frame after it is missing.
         """
         node, self._node, state = self._node, number, self.state
         complete = state.complete[0]
@@ -104,15 +80,10 @@ class DvlIntegrator:
 
 @kernel
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
-    """Computes the displacement of the body's origin that corresponds to a motion of the camera.
+    """Returns the displacement (3,) [m] of the body's origin for a motion of the camera, in the body axes before it.
 
-    Args:
-        a_from_b: (4, 4) motion of the camera: the pose of the later camera in the earlier camera.
-        body_from_camera: (4, 4) pose of the camera in the body.
-
-    Returns:
-        Displacement (3,) [m] in the body axes before the motion, and its Jacobian (3, 6) with respect to an increment
-        [rotation, translation] (rad, m) of the motion, in the axes of the later camera.
+    Also its Jacobian (3, 6) with respect to an increment [rotation, translation] (rad, m), in the axes of the later
+    camera.
     """
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
@@ -130,11 +101,8 @@ def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
     """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
     Args:
-        state: `DvlState`, modified in place.
-        model: `DvlModel`.
         a_from_b, cov: (4, 4), (6, 6) visual motion of the camera and its covariance.
         velocity: (3,) reading of this frame, in body axes [m/s]; NaN if there is none.
-        gates: `ReadingGates`, modified in place.
 
     Returns:
         The fused motion (4, 4) and its covariance (6, 6). If the reading of this frame or of the previous one is
@@ -161,13 +129,11 @@ def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
 
 @kernel
 def _body_motion(a_from_b, body_from_camera):
-    """Returns the motion (4, 4) of the body that corresponds to a motion of the camera."""
     return geometry.compose(geometry.compose(body_from_camera, a_from_b), geometry.inverse(body_from_camera))
 
 
 @kernel
 def _length(step):
-    """Returns the length of a vector (3,)."""
     return np.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
 
 
@@ -175,9 +141,8 @@ def _length(step):
 def _step_cov(state, model, step):
     """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
 
-    The scale error, of standard deviation s, accumulates along the path. After a path of length L since the node, a
-    displacement of length l therefore contributes the variance s^2 ((L + l)^2 - L^2) along its direction; these
-    contributions sum to s^2 times the squared length of the whole path.
+    The scale error s accumulates: a displacement of length l after a path L adds s^2 ((L + l)^2 - L^2) along its
+    direction.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
@@ -189,14 +154,7 @@ def _step_cov(state, model, step):
 
 @kernel
 def _accumulate(state, model, step, a_from_b, cov):
-    """Adds a frame to the integration since the node.
-
-    Args:
-        state: `DvlState`, modified in place.
-        model: `DvlModel`.
-        step: (3,) displacement since the previous frame, in the body axes at the previous frame [m].
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera since the previous frame, and its covariance.
-    """
+    """Adds a frame, with displacement `step` (3,) in the body axes at the previous frame [m], to the integration."""
     state.path_m[0] += _length(step)
     node_from_body = state.node_from_body
     for i in range(3):
@@ -228,13 +186,10 @@ def _restart(state):
 
 @kernel
 def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera, gates):
-    """Updates a camera motion with a measured displacement of the body's origin (Kalman update).
+    """Updates a camera motion with a displacement of the body's origin (Kalman update).
 
     Args:
-        a_from_b, cov: (4, 4), (6, 6) motion of the camera and its covariance.
         step, step_cov: (3,), (3, 3) displacement [m] in the axes of the body before the motion, and its covariance.
-        body_from_camera: (4, 4) pose of the camera in the body.
-        gates: `ReadingGates`, modified in place.
 
     Returns:
         Motion (4, 4) and covariance (6, 6) after the update, and whether the displacement was used.

@@ -30,18 +30,11 @@ _PATIENCE = (300, 300, 30, 5, 20, 300)
 class PoseFilter:
     """Extended Kalman filter of one pose.
 
-    Errors are motions [rotation, translation] (rad, m) in camera axes: pose = true pose @ exp(error).
+    Errors are motions [rotation, translation] (rad, m) in camera axes: pose = true pose @ exp(error). The initial pose
+    is known with a standard deviation of 1e-4 rad and 1e-4 m.
 
-    Args:
-        world_from_camera: (4, 4) initial pose, known with a standard deviation of 1e-4 rad and 1e-4 m.
-        rig: believed calibration.
-        noise: believed noise of the navigation sensors.
-
-    Attributes:
-        world_from_camera: (4, 4) estimated pose.
-        cov: (6, 6) covariance of the error of this pose.
-        pressure_ahrs: error model of the pressure sensor and the AHRS.
-        gates: states of the gates of all sensors.
+    Attributes:     world_from_camera, cov: (4, 4), (6, 6) estimated pose and covariance of its error.
+    pressure_ahrs: error model of the pressure sensor and the AHRS.     gates: states of the gates of all sensors.
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
@@ -55,16 +48,9 @@ class PoseFilter:
     def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
         """Fuses a pose measured relative to an earlier pose, such as the result of a registration with the mosaic.
 
-        The mosaic contains the error of the earlier pose at which its cells were recorded, so the measurement
-        constrains only the motion since that pose. With the covariances S of this motion and R of the measurement, the
-        gain is S (S + R)^-1. The covariance of the pose decreases by the gain times S, which is less than for a
-        measurement of an absolute pose (Schmidt-Kalman filter, with the earlier pose as consider parameter).
-
-        Args:
-            measured: (4, 4) measured world_from_camera.
-            cov: (6, 6) covariance R of the measurement.
-            motion_cov: (6, 6) covariance of the motion since the earlier pose; S is this matrix, limited to at most the
-                covariance of the pose (`clip_covariance`).
+        Only the motion since the earlier pose is constrained: with the covariances S of this motion (`motion_cov`, at
+        most that of the pose, `clip_covariance`) and R of the measurement (`cov`), the gain is S (S + R)^-1, and the
+        covariance decreases by the gain times S (Schmidt-Kalman filter, with the earlier pose as consider parameter).
 
         Returns:
             (6, 6) decrease of the covariance of the pose; None if the measurement was rejected as an outlier.
@@ -112,10 +98,8 @@ class PoseFilter:
     def fuse_vertical(self, readings: Readings) -> None:
         """Fuses the direction of the vertical, if it was measured, as far as it is more precise than the pose.
 
-        The errors of the readings are not independent: a bias of the accelerometer is in all of them. Let S be the
-        covariance of the predicted direction and s the standard deviation of a reading. Along the axes of S, each
-        component with a variance above s^2 is fused with the noise that reduces its variance to s^2, and the others are
-        left as they are. However many readings follow, the variance does not fall below s^2.
+        A bias of the accelerometer is in all readings. Along the axes of the predicted direction's covariance,
+        components with a variance above s^2, that of a reading, are reduced to s^2, and never below it.
         """
         if readings.up is None:
             return
@@ -160,30 +144,20 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
 
 
 class ReadingGates(NamedTuple):
-    """States of the gates that reject readings, one row for each sensor in `SENSORS`. The arrays are modified in place.
+    """States of the gates that reject readings, one row per sensor in `SENSORS`; arrays are modified in place."""
 
-    Args:
-        counts: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used
-            although they contradict the pose.
-        residuals: (6, 3) residual of the last reading that contradicted the pose.
-    """
-
+    #: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used although
+    #: they contradict the pose.
     counts: NDArray[np.int64]
-    residuals: Array
+    residuals: Array  #: (6, 3) residual of the last reading that contradicted the pose
 
 
 class PressureAhrsModel(NamedTuple):
-    """Error model of the pressure sensor and the AHRS.
+    """Error model of the pressure sensor and the AHRS."""
 
-    Args:
-        camera_from_body: (4, 4) pose of the body in the camera.
-        pressure_m2: variance of the height measured by the pressure sensor [m^2].
-        attitude_sigmas_rad: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad].
-    """
-
-    camera_from_body: Array
-    pressure_m2: float
-    attitude_sigmas_rad: Array
+    camera_from_body: Array  #: (4, 4) pose of the body in the camera
+    pressure_m2: float  #: variance of the height measured by the pressure sensor [m^2]
+    attitude_sigmas_rad: Array  #: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad]
 
 
 @kernel
@@ -192,10 +166,8 @@ def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad, gates):
 
     Args:
         world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
-        model: `PressureAhrsModel`.
         height_m, rpy_rad: readings of the height of the left camera in the world [m], and of roll, pitch and yaw (3,)
             of the body in the world [rad]; NaN where there is no reading.
-        gates: `ReadingGates`, modified in place.
 
     Returns:
         Pose (4, 4) and covariance (6, 6) after the update.
@@ -246,8 +218,6 @@ def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, senso
     the same way, the pose is taken to be wrong: its covariance is increased by that of the error they imply.
 
     Args:
-        world_from_camera, prior, residual, jacobian, cov: see `kalman_update`.
-        gates: `ReadingGates`, modified in place.
         sensor: index of the sensor in `SENSORS`.
 
     Returns:
@@ -273,7 +243,6 @@ def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, senso
 
 @kernel
 def _chi2(residual, cov):
-    """Returns the chi-square of a residual (k,) with covariance (k, k)."""
     return np.sum(residual * np.linalg.solve(cov, residual))
 
 
@@ -303,13 +272,7 @@ def kalman_update(world_from_camera, prior, residual, jacobian, cov):
 
 @kernel
 def _gain(prior, jacobian, cov):
-    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by Gaussian elimination.
-
-    Args:
-        prior: (6, 6) covariance P of the pose.
-        jacobian: (k, 6) derivative J of the predicted observation with respect to an increment of the pose.
-        cov: (k, k) covariance R of the observation.
-    """
+    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by elimination; P `prior` (6, 6), R `cov` (k, k)."""
     size = len(cov)
     gain, innovation_cov = np.zeros((6, size)), cov.copy()
     for m in range(size):
@@ -337,11 +300,7 @@ def _gain(prior, jacobian, cov):
 
 @kernel
 def _correct(world_from_camera, prior, measured, cov, motion_cov):
-    """Compiled kernel of `PoseFilter.correct_pose`, without the gate; `prior` (6, 6) is the covariance of the pose.
-
-    Returns:
-        Chi-square of the innovation, the corrected pose (4, 4), and the decrease (6, 6) of the pose covariance.
-    """
+    """Kernel of `PoseFilter.correct_pose`: chi-square of the innovation, corrected pose, decrease of the covariance."""
     motion_cov = clip_covariance(motion_cov, prior, 0.0, 1.0)
     residual = geometry.log(geometry.inverse(world_from_camera) @ measured)
     inverse = np.linalg.inv(motion_cov + cov)
@@ -350,14 +309,10 @@ def _correct(world_from_camera, prior, measured, cov, motion_cov):
 
 
 def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
-    """Returns the rotation world_from_camera (3, 3) of an AHRS reading, and its covariance (3, 3) in camera axes.
+    """Returns the rotation world_from_camera (3, 3) of an AHRS reading (3,) [rad], and its covariance (3, 3) in camera
+    axes.
 
     The errors of roll, pitch and yaw are treated as rotations about the x, y and z axes of the body.
-
-    Args:
-        rpy_rad: (3,) roll, pitch and yaw of the body [rad].
-        camera_from_body: (4, 4) pose of the body in the camera.
-        noise: believed noise of the navigation sensors.
     """
     return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
 

@@ -28,17 +28,11 @@ _START_S = 1.0  # the mean specific force over this time gives the first attitud
 
 
 class InertialNoise(NamedTuple):
-    """Noise of an IMU in the terms of Kalibr; that of the accelerometer is far below the accelerations of a vehicle.
+    """Noise of an IMU in the terms of Kalibr; that of the accelerometer is far below the accelerations of a vehicle."""
 
-    Args:
-        rate_density: white noise of each angular rate [rad/s/sqrt(Hz)].
-        rate_walk: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)].
-        force_density: white noise of each specific force [m/s2/sqrt(Hz)].
-    """
-
-    rate_density: float
-    rate_walk: float
-    force_density: float
+    rate_density: float  #: white noise of each angular rate [rad/s/sqrt(Hz)]
+    rate_walk: float  #: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]
+    force_density: float  #: white noise of each specific force [m/s2/sqrt(Hz)]
 
 
 def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array]:
@@ -46,10 +40,6 @@ def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array
 
     The standard deviation includes the noise of both sensors, the bias of the gyroscope and the accelerations of the
     vehicle, not the bias of the accelerometer: a bias b adds an error of b / g, common to all readings.
-
-    Args:
-        readings: readings with increasing times, at least one.
-        noise: noise of the IMU.
 
     Returns:
         Unit vectors (n, 3) that point upwards, in the axes of the IMU, and standard deviations (n,) about each
@@ -73,7 +63,6 @@ def _filtered(times_s, rates, forces, rate_density2, rate_walk2, force_density2)
 
     Args:
         times_s, rates, forces: (n,), (n, 3), (n, 3) readings.
-        rate_density2, rate_walk2, force_density2: squared noise densities; the last includes accelerations.
     """
     n = len(times_s)
     up, variance, bias = np.empty((n, 3)), np.empty(n), np.zeros(3)

@@ -37,15 +37,10 @@ MAX_SIGMA_PX = 1.0
 
 
 class Disparity(NamedTuple):
-    """Disparity of every pixel of a left image, with its standard deviation.
+    """Disparity of every pixel of a left image, with its standard deviation."""
 
-    Args:
-        disparity_px: (H, W) float32 disparity [px], NaN where unknown.
-        sigma_px: (H, W) float32 standard deviation of the disparity [px], NaN where unknown.
-    """
-
-    disparity_px: Map
-    sigma_px: Map
+    disparity_px: Map  #: (H, W) float32 disparity [px], NaN where unknown
+    sigma_px: Map  #: (H, W) float32 standard deviation of the disparity [px], NaN where unknown
 
     def with_sigma_below(self, sigma_px: float | Map) -> Disparity:
         """Returns the disparity with the pixels whose standard deviation is not below `sigma_px` set to NaN.
@@ -61,17 +56,13 @@ class Disparity(NamedTuple):
 def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) -> Disparity:
     """Returns the disparity of the pixels of the left image that are matched in the right one; NaN elsewhere.
 
-    Semi-global matching (Hirschmueller 2008; OpenCV's variant with three path directions) of images with locally
-    normalised contrast gives an initial disparity; a left-right consistency check removes occlusions and mismatches.
-    The sub-pixel interpolation of semi-global matching is biased towards whole pixels (bias 0.02 px, standard deviation
-    0.17 px on a rendered reef), so `epipolar.refine` refines the disparity (bias 0.002 px, standard deviation 0.06 px).
-    The returned standard deviation is that without the prior of the refinement, so it increases where texture is weak
-    compared with noise.
+    Semi-global matching (Hirschmueller 2008; OpenCV, three path directions) of images with locally normalised contrast,
+    with a left-right check, is refined by `epipolar.refine` (bias on a rendered reef 0.002 instead of 0.02 px). The
+    standard deviation is that without the prior of the refinement.
 
     Args:
         left, right: (H, W) uint8 or float32 rectified grey images.
-        max_disparity_px: number of whole-pixel disparities that are searched, from 0 on; it is rounded up to a multiple
-            of 16.
+        max_disparity_px: number of whole-pixel disparities searched, rounded up to a multiple of 16.
     """
     coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
@@ -83,9 +74,6 @@ class SearchRange:
     """Range of the disparity search, at first the widest one, then adapted to the largest disparities of the last pair.
 
     The widest range is `MAX_DISPARITY_FRACTION` of the image width.
-
-    Args:
-        rig: calibration at the scale of the images.
 
     Attributes:
         max_disparity_px: largest disparity to search [px].

@@ -47,34 +47,25 @@ class TwoView(NamedTuple):
 
     K is the camera matrix, f the focal length [px], b the baseline of the stereo pair [m]; the pose of the reference
     camera in the other camera has rotation R and translation t [m]. p is in homogeneous pixel coordinates.
-
-    Args:
-        matrix: (3, 3) K R K^-1, the infinite homography other_from_reference.
-        epipole: (3,) K t / (f b), the displacement in homogeneous pixel coordinates per pixel of disparity.
     """
 
-    matrix: Array
-    epipole: Array
+    matrix: Array  #: (3, 3) K R K^-1, the infinite homography other_from_reference
+    epipole: Array  #: (3,) K t / (f b), the displacement in homogeneous pixel coordinates per pixel of disparity
 
 
 class Refinement(NamedTuple):
-    """Result of `refine`.
+    """Result of `refine`."""
 
-    Args:
-        disparity_px: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed.
-        sigma_px: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard
-            deviation `PRIOR_PX` [px].
-        gain: (H, W) fraction of an error of the disparity that the last iteration removes: near 1 on texture, near 0
-            without texture.
-        noise: standard deviation of the image noise in the difference of both images [grey levels].
-        variance_inflation: factor by which the correlation of the noise of neighbouring pixels increases the variance;
-            not included in `sigma_px`.
-    """
-
-    disparity_px: Map
+    disparity_px: Map  #: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed
+    #: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard deviation
+    #: `PRIOR_PX` [px].
     sigma_px: Map
+    #: (H, W) fraction of an error of the disparity that the last iteration removes: near 1 on texture, near 0 without
+    #: texture.
     gain: Map
-    noise: float
+    noise: float  #: standard deviation of the image noise in the difference of both images [grey levels]
+    #: factor by which the correlation of the noise of neighbouring pixels increases the variance; not included in
+    #: `sigma_px`.
     variance_inflation: float
 
     @property
@@ -102,25 +93,18 @@ def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> T
 def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterations: int = 2) -> Refinement:
     """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
 
-    Let I be the reference image, and O the other image warped to it by the current disparities d. Each pixel measures
-    the error of its disparity, e = d_true - d = (I - O) / (dO/dd). A plane is fitted to the values d + e in a window,
-    weighted by (dO/dd)^2 and the weights of the window; its value at the centre is the refined disparity. This value is
-    unbiased on inclined surfaces and not biased towards whole or half pixels (`_warp`); neighbours on another surface
-    are excluded. Brightness and contrast of O are first matched locally to those of I, because backscatter and
-    illumination change with the viewpoint.
+    With the other image O warped to the reference image I by the disparities d, each pixel measures the error e = (I -
+    O) / (dO/dd). The refined disparity is the centre of a plane fitted to d + e, weighted by (dO/dd)^2 and the window,
+    without neighbours on another surface; it is unbiased on slopes and at sub-pixel positions (`_warp`). Brightness and
+    contrast of O are first matched locally to I. With strong noise, iterations after the first use a larger window.
 
-    The variance is the least-squares variance for a noise variance estimated from nearby residuals, or from the
-    residuals of the window itself if that estimate is larger. With strong noise, the iterations after the first use a
-    larger window. Image gradients dO/dd that noise alone can produce are not treated as texture. `measurement_sigma_px`
-    agrees with the standard deviation of the error to 15 % in clear water; the standard deviation of the error,
-    mismatches included, is 1.3 times `measurement_sigma_px` if the noise is one fifth of the image contrast, and 1.7
-    times if it is half of the contrast.
+    The noise variance is that of nearby residuals, or of the window's own if larger. `measurement_sigma_px` agrees with
+    the error to 15 % in clear water; the error is 1.3 times larger for noise of a fifth of the contrast, 1.7 times for
+    half.
 
     Args:
         reference, other: (H, W) float32 grey images.
         disparity_px: (H, W) float32 initial disparity [px], NaN where unknown.
-        view: two-view geometry of the images.
-        iterations: number of Gauss-Newton iterations.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
     sigma, gain, mean_square, noise_variance, inflation, window_px = fitted, fitted, fitted, 1.0, 1.0, WINDOW_PX
@@ -148,24 +132,12 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) of a disparity from the measurement alone, sigma / gain.
-
-    Where there is little texture, the result is too large, because `sigma` includes the error due to the prior.
-
-    Args:
-        sigma, gain: `Refinement.sigma_px`, which includes the prior, and `Refinement.gain`.
-    """
+    """Returns the standard deviation (H, W) from the measurement alone, sigma / gain; too large over little texture."""
     return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
 
 
 def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
-    """Returns the standard deviation [px] of the Gaussian window of the next iteration, which is larger for more noise.
-
-    Args:
-        sigma: (H, W) standard deviation of the disparity [px].
-        fitted: (H, W) disparity [px], `UNKNOWN_PX` where unknown.
-        window_px: the present value, which is returned if no disparity is known.
-    """
+    """Returns the standard deviation [px] of the window of the next iteration, larger for more noise."""
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
         return window_px
@@ -179,11 +151,10 @@ def _contrast(image: Map) -> Map:
 
 
 def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Map, Mask]:
-    """Warps the other image O to the reference image I, and adapts its local mean and standard deviation to those of I.
+    """Warps the other image O to the reference I, and adapts its local mean and standard deviation to those of I.
 
     Returns:
-        Residual I - O, 0 at pixels not visible in O; gradient dO/dd and pixel locking, both from `_warp`; and a mask
-        of the pixels that are visible in O. Each is (H, W).
+        Residual I - O (0 where not visible), gradient dO/dd and pixel locking (`_warp`), and mask of visible pixels.
     """
     warped, slope, locking = np.zeros_like(reference), np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope, locking)
@@ -214,16 +185,12 @@ def _mean(image: Map) -> Map:
 
 
 def _gaussian_window(window_px: float) -> Map:
-    """Returns the weights (n,) of a Gaussian window along one axis, with the standard deviation `window_px`."""
     half = int(np.ceil(2 * window_px))
     return np.exp(-0.5 * (np.arange(-half, half + 1) / window_px) ** 2).astype(np.float32)
 
 
 def _noise_variance(residual: Map, visible: Mask) -> float:
-    """Returns a robust variance of the residuals from their median absolute value, at least `MIN_NOISE_VARIANCE`.
-
-    Every second pixel of every second row is used. The result is 1 if fewer than 100 of them are visible.
-    """
+    """Returns a robust variance of the residuals, at least `MIN_NOISE_VARIANCE`; 1 if fewer than 100 are visible."""
     sample = np.abs(residual[::2, ::2][visible[::2, ::2]])
     if sample.size < 100:
         return 1.0
@@ -231,11 +198,10 @@ def _noise_variance(residual: Map, visible: Mask) -> float:
 
 
 def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor by which the correlation of the noise of neighbouring pixels increases the variance of a fit.
+    """Returns the factor by which correlated noise of neighbouring pixels increases the variance of a fit.
 
-    It is computed from the correlation between neighbouring residuals that remain after the fit. The interpolated
-    colours of a Bayer sensor, for example, have correlated noise: with pixels treated as independent, the standard
-    deviation of the disparity was 1.6 times too small.
+    It follows from the correlation of the residuals that remain after the fit. Without it, the standard deviation was
+    1.6 times too small for the interpolated colours of a Bayer sensor.
     """
     along, across = _correlations(remaining, visible, variance)
     return (1 + 2 * max(along, 0.0)) * (1 + 2 * max(across, 0.0))
@@ -255,10 +221,8 @@ def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float,
 def _locking_factor(residual: Map, visible: Mask, variance: float) -> float:
     """Returns the factor, 0 to 1, by which the correlation of the noise of neighbouring pixels reduces pixel locking.
 
-    Let c^k be the correlation of the noise of pixels at a distance of k pixels. Interpolation then reduces the variance
-    of the noise less than for independent pixels: halfway between two pixels, the variance is multiplied by
-    1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3). The result is the expression in parentheses. c is the correlation
-    between neighbours in a column, because a stereo pair is not interpolated along the columns.
+    With the correlation c between neighbours in a column, which stereo does not interpolate, interpolation halfway
+    multiplies the variance of noise by 1 - 0.36 (1 - 1.367 c + 0.391 c^2 - 0.022 c^3); the result is the parenthesis.
     """
     c = float(np.clip(_correlations(residual, visible, variance)[1], 0.0, 1.0))
     return max(1 - 1.367 * c + 0.391 * c * c - 0.022 * c**3, 0.0)
@@ -274,16 +238,12 @@ def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
 def _warp(reference, other, disparity, matrix, epipole, warped, slope, locking):
     """Warps the other image O to the reference image, and returns a mask (H, W) of the pixels that are visible in O.
 
-    Writes the warped image to `warped`, its gradient dO/dd with respect to the disparity to `slope`, and the expected
-    product of residual and gradient due to noise alone, for a residual of variance 1, to `locking`, each (H, W). The
-    gradient is the mean of the gradients of both images, because the gradient of a single image is biased by its noise
-    and by interpolation.
+    Fills `warped`, `slope` (gradient dO/dd, the mean of both images', which is less biased by noise) and `locking`
+    (expected product of residual and gradient due to noise alone, per variance of the residual).
 
-    Interpolated noise n has the variance s^2 V at a position between pixels, with s^2 the variance of the noise of a
-    pixel and V the sum of the squared weights: 1 at a pixel, 0.64 halfway between two pixels in a row. The residual
-    contains -n and the gradient (dn/dd) / 2, and the residual has the variance s^2 (1 + V), so their product has the
-    mean -(dV/dd) / 4 / (1 + V) times the variance of the residual. Unless this mean is subtracted, least squares is
-    biased towards disparities at which the interpolation is halfway between two pixels.
+    Interpolated noise has V times the variance of a pixel, with V the sum of the squared weights (1 at a pixel, 0.64
+    halfway). The residual contains -n, the gradient (dn/dd) / 2; their product has the mean -(dV/dd) / 4 / (1 + V).
+    Unless it is subtracted, disparities halfway between two pixels are preferred.
     """
     height, width = reference.shape
     visible = np.zeros((height, width), np.bool_)
@@ -325,10 +285,10 @@ def _interpolated_noise(t):
 
 @kernel(forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
-    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fit at each pixel.
+    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fits, in place.
 
-    `sums` is modified in place. `centre` (n,) are the disparities of the pixels; `disparity`, `residual`, `slope` and
-    `locking` (n,) are the values of their neighbours. The loop is written so that the compiler can vectorise it.
+    `centre` are the disparities of the pixels, the others belong to the neighbours; the compiler can vectorise the
+    loop.
     """
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11, s12 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11], sums[12]
@@ -358,15 +318,8 @@ def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight,
 def _fit_planes(disparity, residual, slope, locking, noise, window, support, priors):
     """Fits a plane to the disparities around each pixel.
 
-    The expected product of residual and slope due to noise alone is subtracted: `locking` times the mean squared
-    residual of the window, or times `noise` if that is smaller.
-
-    Args:
-        disparity, residual, slope, locking: (H, W) results of `_balanced_warp` and the current disparity [px].
-        noise: (H, W) noise variance [grey levels squared].
-        window: (n,) weights of the window along one axis.
-        support: see `SUPPORT_PX`.
-        priors: see `_PRIORS`.
+    The expected noise product of residual and slope is subtracted: `locking` times the mean squared residual of the
+    window, or times `noise` (H, W) if that is smaller.
 
     Returns:
         Disparity at the centre (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (see

@@ -1,19 +1,13 @@
 """Estimation of small errors of the rectification from the row differences of matched points.
 
-In a rectified pair every point lies in the same row of both images. Let w [rad] be the rotation vector (pitch, yaw,
-roll about the x, y and z axes of the camera) of the right camera from its ideal to its actual attitude, and e an offset
-of the row of the principal point [focal lengths]. At the normalised coordinates (x, y) of the right image, they change
-the normalised row of a point by
+With the rotation vector w [rad] of the right camera from its ideal attitude and an offset e of the row of its principal
+point [focal lengths], the normalised row of a point at (x, y) changes by
 
     dy = w_x (1 + y^2) - w_y x y - w_z x + e
 
-(the linearised rotation of a pinhole camera; Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed
-from the right image. Yaw is estimated, but not removed: a lens distortion error causes nearly the same pattern, and a
-wrong yaw would shift all disparities.
-
-Row differences that these four errors do not explain are due either to matching noise, which averages out in each
-region of the image, or to errors of the calibration (distortion, a port), which do not average out. `RegionMeans`
-separates the two.
+(Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed from the right image; yaw is not, because a
+distortion error looks nearly the same and a wrong yaw would shift all disparities. `RegionMeans` separates matching
+noise, which averages out in a region of the image, from errors of the calibration.
 """
 
 from __future__ import annotations
@@ -44,17 +38,11 @@ _REGIONS = (4, 3)  # regions of the image along columns and rows
 
 
 class RegionMeans(NamedTuple):
-    """Weighted sums of the row differences in each of m regions of the image, from which their means follow.
+    """Weighted sums of the row differences in each of m regions of the image, from which their means follow."""
 
-    Args:
-        weight: (m,) sum of the weights, which is the inverse variance of the mean row difference.
-        rows: (m,) weighted sum of the normalised row differences.
-        jacobian: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`).
-    """
-
-    weight: Array
-    rows: Array
-    jacobian: Array
+    weight: Array  #: (m,) sum of the weights, which is the inverse variance of the mean row difference
+    rows: Array  #: (m,) weighted sum of the normalised row differences
+    jacobian: Array  #: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`)
 
     def plus(self, region: NDArray[np.int64], weight: Array, rows: Array, jacobian: Array) -> RegionMeans:
         """Returns the sums with n more row differences.
@@ -85,7 +73,6 @@ class RegionMeans(NamedTuple):
 
 
 def _no_regions() -> RegionMeans:
-    """Returns the sums before the first observation, which are zero."""
     n = _REGIONS[0] * _REGIONS[1]
     return RegionMeans(np.zeros(n), np.zeros(n), np.zeros((n, 4)))
 
@@ -107,8 +94,6 @@ class EpipolarCalibration:
         """Adds the row differences of one stereo pair whose right image was rectified with `removed`.
 
         Args:
-            points: matched points of the pair.
-            rig: calibration at the scale of the images.
             patch_px: side of the matched patches [px], for the correlation between overlapping patches.
         """
         x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]
@@ -137,9 +122,6 @@ class EpipolarCalibration:
         The condition is that the row changes by more than 4 standard deviations and by more than 0.02 px in at least
         one corner of the image.
 
-        Args:
-            rig: calibration at full image size.
-
         Returns:
             Whether `removed` was changed.
         """
@@ -160,7 +142,6 @@ class EpipolarCalibration:
 
         Args:
             right: (H, W, 3) right image at full size.
-            rig: calibration at full image size.
         """
         if not self.removed.any():
             return right
@@ -214,5 +195,4 @@ def spread(points: StereoPoints) -> float:
 
 
 def _sides(rig: StereoRig) -> tuple[tuple[int, float], tuple[int, float]]:
-    """Returns (width, cx) and (height, cy) [px]."""
     return (rig.width_px, rig.cx_px), (rig.height_px, rig.cy_px)

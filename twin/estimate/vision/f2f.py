@@ -25,19 +25,12 @@ _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single 
 
 
 class _Reference(NamedTuple):
-    """Image with which frames are matched, and its points.
+    """Image with which frames are matched, and its points."""
 
-    Args:
-        image: (height, width) normalised left image.
-        pixels: (n, 2) positions of the points in the image [px].
-        measured: (n, 3) normalised (x, y, disparity) of the points.
-        cov: (n, 3, 3) covariance of each row of `measured`.
-    """
-
-    image: matching.Image
-    pixels: matching.Points
-    measured: Array
-    cov: Array
+    image: matching.Image  #: (height, width) normalised left image
+    pixels: matching.Points  #: (n, 2) positions of the points in the image [px]
+    measured: Array  #: (n, 3) normalised (x, y, disparity) of the points
+    cov: Array  #: (n, 3, 3) covariance of each row of `measured`
 
     def xyz(self, baseline_m: float) -> Array:
         """Returns the positions (n, 3) of the points in the axes of the reference camera [m]."""
@@ -46,21 +39,14 @@ class _Reference(NamedTuple):
 
 
 class _Located(NamedTuple):
-    """Pose of an image relative to the reference, from tracked points.
+    """Pose of an image relative to the reference, from tracked points."""
 
-    Args:
-        motion: pose of the image in the reference camera, its covariance and the number of inliers.
-        inlier_share: fraction of the tracked points that are inliers, 0 to 1.
-        tracked_share: fraction of the points of the reference that were tracked, 0 to 1.
-        residual_px: median distance between the tracked and the fitted positions of the points [px].
-        as_reference: the image with the tracked points, which can replace the reference.
-    """
-
+    #: pose of the image in the reference camera, its covariance and the number of inliers.
     motion: two_view_motion.Motion
-    inlier_share: float
-    tracked_share: float
-    residual_px: float
-    as_reference: _Reference
+    inlier_share: float  #: fraction of the tracked points that are inliers, 0 to 1
+    tracked_share: float  #: fraction of the points of the reference that were tracked, 0 to 1
+    residual_px: float  #: median distance between the tracked and the fitted positions of the points [px]
+    as_reference: _Reference  #: the image with the tracked points, which can replace the reference
 
 
 class FrameToFrame:
@@ -81,7 +67,6 @@ class FrameToFrame:
     the failure.
 
     Args:
-        rig: calibration at the scale of the images.
         patch_px: side of the tracking window [px].
 
     Attributes:
@@ -103,7 +88,6 @@ class FrameToFrame:
 
         Args:
             image: (height, width) normalised left image of the keyframe.
-            points: its matched points, strongest first.
         """
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
@@ -167,20 +151,15 @@ class FrameToFrame:
         return geometry.transport_covariance(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
 
     def _set_reference(self, reference: _Reference) -> None:
-        """Makes the current frame, with these points, the reference."""
         self.reference, self._common_cov = reference, np.zeros((6, 6))
         self.filter.restart()
 
     def _pyramid_levels(self, depth_m: Array) -> int:
         """Returns the number of pyramid levels above the full image that the error of the predicted positions requires.
 
-        The tracker finds a point at a distance of up to about half the side of its window; each level doubles this
-        distance. The variance of the predicted positions follows from the filter's variances of the rotation about the
-        x and y axes and of the translation across the optical axis, at the median depth. At 15 frames per second one
-        level is sufficient; at 5, the acceleration of the vehicle moves the points by about 10 px more than predicted.
-
-        Args:
-            depth_m: (n,) depths of the points [m].
+        The tracker finds points within half its window, and each level doubles this. The error follows from the
+        filter's variances of rotation about x and y and of translation across the optical axis, at the median of
+        `depth_m` (n,).
         """
         variance = np.diag(self.filter.cov)
         across = variance[3:5] / float(np.median(depth_m)) ** 2
@@ -189,11 +168,7 @@ class FrameToFrame:
         return int(np.clip(levels, 1, _MOST_LEVELS))
 
     def _locate(self, image: matching.Image, reference: _Reference, predicted: Array) -> _Located | None:
-        """Estimates the pose of an image in the reference camera, starting from a predicted pose (4, 4).
-
-        Returns:
-            The pose with the tracked points, or None if too few points are tracked or are inliers.
-        """
+        """Returns the pose of an image in the reference camera with the tracked points; None if too few are inliers."""
         current_from_reference = geometry.inverse(predicted)
         points = geometry.transform(current_from_reference, reference.xyz(self.rig.baseline_m))
         guess = self.rig.project(points).astype(np.float32)
@@ -226,14 +201,10 @@ class FrameToFrame:
 
 
 def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns normalised (x, y, disparity) (n, 3) of stereo points, with (x, y) of their pixels in the left image.
+    """Returns normalised (x, y, disparity) (n, 3) at the pixels of the left image, and their covariance (n, 3, 3).
 
-    `stereo.fuse` moves a point by half its row difference between the two images. Frames are matched with the left
-    image alone, however, and a systematic row difference (a pitch of one camera) must not appear as motion.
-
-    Returns:
-        The coordinates (n, 3) and their covariance (n, 3, 3). That of (x, y) is the covariance before the fusion, which
-        halves the variance of the row.
+    `stereo.fuse` moves a point by half its row difference; frames are matched with the left image alone, where this
+    would appear as motion. The covariance of (x, y) is that before the fusion.
     """
     measured, cov = points.measured.copy(), points.cov.copy()
     measured[:, :2] = rig.normalised(points.pixels)
@@ -251,7 +222,6 @@ def constant_velocity_motion(
 
     Args:
         motion: (4, 4) predicted motion.
-        status: reason why the motion was not measured.
     """
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])

@@ -40,7 +40,6 @@ class ImageSpool:
         """Stores the stereo pair of a keyframe; another thread writes it to disk.
 
         Args:
-            row: index of the frame in the trajectories.
             left, right: (height, width, 3) RGB images at full size.
             gray: grey levels of both images at the binning of the spool (`matching.gray`).
 
@@ -104,22 +103,19 @@ class ImageSpool:
         return left.astype(np.float32), right.astype(np.float32)
 
     def _cache(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
-        """Adds the grey levels of a pair to the cache; removes the least recently used ones beyond `_CACHE_BYTES`.
-
-        The pair itself always remains in the cache.
+        """Adds the grey levels of a pair to the cache; removes the least recently used beyond `_CACHE_BYTES`, except
+        the pair.
         """
         self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
         while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
 
     def _write(self, row: int, left: Image, right: Image) -> None:
-        """Writes both images of a pair to disk as PNG files."""
         for side, image in (("left", left), ("right", right)):
             data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             self._path(row, side).write_bytes(data.tobytes())
 
     def _path(self, row: int, side: str) -> Path:
-        """Returns the path of an image file; `side` is "left" or "right"."""
         return self.folder / f"{row:06d}_{side}.png"
 
     def _read(self, row: int, side: str) -> NDArray[np.uint8]:

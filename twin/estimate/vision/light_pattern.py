@@ -1,9 +1,7 @@
 """Light pattern of the cameras: the smooth part of the images that is due to lamps and backscatter.
 
-The pattern moves with the cameras, not with the floor. In turbid water its gradient exceeds that of the texture of the
-floor, above all at the edge of the area that the lamps light. Dense matching would then find the disparity of the
-pattern instead of that of the floor. The pattern is therefore estimated from the images of many keyframes and
-subtracted before dense matching, unless the texture dominates the pattern.
+It moves with the cameras. In turbid water dense matching would find its disparity instead of that of the floor, so it
+is estimated from many keyframes and subtracted, unless the texture dominates.
 """
 
 from __future__ import annotations
@@ -24,12 +22,9 @@ DEGREE = 6
 
 
 class LightPattern(NamedTuple):
-    """Light pattern of a stereo camera.
+    """Light pattern of a stereo camera."""
 
-    Args:
-        left, right: (H, W) float32 pattern in each image [grey levels].
-    """
-
+    #: left, right: (H, W) float32 pattern in each image [grey levels].
     left: Map
     right: Map
 
@@ -49,17 +44,13 @@ def pattern_fit(pair: tuple[Map, Map]) -> Array:
 def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern | None:
     """Returns the light pattern of a survey; None if it is not needed or not known.
 
-    A coefficient of the pattern is its mean m over the n keyframes, multiplied by max(0, 1 - v / m^2), a shrinkage as
-    in the positive-part estimator of James & Stein (1961), with v the variance of the mean. A coefficient whose mean
-    does not exceed the standard deviation of this mean is attributed to texture and relief, and is therefore left in
-    the images. Images of neighbouring keyframes overlap, so v = (s^2 / n) (1 + r) / (1 - r), with s^2 the variance of
-    the coefficient over the keyframes and r the correlation of consecutive keyframes, as in a first-order
-    autoregressive process.
+    A coefficient is its mean m over the n keyframes times max(0, 1 - v / m^2) (positive-part shrinkage, James & Stein
+    1961), which leaves texture and relief in the images. Images of neighbouring keyframes overlap, so the variance of
+    the mean is v = (s^2 / n) (1 + r) / (1 - r), with the variance s^2 over the keyframes and the correlation r of
+    consecutive ones.
 
-    The pattern misleads the matching only where it dominates the texture. The result is therefore None if the sum of
-    m^2 over all coefficients except the constant ones does not exceed the sum of s^2: an image then varies more by the
-    floor in view than by the light of the cameras, and the mean over the keyframes may be that of a part of the floor
-    which most of them show. The result is also None for fewer than two keyframes.
+    None for fewer than two keyframes, and if the sum of m^2 (without constants) does not exceed that of s^2: the floor
+    in view then dominates the light, and the mean may be that of a part of the floor.
 
     Args:
         fits: coefficients of the keyframes (`pattern_fit`), in chronological order.
@@ -95,11 +86,7 @@ def _fitting_matrix(n: int) -> Array:
 
 
 def _images_per_independent_image(deviation: Array) -> float:
-    """Returns (1 + r) / (1 - r), with r the correlation of consecutive keyframes, limited to 0 <= r <= 0.9.
-
-    Args:
-        deviation: (n, 2, d, d) coefficients of the keyframes, minus their means.
-    """
+    """Returns (1 + r) / (1 - r), r the correlation (0 to 0.9) of consecutive keyframes' `deviation` (n, 2, d, d)."""
     power = np.sum(deviation[1:] ** 2 + deviation[:-1] ** 2) / 2
     r = float(np.clip(np.sum(deviation[1:] * deviation[:-1]) / max(power, 1e-12), 0.0, 0.9))
     return (1 + r) / (1 - r)

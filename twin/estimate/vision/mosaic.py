@@ -1,14 +1,9 @@
 """Local 2.5-D mosaic, and the registration of frames with it (F2M) in six degrees of freedom over any relief.
 
-The mosaic is a raster in world coordinates. Each cell has a normalised brightness, an elevation, and the number of the
-keyframe from which both come. Cells are not overwritten, because the pose of the oldest keyframe has drifted least. A
-frame is registered by direct image alignment: textured cells are projected into the frame, and the pose is adjusted to
-minimise the differences of brightness (Gauss-Newton with Huber weights).
-
-The residuals are caused less by pixel noise than by errors of height and by uneven illumination, which are correlated
-between neighbouring cells. Over a floor of coarse texture, with cells treated as independent, the computed standard
-deviation of the rotation was 0.4 mrad, but the error was 1.4 to 6 mrad. The covariance is therefore computed as for
-clustered data (Liang & Zeger 1986), with blocks of the image as clusters.
+A cell has brightness, elevation and number of the oldest keyframe that saw it, whose pose has drifted least. Textured
+cells are aligned directly with the frame (Gauss-Newton, Huber weights). Their residuals are correlated (heights,
+light): with independent cells, the computed standard deviation of the rotation was 0.4 mrad at an error of 1.4 to 6
+mrad, so the covariance is that of clustered data (Liang & Zeger 1986), with image blocks as clusters.
 """
 
 from __future__ import annotations
@@ -36,17 +31,13 @@ _BLOCKS = (6, 8)  # rows and columns of image blocks; a block is about as wide a
 
 
 class Registration(NamedTuple):
-    """Result of a registration with the mosaic.
+    """Result of a registration with the mosaic."""
 
-    Args:
-        correction: pose of the camera at its estimated pose, relative to the camera at its predicted pose
-            (predicted_from_estimated); `n_points` is the number of compared cells, `residual` is in normalised grey
-            levels.
-        reference_keyframe: median of the keyframe numbers of the compared cells; at least half of the cells come from
-            this keyframe or older ones.
-    """
-
+    #: pose of the camera at its estimated pose, relative to the camera at its predicted pose
+    #: (predicted_from_estimated); `n_points` is the number of compared cells, `residual` is in normalised grey levels.
     correction: two_view_motion.Motion
+    #: median of the keyframe numbers of the compared cells; at least half of the cells come from this keyframe or older
+    #: ones.
     reference_keyframe: int
 
 
@@ -72,11 +63,9 @@ class Mosaic:
         """Fills empty cells of the mosaic from a keyframe; does nothing if no depth is known.
 
         Args:
-            number: number of the keyframe.
             image: (height, width) normalised left image.
             depth_m: (height, width) depth [m], NaN where unknown.
             world_from_camera: (4, 4) pose of the keyframe.
-            rig: calibration at the scale of the image, with square pixels.
 
         Raises:
             OSError: a tile could not be read or written.
@@ -109,7 +98,6 @@ class Mosaic:
             depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
             half_window_m: half the side of the square of cells that is used, centred below the camera [m].
-            rig: calibration at the scale of the image, with square pixels.
 
         Returns:
             The pose correction with its covariance, or None if too few cells are textured, or too few of these are
@@ -152,12 +140,8 @@ class Mosaic:
     ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
         """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
 
-        If at least twice `_MAX_CELLS` cells are textured, a regular subset of them is returned. None if fewer than
-        `_MIN_CELLS` are textured, or if the square has fewer than 8 cells along a side.
-
-        Args:
-            centre: (3,) position of the camera in the world [m]; the square is centred below it.
-            half_m: half the side of the square [m].
+        It has the half side `half_m` [m] and is centred below the camera at `centre` (3,) [m]. From twice `_MAX_CELLS`
+        on, a regular subset; None for fewer than `_MIN_CELLS`, or fewer than 8 cells along a side.
         """
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
@@ -188,16 +172,13 @@ def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArr
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
     """Fills the empty cells of a window, in place, from one keyframe.
 
-    A cell receives the mean height of the pixels that lie in it, and the image brightness at the projection of its
-    centre. With the brightness of the pixels in the cell instead, registered positions would have a bias of 5 mm,
-    because these pixels are not at the centre of the cell.
+    A cell receives the mean height of its pixels, and the brightness at the projection of its centre: that of its
+    pixels, which are not at the centre, would bias registered positions by 5 mm.
 
     Args:
         image, depth: (H, W) normalised image, and depth [m].
         pose, inverse: (4, 4) world_from_camera and camera_from_world.
-        focal, cx, cy: focal length, column and row of the principal point [px].
         west, south, cell: south-west corner of the window and cell size [m].
-        keyframe: number of the keyframe.
         brightness, height, number: (rows, cols) layers of the window, NaN in empty cells.
     """
     total = np.zeros(height.shape, np.float32)
@@ -231,25 +212,18 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 
 @kernel
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """Linearises the brightness residuals of the cells that are visible in the frame at a known depth.
-
-    The residual is the brightness of the cell minus that of the frame. Cells with larger residuals than `max_residual`
-    are left out.
+    """Linearises the brightness residuals (cell minus frame) of the cells that are visible in the frame at a known
+    depth.
 
     Args:
-        points: (n, 3) positions of the cells in the world [m].
-        brightness: (n,) brightness of the cells [normalised grey levels].
-        frame: (height, width) brightness of the frame [normalised grey levels].
-        depth: (height, width) depth of the frame [m].
-        camera_from_world: (4, 4) pose of the world in the camera.
+        points, brightness: (n, 3), (n,) positions in the world [m] and brightness of the cells.
+        frame, depth: (height, width) brightness and depth [m] of the frame.
         camera: focal length, column and row of the principal point [px].
         max_residual: largest brightness residual of an inlier [grey levels].
 
     Returns:
-        Jacobian (m, 6) of the frame's brightness at the projected cells with respect to an increment [rotation,
-        translation] of the pose in camera axes, with depth from the mosaic; the same Jacobian with depth from the
-        frame; residuals (m,); number of the image block of each residual (m,); and a mask (n,) of the m cells that are
-        used.
+        Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the depth
+        from the mosaic and from the frame; residuals (m,) and their image blocks; mask (n,) of the m cells used.
     """
     focal, cx, cy = camera
     n, m, (high, wide) = len(points), 0, _BLOCKS
@@ -288,17 +262,13 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
 
 @kernel
 def _normal_equations(jacobian, frame_jacobian, residuals, block):
-    """Computes the normal equations of the increment of the pose, with Huber weights.
+    """Computes the normal equations of the increment of the pose, with Huber weights, from results of `_linearise`.
 
-    The Jacobian with the depth from the frame provides the instrumental variables: its errors are independent of the
-    errors of the depth from the mosaic, which would otherwise bias the solution.
-
-    Args:
-        jacobian, frame_jacobian, residuals, block: results of `_linearise`.
+    The Jacobian with the frame's depth gives instrumental variables, free of the mosaic's depth errors.
 
     Returns:
-        Normal matrix (6, 6), right-hand side (6,), covariance (6, 6) of the right-hand side from its scatter over the
-        blocks of the image, and the robust standard deviation of the residuals. Zeros for fewer than six residuals.
+        Normal matrix, right-hand side, its covariance from the scatter over the image blocks, and the robust standard
+        deviation of the residuals. Zeros for fewer than six residuals.
     """
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     if len(jacobian) < 6:

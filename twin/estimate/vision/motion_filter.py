@@ -17,15 +17,12 @@ _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it
 class MotionFilter:
     """Extended Kalman filter of the pose in a reference camera and of the velocity, with white-noise acceleration.
 
-    The acceleration of a vehicle is limited. Where the image determines a pose well, the filter follows the measured
-    pose; where it does not (few pixels, noise), the pose follows mainly from the velocity estimated over many frames. A
-    measurement that contradicts the prediction is rejected. The model is that of nearly constant velocity (Bar-Shalom,
-    Li & Kirubarajan 2001, Estimation with Applications to Tracking and Navigation, section 6.2.2). Errors of the pose
+    Nearly constant velocity (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2): where the image determines a pose
+    poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. Errors of the pose
     are motions [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
 
-    Attributes:
-        pose: (4, 4) pose of the last frame in the reference camera.
-        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
+    Attributes:     pose: (4, 4) pose of the last frame in the reference camera.     velocity: (6,) twist of the camera
+    in its own axes [rad/s, m/s].
     """
 
     def __init__(self):
@@ -80,16 +77,9 @@ class MotionFilter:
 def _acceleration_cov(interval_s: float) -> Array:
     """Returns the covariance (12, 12) of pose and velocity that unknown accelerations add within an interval.
 
-    The acceleration is white noise, also within the interval (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2). Its
-    density is such that the standard deviation of the change of velocity is `_ACCELERATION` times the interval.
-
-    An acceleration that is constant within the interval (section 6.3.2) would change the velocity by exactly twice the
-    change of position that it causes, divided by the interval. With exactly measured poses, the filter would then
-    reverse the sign of its velocity error at each frame instead of reducing it (an alpha-beta filter with beta = 2), so
-    that small irregular motions would add up.
-
-    Args:
-        interval_s: length of the interval [s].
+    White-noise acceleration (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2), with a standard deviation of the change
+    of velocity of `_ACCELERATION` times the interval. Constant acceleration within the interval (section 6.3.2) would
+    reverse the velocity error at each frame (an alpha-beta filter with beta = 2).
     """
     velocity = np.diag((_ACCELERATION * interval_s) ** 2)
     shared = velocity * (interval_s / 2)

@@ -1,8 +1,6 @@
 """Linearised observation equations of camera motion, in one image and between two stereo pairs (compiled).
 
-Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f, with the principal point (cx, cy) and the focal
-length f [px]. Disparity is also divided by f, so depth = baseline / disparity. The functions are compiled, because a
-keyframe with five links needs 30 least-squares solutions (six iterations per link) with 500 points each.
+Coordinates are normalised: x = (column - cx) / f, y = (row - cy) / f, and disparity / f: depth = baseline / disparity.
 """
 
 from __future__ import annotations
@@ -21,52 +19,31 @@ class PairMeasurements(NamedTuple):
     """Measurements of the same n points in two stereo pairs, a (earlier) and b (later).
 
     In frame-to-frame motion (`f2f`), a is the current image, without measured disparity, and b the reference image.
-
-    Args:
-        a: (n, 3) normalised (x, y, disparity) in pair a.
-        b: (n, 3) normalised (x, y, disparity) in pair b.
-        cov_a: (n, 3, 3) covariance of each point in `a`.
-        cov_b: (n, 3, 3) covariance of each point in `b`.
     """
 
-    a: Array
-    b: Array
-    cov_a: Array
-    cov_b: Array
+    a: Array  #: (n, 3) normalised (x, y, disparity) in pair a
+    b: Array  #: (n, 3) normalised (x, y, disparity) in pair b
+    cov_a: Array  #: (n, 3, 3) covariance of each point in `a`
+    cov_b: Array  #: (n, 3, 3) covariance of each point in `b`
 
 
 class LinearisedObservations(NamedTuple):
-    """Observation equations of n points in two stereo pairs, linearised at a motion and a structure.
+    """Observation equations of n points in two stereo pairs, linearised at a motion and a structure."""
 
-    Args:
-        residual: (n, 3) measurements in a, minus their linearised prediction from the measurements in b.
-        jacobian_point: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b.
-        jacobian_motion: (n, 3, p) derivative of the prediction with respect to the p unknowns: the increment of the
-            motion a_from_b, a twist in the axes of b (p = 6), and the amplitude of pixel locking if that is estimated
-            too (p = 7).
-        information: (n, 3, 3) inverse covariance of the residual.
-        normalised_residual: (n,) Mahalanobis distance of the residual, divided by sqrt(3).
-    """
-
-    residual: Array
-    jacobian_point: Array
+    residual: Array  #: (n, 3) measurements in a, minus their linearised prediction from the measurements in b
+    jacobian_point: Array  #: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b
+    #: (n, 3, p) derivative of the prediction with respect to the p unknowns: the increment of the motion a_from_b, a
+    #: twist in the axes of b (p = 6), and the amplitude of pixel locking if that is estimated too (p = 7).
     jacobian_motion: Array
-    information: Array
-    normalised_residual: Array
+    information: Array  #: (n, 3, 3) inverse covariance of the residual
+    normalised_residual: Array  #: (n,) Mahalanobis distance of the residual, divided by sqrt(3)
 
 
 @kernel
 def image_jacobian(x, y, depth):
-    """Returns the Jacobian of normalised image positions with respect to the twist of the camera [w, t] (rad, m).
+    """Returns the Jacobian (n, 2, 6) of normalised image positions with respect to the twist of the camera (rad, m).
 
-    This is eq. 1 of Negahdaripour & Madjidi 2003.
-
-    Args:
-        x, y: (n,) normalised image coordinates.
-        depth: (n,) depth [m].
-
-    Returns:
-        (n, 2, 6) Jacobian.
+    This is eq. 1 of Negahdaripour & Madjidi 2003; x, y and depth [m] are (n,).
     """
     jacobian = np.empty((len(x), 2, 6))
     for i in range(len(x)):
@@ -103,7 +80,6 @@ def transfer(points_b, a_from_b, baseline):
     Args:
         points_b: (n, 3) normalised (x, y, disparity) in b.
         a_from_b: (4, 4) pose of b in a.
-        baseline: baseline of the rig [m].
 
     Returns:
         (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an
@@ -143,10 +119,8 @@ def linearise(measured, structure, a_from_b, baseline):
     """Returns the `LinearisedObservations` of two stereo pairs.
 
     Args:
-        measured: `PairMeasurements`.
         structure: (n, 3) points in b at which to linearise, normalised (x, y, disparity).
         a_from_b: (4, 4) motion at which to linearise.
-        baseline: baseline of the rig [m].
     """
     predicted, jacobian_point, jacobian_motion = transfer(structure, a_from_b, baseline)
     a, b, cov_a, cov_b = measured.a, measured.b, measured.cov_a, measured.cov_b
@@ -190,7 +164,6 @@ def motion_normal_equations(observations, weight):
     """Returns the normal equations of the unknowns of the motion, with the structure eliminated.
 
     Args:
-        observations: `LinearisedObservations`.
         weight: (n,) robust weights; points of weight 0 are skipped.
 
     Returns:
@@ -228,7 +201,6 @@ def adjust_structure(observations, measured, update):
     Disparities are at least 1e-4, so that the points stay in front of the camera.
 
     Args:
-        observations: `LinearisedObservations`.
         measured: `PairMeasurements` from which `observations` were computed.
         update: (p,) solution of the normal equations.
     """

@@ -24,15 +24,10 @@ SEARCH_PX = 8.0  #: largest error of a predicted image position from which a poi
 
 
 class MatchedPair(NamedTuple):
-    """Points that were matched in the stereo pairs of two nodes, n of them.
+    """Points that were matched in the stereo pairs of two nodes, n of them."""
 
-    Args:
-        measured: measurements of the points in the earlier pair a and in the later pair b.
-        locking: derivatives of the measurements with respect to the amplitude of pixel locking.
-    """
-
-    measured: PairMeasurements
-    locking: PixelLocking
+    measured: PairMeasurements  #: measurements of the points in the earlier pair a and in the later pair b
+    locking: PixelLocking  #: derivatives of the measurements with respect to the amplitude of pixel locking
 
 
 class PairMatcher:
@@ -80,12 +75,6 @@ class PairMatcher:
 
         Matching starts at positions predicted from the poses and the depth. Each patch is warped according to a plane
         fitted to the disparities around its point.
-
-        Args:
-            node: node whose points are matched.
-            points: its stereo points.
-            templates: patches around the points, per pyramid level.
-            other: the other node.
         """
         rig = self.rig
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera

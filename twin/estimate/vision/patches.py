@@ -1,25 +1,10 @@
 """Registration of small image patches between images, to a few thousandths of a pixel.
 
-Systematic errors of patch matching, measured against the simulated truth, and their remedies here:
-
-- A patch on a slanted surface appears sheared in the other image. A square window there covers a different part of
-  the floor, with different relief, which biased the motion between legs by 0.4 mrad with patches of 21 px. Each patch
-  is therefore warped according to the plane that stereo measures around its point, so that it covers the same part of
-  the floor in all images.
-- The lamps move with the vehicle, so the illumination of a point changes between images. If the change varies across
-  the patch, the match is shifted by about the squared correlation length of the texture times the gradient of the
-  change (0.01 px on a lamp-lit reef, with the same sign at every step). Linear gradients of brightness and of contrast
-  over the patch are therefore estimated as nuisance parameters.
-- Interpolation biases the sub-pixel position: by 0.014 px with cubic convolution on a rendered reef. With cubic
-  B-splines the bias is 0.0055 px for texture wavelengths of 2.5 px or more, and 0.004 px on slightly smoothed images
-  (`matching.gray`).
-- Local normalisation (`matching.normalise`) depends on the position in the image. Near the border, where its window is
-  cut off, the matching error over coarse texture was 0.015 px, which tilted each leg by 0.3 to 0.6 mrad relative to the
-  next. Grey levels are therefore matched without normalisation; the nuisance parameters account for differences of
-  brightness and contrast.
-
-Matching is inverse compositional Gauss-Newton with nuisance parameters projected out (Baker & Matthews 2004), from
-coarse to fine pyramid levels, with cubic B-spline interpolation (Unser 1999).
+Inverse compositional Gauss-Newton, coarse to fine (Baker & Matthews 2004), with cubic B-splines (Unser 1999). Remedies
+of systematic errors: each patch is warped by the plane that stereo measures around its point (unwarped, slopes bias the
+rotation between legs by 0.4 mrad); gradients of brightness and contrast are nuisance parameters that are projected out,
+because the lamps move (0.01 px); B-splines halve the bias of cubic convolution (0.014 px); grey levels are not
+normalised locally (0.015 px near the border).
 """
 
 from __future__ import annotations
@@ -50,38 +35,27 @@ _NUISANCES = 6  # brightness, contrast, and the linear gradients of both in colu
 
 
 class PatchTemplates(NamedTuple):
-    """Patches of one image at one pyramid level, prepared for matching: n patches of m pixels each.
+    """Patches of one image at one pyramid level, prepared for matching: n patches of m pixels each."""
 
-    Args:
-        half: half side of a patch, (side - 1) / 2 [px].
-        offset: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
-        energy: (n,) sum of squared deviations of the grey levels from the patch's mean; 0 if the patch cannot be
-            matched, because it is too uniform, or not inside the image with a margin of one pixel.
-        gradient: (n, 2, m) image gradient, with the nuisance parameters projected out.
-        nuisance: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients
-            of both with respect to column and row.
-    """
-
-    half: int
+    half: int  #: half side of a patch, (side - 1) / 2 [px]
+    #: (n, 2) patch centre, rounded to a pixel of its pyramid level, minus the point [px of the full image].
     offset: Array
+    #: (n,) sum of squared deviations of the grey levels from the patch's mean; 0 if the patch cannot be matched,
+    #: because it is too uniform, or not inside the image with a margin of one pixel.
     energy: Array
-    gradient: NDArray[np.float32]
+    gradient: NDArray[np.float32]  #: (n, 2, m) image gradient, with the nuisance parameters projected out
+    #: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients of both
+    #: with respect to column and row.
     nuisance: NDArray[np.float32]
 
 
 class PatchMatches(NamedTuple):
-    """Positions of n patches in a target image.
+    """Positions of n patches in a target image."""
 
-    Args:
-        points: (n, 2) positions in the target [px].
-        ok: (n,) bool, true if the match converged and its correlation with the template is above 0.7.
-        cov: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the
-            noise of both, in the pixels and axes of the source image [px^2]; estimated from the texture and the
-            residuals.
-    """
-
-    points: Array
-    ok: NDArray[np.bool_]
+    points: Array  #: (n, 2) positions in the target [px]
+    ok: NDArray[np.bool_]  #: (n,) bool, true if the match converged and its correlation with the template is above 0.7
+    #: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the noise of
+    #: both, in the pixels and axes of the source image [px^2]; estimated from the texture and the residuals.
     cov: Array
 
 
@@ -97,7 +71,6 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
     """Extracts the patches around points, at every level of a pyramid.
 
     Args:
-        images: pyramid of the source image.
         points: (n, 2) patch centres in the full image, at whole pixels.
         patch_px: side of the patch (odd), the same at every level.
 
@@ -167,7 +140,6 @@ def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floati
 
 @kernel
 def _slope(disparity, points, half):
-    """Compiled kernel of `disparity_slope`."""
     out = np.zeros((len(points), 2))
     for k in range(len(points)):
         u0, v0 = points[k]
@@ -207,10 +179,7 @@ def _slope(disparity, points, half):
 
 @kernel
 def _extract(source, centres, half):
-    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches at `centres` (n, 2) [px].
-
-    See `PatchTemplates`; gradient and basis are undefined where the energy is 0.
-    """
+    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches, see `PatchTemplates`."""
     count, m = len(centres), (2 * half + 1) ** 2
     energy = np.zeros(count)
     gradient, nuisance = np.empty((count, 2, m), np.float32), np.empty((count, _NUISANCES, m), np.float32)
@@ -227,10 +196,8 @@ def _extract(source, centres, half):
 
 @kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _prepare(source, u0, v0, half, rows):
-    """Prepares a patch of m pixels for matching: writes its nuisance basis and projected gradient to `rows` (8, m).
-
-    By Gram-Schmidt orthogonalisation, rows 0 to 5, the basis of the nuisance parameters (`PatchTemplates`), are
-    orthonormal, and rows 6 and 7, the gradients in column and in row, are orthogonal to them.
+    """Writes the nuisance basis (rows 0 to 5, orthonormal) and projected gradient (6 and 7) of a patch to `rows` (8,
+    m).
 
     Returns:
         The sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
@@ -282,12 +249,9 @@ def _dot(a, b):
 
 @kernel(forceinline=True, fastmath=True)
 def _sample(spline, u0, v0, warp, half, values):
-    """Writes the values of the target's cubic B-spline at the m pixels of a warped patch to `values` (m,).
+    """Writes the target's cubic B-spline at the m pixels of a warped patch, centred at (u0, v0), to `values` (m,).
 
-    The centre of the patch is at column u0 and row v0 of the target.
-
-    For speed, positions relative to the centre are in single precision, and unsigned indices avoid a check for
-    negative values.
+    For speed, relative positions are in single precision, and unsigned indices avoid a check for negative values.
     """
     side, width = 2 * half + 1, spline.shape[1]
     flat = spline.ravel()
@@ -322,14 +286,7 @@ def _sample(spline, u0, v0, warp, half, values):
 
 @kernel(fastmath=_REASSOCIATE)
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
-    """Matches patches at one pyramid level.
-
-    Args:
-        energies, gradients, nuisances, half: see `PatchTemplates`.
-        spline: spline coefficients of the target at this level.
-        guess: (n, 2) expected positions [px of this level].
-        warps: (n, 2, 2) derivative of target pixels with respect to source pixels.
-        tolerance: the iteration ends at a step whose absolute column and row components sum to less [px of this level].
+    """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`.
 
     Returns:
         Positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where matching failed.

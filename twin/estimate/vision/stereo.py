@@ -19,28 +19,19 @@ _MIN_ROW_DIFFERENCES = 30  # with fewer points, the scatter of their row differe
 
 
 class StereoPoints(NamedTuple):
-    """Matched points of one stereo pair.
+    """Matched points of one stereo pair."""
 
-    Args:
-        pixels: (n, 2) whole pixels in the left image.
-        disparity_slope: (n, 2) gradient of the disparity at each point with respect to column and row [px/px].
-        mean_disparity_px: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of
-            the point and is used to predict whether the point lies inside another image.
-        measured: (n, 3) normalised (x, y, disparity), with x and y in the left image.
-        cov: (n, 3, 3) covariance of each point in `measured`.
-        xyz: (n, 3) positions in the axes of the left camera [m].
-        row_difference_px: (n,) row in the right image minus row in the left image [px].
-        noise_ratio: ratio of the measured to the expected standard deviation of the row differences
-            (`row_noise_ratio`); `cov` was computed with matching noise that is larger by this factor.
-    """
-
-    pixels: NDArray[np.float32]
-    disparity_slope: Array
+    pixels: NDArray[np.float32]  #: (n, 2) whole pixels in the left image
+    disparity_slope: Array  #: (n, 2) gradient of the disparity at each point with respect to column and row [px/px]
+    #: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of the point and is
+    #: used to predict whether the point lies inside another image.
     mean_disparity_px: Array
-    measured: Array
-    cov: Array
-    xyz: Array
-    row_difference_px: Array
+    measured: Array  #: (n, 3) normalised (x, y, disparity), with x and y in the left image
+    cov: Array  #: (n, 3, 3) covariance of each point in `measured`
+    xyz: Array  #: (n, 3) positions in the axes of the left camera [m]
+    row_difference_px: Array  #: (n,) row in the right image minus row in the left image [px]
+    #: ratio of the measured to the expected standard deviation of the row differences (`row_noise_ratio`); `cov` was
+    #: computed with matching noise that is larger by this factor.
     noise_ratio: float = 1.0
 
     def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
@@ -55,14 +46,12 @@ class StereoPoints(NamedTuple):
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
     """Returns (x, y, disparity) of points and their covariance from their positions in both images of a rectified pair.
 
-    The left column determines x and is also part of the disparity, so x and disparity are correlated. The rows of both
-    positions must be equal; this constraint is applied as a Kalman update, which also corrects the columns if the
-    errors of column and row are correlated.
+    The left column is in both x and disparity, so they are correlated. Equal rows are enforced by a Kalman update,
+    which also corrects the columns if the errors of column and row are correlated.
 
     Args:
         left, right: (n, 2) positions in the left and in the right image [px].
         cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
-        rig: calibration, with square pixels.
 
     Returns:
         (n, 3) normalised (x, y, disparity) and (n, 3, 3) covariance.
@@ -86,7 +75,6 @@ def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> 
     Args:
         left, right: (n, 2) shifts of the positions in the left and in the right image [px].
         fused_cov: (n, 3, 3) covariance returned by `fuse`.
-        rig: calibration, with square pixels.
     """
     slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
     x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half
@@ -96,10 +84,9 @@ def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> 
 def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
     """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1.
 
-    A point has the same row in both images of a rectified pair, so the row differences of a stereo pair measure the
-    matching noise. Their median, which calibration errors cause, is subtracted first; the ratio is then 1.4826 times
-    the median of the absolute differences divided by their expected standard deviations. The result is 1 for fewer than
-    30 points, and for a ratio that does not exceed 1 by two standard errors of 1.17 / sqrt(n).
+    Row differences of a stereo pair, minus their median (calibration errors), measure the matching noise. The ratio is
+    1.4826 times the median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors
+    of 1.17 / sqrt(n).
 
     Args:
         left, right: (n, 2) positions of the patches in the left and in the right image [px].
@@ -129,16 +116,9 @@ def margin_px(patch_px: int) -> int:
 
 
 def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the patches that are far enough inside the image to stay there despite matching errors.
+    """Returns a mask (n,) of the patches, predicted at `pixels` (n, 2), that stay inside despite matching errors.
 
-    The predicted positions must be independent of the matching errors. A test of the measured positions would prefer
-    matches whose errors point away from the border: over coarse texture, with matching errors of 0.1 to 0.2 px,
-    this biased disparities near the border by -0.02 px and links over two keyframes by 0.16 mrad.
-
-    Args:
-        pixels: (n, 2) predicted patch centres [px].
-        rig: calibration, for the image size.
-        patch_px: side of the patch.
+    Measured positions would prefer errors that point away from the border (-0.02 px of disparity over coarse texture).
     """
     return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
@@ -151,7 +131,6 @@ def corners_with_disparity(
     Args:
         left: (H, W) grey levels.
         dense_px: (H, W) disparity [px], NaN where unknown.
-        count: largest number of corners.
         patch_px: side of the patches, which lie inside the image [px].
     """
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
@@ -174,7 +153,6 @@ def match_stereo_points(
         left, right: (height, width) grey levels (`matching.gray`).
         dense_px: (height, width) initial disparity, NaN where unknown [px].
         rig: calibration at the scale of the images, with square pixels.
-        count: largest number of corners.
         patch_px: side of the matched patches (odd).
     """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
@@ -198,9 +176,7 @@ def match_stereo_points(
 def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching.Gray) -> NDArray[np.float32]:
     """Returns disparities (H, W) [px] for the slopes of patches: refined ones, or the initial ones where that fails.
 
-    Slopes from semi-global matching are 8 to 12 % too small over coarse texture, because it prefers constant
-    disparities. A patch that is warped by a wrong slope covers another part of the floor in the other images, which
-    biased the rotation of links by 0.17 mrad per metre of displacement.
+    Semi-global matching makes slopes 8 to 12 % too small over coarse texture, which biased the rotation of links.
     """
     refined = epipolar.refine(left, right, dense_px, epipolar.STEREO).disparity_px
     return np.where(np.isfinite(refined), refined, dense_px)

@@ -71,7 +71,6 @@ class TiledRaster:
         return self._tiles[key]
 
     def _spool(self, key: tuple[int, int], tile: Layers) -> None:
-        """Writes a tile to disk."""
         self.folder.mkdir(parents=True, exist_ok=True)
         np.save(self._path(key), tile)
         self._spooled.add(key)
@@ -83,10 +82,7 @@ class TiledRaster:
 def _overlapping_tiles(
     row: int, col: int, rows: int, cols: int
 ) -> Iterator[tuple[tuple[int, int], tuple[slice, ...], tuple[slice, ...]]]:
-    """Yields the key of each tile that overlaps a window, and the overlap as slices of the tile and of the window.
-
-    The key is (row // `TILE_SIDE`, column // `TILE_SIDE`) of the cells of the tile.
-    """
+    """Yields key (row // `TILE_SIDE`, col // `TILE_SIDE`) and overlap (slices of tile and window) of each tile."""
     for i in range(row // TILE_SIDE, -(-(row + rows) // TILE_SIDE)):
         for j in range(col // TILE_SIDE, -(-(col + cols) // TILE_SIDE)):
             top, left = max(row, i * TILE_SIDE), max(col, j * TILE_SIDE)

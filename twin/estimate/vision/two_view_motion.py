@@ -34,49 +34,38 @@ _MEDIAN_NORMALISED = {2: 0.680, 3: 0.888}  # sqrt(median of chi2 / 3) by degrees
 
 
 class Motion(NamedTuple):
-    """An estimated motion.
+    """An estimated motion."""
 
-    Args:
-        a_from_b: (4, 4) pose of the later camera b in the earlier camera a.
-        cov: (6, 6) covariance of the motion [rotation, translation] (rad, m), in the axes of b.
-        n_points: number of inliers.
-        residual: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), divided by its
-            expected value (`pair_motion`), or in grey levels (`mosaic`); infinite for a predicted motion.
-        closed_form: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started;
-            None if it started from another motion.
-        disparity_offset: offset of all disparities, estimated from the points of two stereo pairs (`pair_motion`); None
-            if it is not estimated.
-    """
-
-    a_from_b: Array
-    cov: Array
-    n_points: int
+    a_from_b: Array  #: (4, 4) pose of the later camera b in the earlier camera a
+    cov: Array  #: (6, 6) covariance of the motion [rotation, translation] (rad, m), in the axes of b
+    n_points: int  #: number of inliers
+    #: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), divided by its expected
+    #: value (`pair_motion`), or in grey levels (`mosaic`); infinite for a predicted motion.
     residual: float
+    #: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started; None if it
+    #: started from another motion.
     closed_form: Array | None = None
+    #: offset of all disparities, estimated from the points of two stereo pairs (`pair_motion`); None if it is not
+    #: estimated.
     disparity_offset: DisparityOffset | None = None
 
 
 class PairMotionSettings(NamedTuple):
-    """Stochastic model and number of iterations of `pair_motion`.
+    """Stochastic model and number of iterations of `pair_motion`."""
 
-    Args:
-        common_sigma: standard deviation of the biases of x, y and disparity, each of which is the same at all points;
-            normalised. Their effect does not average out over the points.
-        variance_inflation: factor on the covariance for correlated points (`matching.variance_inflation`).
-        n_measured: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has
-            a large variance in `PairMeasurements.cov_a`.
-        iterations: number of Gauss-Newton iterations.
-        locking: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated
-            with the motion; None: the amplitude is not estimated.
-        measured_scatter: whether the covariance of the motion is computed from the residuals of the individual points
-            (`_scatter_cov`), instead of from the covariances of the measurements and a common scale.
-    """
-
+    #: standard deviation of the biases of x, y and disparity, each of which is the same at all points; normalised.
+    #: Their effect does not average out over the points.
     common_sigma: float = 0.0
-    variance_inflation: float = 1.0
+    variance_inflation: float = 1.0  #: factor on the covariance for correlated points (`matching.variance_inflation`)
+    #: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has a large
+    #: variance in `PairMeasurements.cov_a`.
     n_measured: int = 3
-    iterations: int = 6
+    iterations: int = 6  #: number of Gauss-Newton iterations
+    #: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated with the
+    #: motion; None: the amplitude is not estimated.
     locking: PixelLocking | None = None
+    #: whether the covariance of the motion is computed from the residuals of the individual points (`_scatter_cov`),
+    #: instead of from the covariances of the measurements and a common scale.
     measured_scatter: bool = False
 
 
@@ -108,7 +97,6 @@ def frame_motion(points: Array, observed: Array, guess: Array, iterations: int =
         points: (n, 3) positions in the earlier camera [m].
         observed: (n, 2) normalised coordinates in the later image.
         guess: (4, 4) initial pose of the later camera in the earlier one.
-        iterations: number of Gauss-Newton iterations.
 
     Returns:
         The motion, or None if there are too few points or inliers, or a point is behind the later camera.
@@ -140,7 +128,6 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
-        baseline_m: baseline of the rig [m].
         guess: (4, 4) initial pose of b in a.
 
     Returns:
@@ -161,25 +148,20 @@ def pair_motion(
 ) -> Motion | None:
     """Estimates the motion between two stereo pairs jointly with the structure, which avoids errors-in-variables bias.
 
-    Both pairs measure each point as z = (x, y, disparity) with covariance C; the true point in b is unknown. Let g be
-    the transfer of a point from b to a by the motion. With e = z_a - g(z_b) and G = dg/dz_b, the structure is
-    eliminated: the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed adjustment
-    model, Mikhail 1976, as in eqs. 6 and 7 of Negahdaripour & Madjidi 2003). The points have Huber weights, which are 0
-    beyond `CUTOFF` standard deviations.
+    Each pair measures z = (x, y, disparity) with covariance C; g transfers a point from b to a. With e = z_a - g(z_b)
+    and G = dg/dz_b, the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed
+    adjustment model, Mikhail 1976; eqs. 6 and 7 of Negahdaripour & Madjidi 2003), with Huber weights that are 0 beyond
+    `CUTOFF`.
 
-    If the estimated amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), the motion is
-    estimated without it. This happens over a level floor, where all points have nearly the same sub-pixel position: a
-    sine of amplitude 1 / (2 pi) px, whose slope is 1, then explains the noise of all measurements.
+    If the amplitude of pixel locking is not plausible (`pixel_locking.MAX_AMPLITUDE_PX`), as over a level floor where
+    all points have nearly the same sub-pixel position, the motion is estimated without it.
 
     Args:
         measured: points in the earlier pair a and the later pair b.
-        baseline_m: baseline of the rig [m].
         guess: (4, 4) initial pose of b in a.
-        settings: stochastic model and number of iterations.
 
     Returns:
-        The motion, with its residual relative to the expected standard deviation (1 = as expected), or None if there
-        are too few points or inliers.
+        The motion, with its residual relative to the expected standard deviation; None if too few points or inliers.
     """
     if len(measured.a) < _MIN_POINTS:
         return None
@@ -205,34 +187,21 @@ def pair_motion(
 
 
 class _WeightedNormals(NamedTuple):
-    """Normal equations of `pair_motion` at one iteration, for p unknowns.
+    """Normal equations of `pair_motion` at one iteration, for p unknowns."""
 
-    Args:
-        observations: linearised observations of n points.
-        weight: (n,) robust weights.
-        scale: robust standard deviation of the residuals, divided by the expected one.
-        normal: (p, p) normal matrix, `prior` included.
-        prior: (p, p) prior information.
-        right: (p,) right-hand side.
-        bias_jacobian: (p, 3) derivative of `right` with respect to the common biases of x, y and disparity.
-    """
-
-    observations: LinearisedObservations
-    weight: Array
-    scale: float
-    normal: Array
-    prior: Array
-    right: Array
-    bias_jacobian: Array
+    observations: LinearisedObservations  #: linearised observations of n points
+    weight: Array  #: (n,) robust weights
+    scale: float  #: robust standard deviation of the residuals, divided by the expected one
+    normal: Array  #: (p, p) normal matrix, `prior` included
+    prior: Array  #: (p, p) prior information
+    right: Array  #: (p,) right-hand side
+    bias_jacobian: Array  #: (p, 3) derivative of `right` with respect to the common biases of x, y and disparity
 
 
 def _with_locking(
     observations: LinearisedObservations, locking: PixelLocking, amplitude_px: float
 ) -> LinearisedObservations:
-    """Returns the observations with the amplitude of pixel locking as seventh unknown, linearised at `amplitude_px`.
-
-    The residuals are reduced by the effect of this amplitude.
-    """
+    """Returns the observations with pixel locking as seventh unknown, linearised and reduced at `amplitude_px`."""
     moved = np.einsum("nij,nj->ni", observations.jacobian_point, locking.b)
     derivative = locking.a - moved  # of the predicted measurements with respect to the amplitude
     residual = observations.residual - derivative * amplitude_px
@@ -296,19 +265,11 @@ def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -
 def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:
     """Returns the covariance (p, p) of the unknowns from the residuals of the individual points.
 
-    It is the sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, Robust Statistics, section
-    7.6; White 1980). S is the sum of the outer products of the points' scores w J' C^-1 e, with w the weight of a
-    point, J its Jacobian and C the covariance of its residual e. S therefore includes errors that C does not account
-    for, such as those at relief and occlusions. M is the normal matrix times the mean derivative of the Huber function:
-    a point in the linear part of this function contributes its weight times (k - 1) / k, the mean over the k measured
-    coordinates of its residual. S is scaled by k n / (k n - p) for n points and p unknowns. Because few points
-    determine S poorly, it is averaged with its expectation for covariances C times a common factor; the expectation
-    counts as 50 points. The prior information is added to M; multiplied by the squared scale of the residuals, it is
-    added to S.
-
-    Args:
-        normals: normal equations at the last iteration.
-        n_measured: number of measured coordinates k per point in pair a: 3, or 2 without disparity.
+    Sandwich covariance of an M-estimator, M^-1 S M^-1 (Huber & Ronchetti 2009, section 7.6; White 1980). S sums the
+    outer products of the scores w J' C^-1 e and so includes errors that C does not (relief, occlusions). M is the
+    normal matrix times the mean derivative of the Huber function, (k - 1) / k in its linear part for k measured
+    coordinates. S is scaled by k n / (k n - p) and averaged with its expectation for C times a common factor, which
+    counts as 50 points. Prior information is added to M and, times the squared scale, to S.
     """
     observations, weight, scale = normals.observations, normals.weight, normals.scale
     size, n, p = observations.normalised_residual, int(np.count_nonzero(weight)), len(normals.normal)

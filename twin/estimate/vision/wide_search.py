@@ -27,16 +27,12 @@ _CHI2 = chi2.ppf(0.9999, 6)  # largest chi-square of the difference between a me
 
 
 def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig) -> bool:
-    """Returns whether the predicted image positions of the points may be wrong by more than a search range.
+    """Returns whether the predicted image positions of the points may be wrong by more than a search range [px].
 
-    This is so if three times the median standard deviation of the positions, along the direction in which it is
-    largest, exceeds the range.
+    That is, if three times the median standard deviation of the positions, along its largest direction, exceeds it.
 
     Args:
-        range_px: largest error of a predicted position from which it is found [px].
-        points: stereo points of the node.
         cov: (6, 6) covariance of the predicted motion [rotation, translation] (rad, m), in the axes of the node.
-        rig: calibration at the scale of the image.
     """
     x, y, disparity = np.ascontiguousarray(points.measured.T)
     depth_m = rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX / rig.focal_px)
@@ -67,17 +63,12 @@ def coarse_motion(
 ) -> Array | None:
     """Returns the pose (4, 4) of the left camera of a node in that of another node; None if too few features agree.
 
-    SIFT features (Lowe 2004) of the left images are matched by their descriptors. The depth of a feature of the node
-    follows from the nearest matched stereo point at a distance of up to one patch side; features without such a point
-    are left out. The pose is computed from the 3-D features and their pixels in the other image (perspective-n-point
-    with RANSAC). Its error displaces points by one or two pixels, so it serves as a prediction for the measurement of a
-    link.
+    SIFT features (Lowe 2004) get their depth from the nearest stereo point within one patch side; the pose is that of
+    perspective-n-point with RANSAC. Its error of one or two pixels suffices to predict the measurement of a link.
 
     Args:
         node, other: (H, W) grey levels of the left images.
-        points: matched stereo points of the node.
-        rig: calibration at the scale of the images.
-        patch_px: side of the patches, the largest distance of a feature from a stereo point [px].
+        patch_px: largest distance of a feature from a stereo point [px].
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
     node_px, node_descriptors = _features(sift, node)
@@ -114,16 +105,7 @@ def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64]
 
 
 def _at_features(points: StereoPoints, nearest: NDArray[np.int64], pixels: Array, rig: StereoRig) -> Array:
-    """Returns the positions (n, 3) [m] of features at `pixels` (n, 2), in the axes of the left camera.
-
-    The disparity of a feature is extrapolated linearly from a stereo point, with the slope of the disparity there.
-
-    Args:
-        points: stereo points.
-        nearest: (n,) index of the nearest stereo point of each feature.
-        pixels: (n, 2) positions of the features [px].
-        rig: calibration at the scale of the image.
-    """
+    """Returns the positions (n, 3) [m] of features; disparity is extrapolated from the `nearest` (n,) stereo points."""
     offset_px = pixels - points.pixels[nearest]
     disparity = points.measured[nearest, 2] * rig.focal_px + (points.disparity_slope[nearest] * offset_px).sum(axis=1)
     depth_m = rig.focal_px * rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX)
