@@ -9,13 +9,46 @@ from evo.core.trajectory import PosePath3D
 from twin.core import geometry
 from twin.core.links import Link
 from twin.estimate.adjustment import block_cholesky, chordal, pose_graph
-from twin.exchange import posegraph
 
 
 @pytest.fixture
 def public_graph(outside_data):
     """Returns a function that reads the links of a public pose graph."""
-    return lambda name: posegraph.read(outside_data(name)).links
+    return lambda name: read_links(outside_data(name))
+
+
+def read_links(file):
+    """Returns the edges of a file in g2o or TORO format.
+
+    The values of an edge are a position, a quaternion (x, y, z, w) or roll, pitch and yaw, and the upper triangle of
+    the information matrix of [position, rotation vector] or of [position, roll, pitch, yaw].
+    """
+    links, order = [], [3, 4, 5, 0, 1, 2]
+    for tag, i, j, *words in (line.split() for line in file.read_text().splitlines()):
+        if tag not in ("EDGE_SE3:QUAT", "EDGE3"):
+            continue
+        values, information, jacobian = np.array(words, float), np.zeros((6, 6)), np.eye(6)
+        information[np.triu_indices(6)] = values[-21:]
+        information += np.triu(information, 1).T
+        if tag == "EDGE3":
+            rotation = geometry.rotation_from_rpy(*values[3:6])
+            jacobian[3:, 3:] = vector_from_angles(*values[3:5])
+        else:
+            rotation = geometry.rotation_from_wxyz(values[[6, 3, 4, 5]])
+        cov = jacobian @ np.linalg.inv(information) @ jacobian.T
+        links.append(Link(int(i), int(j), geometry.pose(rotation, values[:3]), cov[np.ix_(order, order)], np.nan, 0))
+    return links
+
+
+def vector_from_angles(roll, pitch):
+    """Returns the derivative (3, 3) of the rotation vector in body axes with respect to roll, pitch and yaw."""
+    return np.array(
+        [
+            [1.0, 0.0, -np.sin(pitch)],
+            [0.0, np.cos(roll), np.sin(roll) * np.cos(pitch)],
+            [0.0, -np.sin(roll), np.cos(roll) * np.cos(pitch)],
+        ]
+    )
 
 
 def with_quaternion_information(link):
