@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from twin.errors import TwinError
 
@@ -10,6 +11,11 @@ from twin.errors import TwinError
 MIN_INLIER_SHARE = 0.3
 #: Standard deviation of the interpolation bias, an error common to all points of a link [px].
 COMMON_BIAS_PX = 0.005
+
+
+def _key(default: Any, description: str, **limits: float) -> Any:
+    """Returns a setting that is also a scenario key, with limits in pydantic's terms (ge and le, or gt and lt)."""
+    return field(default=default, metadata={"description": description, **limits})
 
 
 @dataclass(frozen=True)
@@ -20,23 +26,21 @@ class EstimatorSettings:
         TwinError: a value is out of range.
     """
 
-    #: number of previous tracks that the global alignment at the end of a track adjusts, in addition to this track.
-    window_tracks: int = 4
-    node_stride: int = 1  #: every n-th keyframe is a node of the network
-    #: smallest predicted overlap for a link from a node to an earlier one: the fraction of the node's matched points
-    #: that project into the earlier image. The link to the previous node is measured at any overlap.
-    min_overlap: float = 0.45
-    #: largest number of links from a node to earlier nodes with an overlap of at least `min_overlap`.
-    max_links: int = 7
-    use_f2m: bool = True  #: whether to register keyframes with the mosaic (F2M)
-    use_ga: bool = True  #: whether to align the network globally (GA) at the end of each track and of the survey
-    points: int = 500  #: largest number of matched points of a keyframe
-    #: side of the matching window, the same for stereo and for motion [px]. Patches have an odd side: for an even
-    #: value, it is one pixel larger.
-    patch_px: int = 11
+    window_tracks: int = _key(4, "number of previous tracks in the window of global alignment", ge=0, le=1000)
+    node_stride: int = _key(1, "every n-th keyframe is a node of the network", ge=1, le=20)
+    min_overlap: float = _key(
+        0.45, "smallest overlap of linked nodes, the fraction of a node's matched points that both images show; "
+        "consecutive nodes are linked at any overlap", gt=0, lt=1,
+    )  # fmt: skip
+    max_links: int = _key(7, "largest number of links from a node to earlier nodes", ge=1, le=50)
+    use_f2m: bool = _key(True, "register keyframes with the mosaic to correct the position")
+    use_ga: bool = _key(True, "global alignment at the end of each track and of the survey")
+    points: int = _key(500, "largest number of matched points of a keyframe", ge=30, le=5000)
+    #: Patches have an odd side: for an even value, it is one pixel larger.
+    patch_px: int = _key(11, "side of the matching window, the same for stereo and optical flow [px]", ge=7, le=61)
     #: a stereo pair becomes a keyframe if the overlap of the next pair with the last keyframe is expected to be below
     #: this fraction, or if tracking has failed; used only if the caller does not choose the keyframes.
-    keyframe_overlap: float = 0.9
+    keyframe_overlap: float = field(default=0.9, metadata={"gt": 0, "lt": 1})
     #: whether features are matched over the whole images wherever a link cannot be measured from the predicted poses;
     #: for large or unpredictable motions between keyframes. It costs time only where links fail. Otherwise this is done
     #: only where the covariance of the predicted poses exceeds the search range, and a link must agree with this
@@ -46,12 +50,12 @@ class EstimatorSettings:
     noisy_images: bool = True
 
     def __post_init__(self) -> None:
-        for name, low, high in (
-            ("window_tracks", 0, 1000), ("node_stride", 1, 20), ("max_links", 1, 50), ("points", 30, 5000),
-            ("patch_px", 7, 61),
-        ):  # fmt: skip
-            if not low <= getattr(self, name) <= high:
-                raise TwinError(f"estimate.{name}", f"{getattr(self, name)!r} is out of range", f"{low} to {high}")
-        for name in ("min_overlap", "keyframe_overlap"):
-            if not 0 < getattr(self, name) < 1:
-                raise TwinError(f"estimate.{name}", f"{getattr(self, name)!r} is out of range", "between 0 and 1")
+        for setting in fields(self):
+            value, limits = getattr(self, setting.name), setting.metadata
+            allowed = None
+            if "le" in limits and not limits["ge"] <= value <= limits["le"]:
+                allowed = f"{limits['ge']} to {limits['le']}"
+            if "lt" in limits and not limits["gt"] < value < limits["lt"]:
+                allowed = f"between {limits['gt']} and {limits['lt']}"
+            if allowed:
+                raise TwinError(f"estimate.{setting.name}", f"{value!r} is out of range", allowed)

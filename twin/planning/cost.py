@@ -79,7 +79,7 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
             _SURROGATE_S.total(n_frames, n_keyframes, megapixels), _SURROGATE_MB,
             _SURROGATE_DISK_MB.total(n_frames, n_keyframes, megapixels),
         )  # fmt: skip
-    window = n_keyframes * min(1.0, (mission.scenario.estimate.window_tracks + 1) / len(mission.tracks))
+    window = n_keyframes * min(1.0, (mission.scenario.estimator_settings().window_tracks + 1) / len(mission.tracks))
     texels = mission.terrain.texture.size / 3
     floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels + _mesh_mb(mission) + _walls_mb(mission)
     return ComputingCost(

@@ -63,12 +63,12 @@ _CAPTION = (
 
 
 def _text(survey: TankSurvey) -> str:
-    rig, n = survey.mission.rig, len(survey.path.planned_m)
+    rig, n, settings = survey.mission.rig, len(survey.path.planned_m), survey.mission.scenario.estimator_settings()
     ended = f" The final alignment is missing: {survey.ended}." if survey.ended else ""
     return (
         f"{n} stereo pairs of {rig.width_px} x {rig.height_px} pixels, 5 cm apart, 1.52 m (5 ft) above the floor of a "
         "tank; the track bends by 12 mm and jitters by 1 mm and 0.1 deg on each axis. Each pair is connected to up to "
-        f"{survey.mission.scenario.estimate.max_links} earlier ones with an overlap of 70 %, and all pairs are aligned "
+        f"{settings.max_links} earlier ones with an overlap of 70 %, and all pairs are aligned "
         "together. The estimators start at the planned pose of the first pair; paths and heights are compared after "
         "the motion that maps the first estimated pose to the first true one. The light is uneven: the white PVC pipe "
         "is saturated, a third of the floor lies in the shade. Cells that an object hides in every pair count as "

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Mapping
+from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_type_hints
 
 import numpy as np
 from pydantic import (
@@ -17,6 +18,7 @@ from pydantic import (
     Field,
     PrivateAttr,
     ValidationInfo,
+    create_model,
     field_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -826,43 +828,23 @@ class ControlConfig(Section):
     )  # fmt: skip
 
 
-class EstimateConfig(Section):
-    """Settings of motion estimation, the keyframe network and global alignment (GA)."""
-
+class _EstimatePlugin(Section):
     plugin: str | None = Field(
         default=None, max_length=200, pattern=PLUGIN_NAME,
         description="estimator of another package, which replaces motion estimation, network and alignment: "
         "module:Class, or the name of an entry point twin.estimators; it runs code of that package",
     )  # fmt: skip
-    window_tracks: int = Field(
-        default=EstimatorSettings.window_tracks, ge=0, le=1000,
-        description="number of previous tracks in the window of global alignment",
-    )  # fmt: skip
-    node_stride: int = Field(
-        default=EstimatorSettings.node_stride, ge=1, le=20, description="every n-th keyframe is a node of the network"
-    )
-    min_overlap: float = Field(
-        default=EstimatorSettings.min_overlap, gt=0, lt=1,
-        description="smallest overlap of linked nodes, the fraction of a node's matched points that both images show; "
-        "consecutive nodes are linked at any overlap",
-    )  # fmt: skip
-    max_links: int = Field(
-        default=EstimatorSettings.max_links, ge=1, le=50,
-        description="largest number of links from a node to earlier nodes",
-    )  # fmt: skip
-    use_f2m: bool = Field(
-        default=EstimatorSettings.use_f2m, description="register keyframes with the mosaic to correct the position"
-    )
-    use_ga: bool = Field(
-        default=EstimatorSettings.use_ga, description="global alignment at the end of each track and of the survey"
-    )
-    points: int = Field(
-        default=EstimatorSettings.points, ge=30, le=5000, description="largest number of matched points of a keyframe"
-    )
-    patch_px: int = Field(
-        default=EstimatorSettings.patch_px, ge=7, le=61,
-        description="side of the matching window, the same for stereo and optical flow [px]",
-    )  # fmt: skip
+
+
+def _keys_of_settings() -> dict[str, Any]:
+    """Returns the types and fields of the keys that `EstimatorSettings` defines."""
+    types = get_type_hints(EstimatorSettings)
+    keys = [setting for setting in fields(EstimatorSettings) if "description" in setting.metadata]
+    return {key.name: (types[key.name], Field(default=key.default, **key.metadata)) for key in keys}
+
+
+class EstimateConfig(create_model("EstimateKeys", __base__=_EstimatePlugin, **_keys_of_settings())):
+    """Settings of motion estimation, the keyframe network and global alignment (GA)."""
 
 
 class MapConfig(Section):
