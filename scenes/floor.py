@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.grid_triangles import grid_triangles
+from twin.core.height_field import grid_triangles
 from twin.scenes.gl import MjSpec, mujoco
 from twin.terrains import Terrain
 

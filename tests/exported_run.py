@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import recorded_datasets as recorded
 
-from twin.core.orthomosaic import OrthoTile, finer_grid
+from twin.core.ortho_tiles import OrthoTile, finer_grid
 from twin.core.records import ElevationMap, MapGrid, Readings, Trajectory
 from twin.exchange.geotiff import OrthomosaicFile
 from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RigCalibration, RunContents

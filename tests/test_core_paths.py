@@ -2,7 +2,7 @@
 
 import pytest
 
-from twin.core.paths import path_problem
+from twin.core.user_files import path_problem
 
 
 def test_links_to_themselves_and_to_missing_files_are_problems_and_new_paths_are_not(tmp_path):

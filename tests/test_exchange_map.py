@@ -8,7 +8,7 @@ import rasterio
 import trimesh
 
 from twin.core import geometry
-from twin.core.grid_triangles import grid_triangles, raster_triangles
+from twin.core.height_field import grid_triangles, raster_triangles
 from twin.core.records import ElevationMap, MapGrid
 from twin.errors import TwinError
 from twin.exchange import geotiff, mesh

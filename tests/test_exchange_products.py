@@ -11,7 +11,7 @@ import trimesh
 from exported_run import GRID
 
 from twin.core.georeference import Georeference
-from twin.core.orthomosaic import OrthoTile
+from twin.core.ortho_tiles import OrthoTile
 from twin.core.records import MapGrid
 from twin.exchange import geotiff, textured_mesh
 from twin.exchange.formats import FORMATS

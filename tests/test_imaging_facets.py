@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.core.floor_rays import cast_pixels, height_field
 from twin.core.geometry import Array
+from twin.core.height_field import cast_pixels, height_field
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.scene.facets import UNIT, Facets

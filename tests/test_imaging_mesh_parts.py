@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from twin.core import geometry, row_parallel
+from twin.core import geometry, threads
 from twin.imaging.scene import mesh_raster
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 from twin.imaging.scene.sway import swayed
@@ -200,7 +200,7 @@ def test_the_image_does_not_depend_on_the_number_of_threads(monkeypatch) -> None
     items = [DrawnMesh(MESHES[name], random_views(9)[k], k + 1) for k, name in enumerate(MESHES)]
     drawn = []
     for processors in (1, 2):
-        monkeypatch.setattr(row_parallel, "_n_processors", lambda n=processors: n)
+        monkeypatch.setattr(threads, "_n_processors", lambda n=processors: n)
         drawn.append(images())
         draw_meshes(items, PERSPECTIVE, drawn[-1])
     for one, two in zip(*drawn, strict=True):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.core.floor_rays import height_field
+from twin.core.height_field import height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
 from twin.imaging.light.lamps import LED_BEAM, beam_share

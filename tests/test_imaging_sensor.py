@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from twin.core import geometry, row_parallel
+from twin.core import geometry, threads
 from twin.core.timing import Stopwatch
 from twin.imaging.camera.photo_sensor import sensor_of
 from twin.imaging.camera.sensor import AutoExposure, ExposureSetting, _mean, expose
@@ -55,7 +55,7 @@ def test_noise_does_not_depend_on_the_number_of_threads(monkeypatch, sensor):
     light = np.random.default_rng(0).uniform(0, 60, (130, 90, 3)).astype(np.float32)
     images = []
     for processors in (1, 2):
-        monkeypatch.setattr(row_parallel, "_n_processors", lambda n=processors: n)
+        monkeypatch.setattr(threads, "_n_processors", lambda n=processors: n)
         images.append(sensor_of(scenario).image(light, ExposureSetting(0.01, 0.01, 2.0), np.random.default_rng(1)))
     np.testing.assert_array_equal(*images)
 
@@ -125,7 +125,7 @@ def test_stereo_pairs_do_not_depend_on_the_number_of_processors(monkeypatch, sen
     """To the last bit: with two processors, both images are computed at the same time."""
     pairs = []
     for processors in (1, 2):
-        monkeypatch.setattr(row_parallel, "_n_processors", lambda n=processors: n)
+        monkeypatch.setattr(threads, "_n_processors", lambda n=processors: n)
         pairs.append(captures([True] * 5, sensor, MOVING))
     for one, two in zip(*pairs, strict=True):
         np.testing.assert_array_equal(one.left, two.left)

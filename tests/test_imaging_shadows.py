@@ -10,7 +10,7 @@ import pytest
 
 from twin import terrains
 from twin.core import geometry
-from twin.core.floor_rays import cast_pixels, height_field
+from twin.core.height_field import cast_pixels, height_field
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.light import shadows
 from twin.imaging.light.illumination import illumination_of

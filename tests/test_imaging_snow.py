@@ -280,7 +280,7 @@ def test_drawing_does_not_depend_on_the_number_of_bands(monkeypatch):
     snow, motion = marine_snow(density=200.0), ExposureMotion(np.array([0, 0.2, 0, 0.5, 0.3, 0]), 0.02, 0.01)
     images = []
     for threads in (1, 2):
-        monkeypatch.setattr("twin.core.row_parallel._n_processors", lambda n=threads: n)
+        monkeypatch.setattr("twin.core.threads._n_processors", lambda n=threads: n)
         light = np.zeros((*SHAPE, 3), np.float32)
         snow.draw(light, np.full(SHAPE, 2.0, np.float32), POSE, 0, 0.0, motion)
         images.append(light)

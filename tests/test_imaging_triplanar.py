@@ -233,7 +233,7 @@ def test_the_result_does_not_depend_on_the_number_of_bands(monkeypatch: pytest.M
     assert surface is not None
     results = []
     for processors in (1, 2):
-        monkeypatch.setattr("twin.core.row_parallel._n_processors", lambda n=processors: n)
+        monkeypatch.setattr("twin.core.threads._n_processors", lambda n=processors: n)
         albedo = draped.copy()
         paint_walls(surface, albedo, depth, pose, float(FOCAL_PX))
         results.append(albedo)

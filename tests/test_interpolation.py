@@ -5,7 +5,7 @@ import pytest
 from scipy.interpolate import BSpline
 
 from twin.core import interpolation
-from twin.core.map_slopes import map_slopes
+from twin.core.height_field import map_slopes
 
 ROWS, COLUMNS = np.mgrid[:9, :11].astype(np.float32)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.core.growing_array import GrowingArray
 from twin.core.links import Link, Links
+from twin.core.series import GrowingArray
 
 
 def some_links(n):

@@ -11,7 +11,7 @@ from rasterio.enums import ColorInterp
 from twin import terrains
 from twin.core import geometry
 from twin.core.georeference import Georeference
-from twin.core.orthomosaic import OrthoTile, finer_grid, mean_colours, window
+from twin.core.ortho_tiles import OrthoTile, finer_grid, mean_colours, window
 from twin.core.records import ElevationMap, MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.estimate.mapping import exposure_balance
@@ -244,7 +244,7 @@ def test_a_low_place_elsewhere_takes_no_colour_from_a_tilted_image():
 def test_tiles_join_without_a_trace(monkeypatch):
     images = [image_of(p) for p in POSES]
     whole = made(views(images), flat())
-    monkeypatch.setattr("twin.core.orthomosaic.TILE_PX", 64)
+    monkeypatch.setattr("twin.core.ortho_tiles.TILE_PX", 64)
     tiles = list(estimate.orthomosaic(views(images), flat(), RIG))
     assert len(tiles) == 12 and {tile.row % 7 for tile in tiles} == {0}
     joined = np.zeros_like(whole.rgba)

@@ -8,9 +8,9 @@ import pytest
 from twin import survey
 from twin.controllers.segments import Reference
 from twin.core import geometry
-from twin.core.braking import BLIND_S, BRAKING_S
 from twin.core.quality import ActionTimes
 from twin.core.records import Estimate, Readings
+from twin.core.settings import BLIND_S, BRAKING_S
 from twin.core.timing import Stopwatch
 from twin.estimate.vision.f2f import constant_velocity_motion
 from twin.estimate.vision.motion_filter import MotionFilter

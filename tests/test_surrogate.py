@@ -15,7 +15,7 @@ from pydantic import BaseModel
 
 from twin import scenes, survey
 from twin.core import geometry
-from twin.core.floor_rays import cast_pixels, height_field
+from twin.core.height_field import cast_pixels, height_field
 from twin.core.records import MapGrid
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError

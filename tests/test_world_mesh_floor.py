@@ -12,7 +12,7 @@ from PIL import Image
 
 from twin import survey, terrains
 from twin.core import geometry
-from twin.core.grid_triangles import grid_triangles
+from twin.core.height_field import grid_triangles
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError, TwinError
 from twin.imaging.scene.object_view import ObjectRenderer, Objects

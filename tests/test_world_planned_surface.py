@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from twin import terrains
-from twin.core.floor_rays import ray_grid
+from twin.core.height_field import ray_grid
 from twin.core.image_overlap import RAY_COLUMNS, image_overlap
 from twin.core.timing import Stopwatch
 from twin.scenario.file import load_scenario

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from twin.core.output_folder import check_folder, check_path
-from twin.core.paths import resolved
+from twin.core.user_files import resolved
 from twin.errors import TwinError
 
 if TYPE_CHECKING:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.core.floor_rays import HeightField, cast_camera_ray, cast_ray, ray_grid
 from twin.core.geometry import Array
+from twin.core.height_field import HeightField, cast_camera_ray, cast_ray, ray_grid
 from twin.core.records import StereoRig
 from twin.kernels import kernel
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.core.growing_array import GrowingArray
+from twin.core.series import GrowingArray
 
 
 class Link(NamedTuple):

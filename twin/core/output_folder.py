@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from twin.core.paths import path_problem
+from twin.core.user_files import path_problem
 from twin.errors import TwinError
 
 LOCK_FILE = ".lock"  #: is in a folder while this is written, and names the process

@@ -19,6 +19,10 @@ Image = NDArray[np.uint8]
 #: Linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]; see `Frame.exposure`.
 Exposure = tuple[float, float, float]
 
+_WATER_KG_M3, _GRAVITY_MPS2 = 1025.0, 9.81
+#: Increase of the pressure of sea water with depth [Pa/m].
+PASCAL_PER_METRE = _WATER_KG_M3 * _GRAVITY_MPS2
+
 
 @dataclass(frozen=True)
 class StereoRig:

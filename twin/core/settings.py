@@ -1,7 +1,8 @@
-"""Settings of the estimators."""
+"""Settings of the estimators, and the braking of a vehicle without vision, which the mission and they agree on."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -11,6 +12,9 @@ from twin.errors import TwinError
 MIN_INLIER_SHARE = 0.3
 #: Standard deviation of the interpolation bias, an error common to all points of a link [px].
 COMMON_BIAS_PX = 0.005
+#: If no motion has been measured for more than BLIND_S, the vehicle stops: its speed decays with the time constant
+#: BRAKING_S [s].
+BLIND_S, BRAKING_S = 0.5, 1.0
 
 
 def _key(default: Any, description: str, **limits: float) -> Any:
@@ -59,3 +63,13 @@ class EstimatorSettings:
                 allowed = f"between {limits['gt']} and {limits['lt']}"
             if allowed:
                 raise TwinError(f"estimate.{setting.name}", f"{value!r} is out of range", allowed)
+
+
+def braking_factor(blind_s: float, interval_s: float) -> float:
+    """Returns the factor, at most 1, by which the speed is multiplied over an interval.
+
+    Args:
+        blind_s: time without a measured motion, up to the start of the interval.
+        interval_s: length of the interval.
+    """
+    return 1.0 if blind_s <= BLIND_S else math.exp(-interval_s / BRAKING_S)

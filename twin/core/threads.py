@@ -1,12 +1,99 @@
-"""Threads of linear algebra: several slow down operations on small matrices, and may change the last bits."""
+"""Threads: an image in bands of rows, the two images of a stereo pair at the same time, one thread of linear algebra.
+
+The result does not depend on the number of bands.
+"""
 
 from __future__ import annotations
 
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
+from functools import cache
+from typing import TypeVar
 
 from threadpoolctl import threadpool_limits
 
+Left = TypeVar("Left")
+Right = TypeVar("Right")
+
+THREADS = 2  # with more threads, synchronization costs more than it gains: an image takes milliseconds
+LEAST_ROWS = 32  # smallest band; for fewer rows, starting a thread costs more than the work
+
+
+_state = threading.local()  # `whole` is set while this thread processes one image of a pair
+
+
+def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left, Right]:
+    """Returns the results of `left` and `right`, computed at the same time if there are enough processors.
+
+    Meanwhile, `in_row_bands` does not split images.
+
+    Args:
+        right: computes the right image; it must not modify data that `left` uses, and vice versa.
+
+    Raises:
+        Exception: any exception that `left` or `right` raises.
+    """
+    if _n_processors() < THREADS:
+        return left(), right()
+    other = _thread_pool(os.getpid()).submit(_whole, right)
+    try:
+        first = _whole(left)
+    finally:
+        wait([other])
+    return first, other.result()
+
+
+def _whole(work: Callable[[], Left]) -> Left:
+    """Returns the result of `work`, during which `in_row_bands` does not split images in this thread."""
+    _state.whole = True
+    try:
+        return work()
+    finally:
+        _state.whole = False
+
+
+def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: int = 1) -> None:
+    """Runs `work(first_row, end_row)` over all rows, in parallel bands if the image is large.
+
+    All rows are one band if there are fewer than `THREADS` processors, or within a call of `in_pair`.
+
+    Args:
+        work: processes rows first_row to end_row - 1; its kernels release the GIL.
+        rows_per_row: number of image rows that each processed row represents.
+
+    Raises:
+        Exception: any exception that `work` raises in any band.
+    """
+    small = n_rows * rows_per_row < THREADS * LEAST_ROWS
+    if small or getattr(_state, "whole", False) or _n_processors() < THREADS:
+        work(0, n_rows)
+        return
+    cuts = [n_rows * k // THREADS for k in range(THREADS + 1)]
+    others = [_thread_pool(os.getpid()).submit(work, *band) for band in zip(cuts[1:], cuts[2:], strict=False)]
+    try:
+        work(cuts[0], cuts[1])
+    finally:
+        for other in others:
+            other.result()
+
+
+@cache
+def _thread_pool(process: int) -> ThreadPoolExecutor:
+    """Returns the pool of threads that work in addition to the calling thread; each forked process has its own pool."""
+    return ThreadPoolExecutor(THREADS - 1, thread_name_prefix=f"bands-{process}")
+
+
+@cache
+def _n_processors() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Returns a context in which the loaded libraries of linear algebra use one thread."""
+    """Returns a context in which the loaded libraries of linear algebra use one thread.
+
+    Several slow down operations on small matrices, and may change the last bits.
+    """
     return threadpool_limits(1, "blas")

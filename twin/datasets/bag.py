@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from twin.core.optional_packages import optional
-from twin.core.paths import is_file
+from twin.core.user_files import is_file
 from twin.datasets.text_files import inside, read_yaml
 from twin.errors import TwinError
 

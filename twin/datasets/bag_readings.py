@@ -12,7 +12,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.pressure import PASCAL_PER_METRE
+from twin.core.records import PASCAL_PER_METRE
 from twin.datasets.bag import Bag
 from twin.datasets.bag_calibration import Transforms, relative_pose
 from twin.datasets.inertial import INERTIAL, USUAL_BIAS_MPS2, InertialErrorModel, vertical_series

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.nearest import nearest_index
 from twin.core.records import Trajectory
+from twin.core.series import nearest_index
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.image_files import ImageSource
 from twin.datasets.readings import RecordedReadings

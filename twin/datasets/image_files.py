@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
-from twin.core.paths import is_file
 from twin.core.records import Image
-from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
+from twin.core.user_files import MOST_IMAGE_BYTES, is_file, read_bytes
 from twin.errors import TwinError
 
 Bayer = Literal["RGGB", "GRBG", "GBRG", "BGGR"]

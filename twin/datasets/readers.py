@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from twin.core.paths import path_problem
+from twin.core.user_files import path_problem
 from twin.datasets.bag_reader import BagReader, BagTopics
 from twin.datasets.dataset import Dataset, Reader, check_times
 from twin.datasets.euroc import EurocReader

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.core import user_files
 from twin.core.geometry import Array
-from twin.core.paths import resolved
+from twin.core.user_files import resolved
 from twin.errors import TwinError, described
 
 _MOST_BYTES = 256 * 2**20  # largest list of images or poses

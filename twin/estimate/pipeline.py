@@ -20,7 +20,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
 from twin.core.links import Link
-from twin.core.orthomosaic import OrthoTile
+from twin.core.ortho_tiles import OrthoTile
 from twin.core.quality import EstimationQuality
 from twin.core.records import (
     ElevationMap,

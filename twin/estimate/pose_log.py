@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from twin.core.geometry import Array
-from twin.core.growing_array import GrowingArray
+from twin.core.series import GrowingArray
 
 
 class PoseLog:

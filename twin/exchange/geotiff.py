@@ -19,7 +19,7 @@ from rasterio.transform import Affine
 from rasterio.warp import transform
 
 from twin.core.georeference import Georeference
-from twin.core.orthomosaic import OrthoTile
+from twin.core.ortho_tiles import OrthoTile
 from twin.core.raster_files import open_raster
 from twin.core.records import ElevationMap, Image, MapGrid
 from twin.errors import TwinError

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 
-from twin.core.grid_triangles import raster_triangles
+from twin.core.height_field import raster_triangles
 from twin.core.records import ElevationMap
 
 #: Rotation from the axes of the world to those of glTF, which is y-up: x is east, y is up, z is south.

@@ -12,8 +12,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.optional_packages import optional
-from twin.core.pressure import PASCAL_PER_METRE
-from twin.core.records import Trajectory
+from twin.core.records import PASCAL_PER_METRE, Trajectory
 from twin.errors import TwinError
 from twin.exchange.euroc import timestamp_ns
 from twin.exchange.image_copy import encoded_image

@@ -21,7 +21,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
 from twin.core.georeference import Georeference
-from twin.core.grid_triangles import raster_triangles
+from twin.core.height_field import raster_triangles
 from twin.core.raster_files import open_raster
 from twin.core.records import ElevationMap, MapGrid
 from twin.exchange import geotiff

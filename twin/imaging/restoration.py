@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core import floor_rays, geometry
+from twin.core import geometry, height_field
 from twin.core.records import ElevationMap, Exposure, Image, StereoRig
 from twin.errors import TwinError
 from twin.imaging.camera.photons import vignetting
@@ -102,8 +102,8 @@ class Restoration:
         """
         rig = self._rig
         columns = max(2, rig.width_px // DEPTH_STEP_PX)
-        pixels = floor_rays.ray_grid(rig, columns)
-        depth = floor_rays.cast_pixels(self._floor, map_from_camera[None], rig, pixels)[0]
+        pixels = height_field.ray_grid(rig, columns)
+        depth = height_field.cast_pixels(self._floor, map_from_camera[None], rig, pixels)[0]
         terms, per_m = np.column_stack([pixels, np.ones(len(pixels))]), 1 / depth
         known = per_m > 0
         if known.sum() < 3:  # too few rays meet the map to fit a plane; these colours are not used
@@ -114,13 +114,13 @@ class Restoration:
         return 1 / cv2.resize(coarse, (rig.width_px, rig.height_px), interpolation=cv2.INTER_LINEAR)
 
 
-def estimated_floor(elevation: ElevationMap) -> floor_rays.HeightField:
+def estimated_floor(elevation: ElevationMap) -> height_field.HeightField:
     """Returns the heights of a map with at least one height; each hole has the height of the nearest cell.
 
     The heights are not smoothed: smoothing tilts the facets at every edge, where the light depends on them most.
     """
     height, _ = fill_holes(elevation.height_m.astype(np.float64))
-    return floor_rays.map_height_field(height.astype(np.float32), elevation.grid)
+    return height_field.map_height_field(height.astype(np.float32), elevation.grid)
 
 
 def linear_signal(scenario: Scenario) -> NDArray[np.float32]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.camera.lens_psf import Defocus
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.light.lamp_light import LampLight

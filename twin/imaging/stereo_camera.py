@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import Exposure, Image
-from twin.core.row_parallel import in_pair
+from twin.core.threads import in_pair
 from twin.core.timing import StageTimer
 from twin.imaging.camera.lens_psf import LensPsf
 from twin.imaging.camera.photo_sensor import PhotoSensor, Sensor, sensor_of

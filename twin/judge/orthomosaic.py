@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.orthomosaic import OrthoTile
+from twin.core.ortho_tiles import OrthoTile
 from twin.core.records import Array
 from twin.judge.colour_difference import XYZ_FROM_RGB, ciede2000, lab_of
 from twin.judge.patch_shift import patch_shift, transfer

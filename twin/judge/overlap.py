@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from twin.core.floor_rays import HeightField, height_field, map_height_field
+from twin.core.height_field import HeightField, height_field, map_height_field
 from twin.core.image_overlap import image_overlap
 from twin.core.records import Array, MapGrid, StereoRig, SurveyResult, Truth
 from twin.judge.summary_statistics import finite_float, percentile

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.nearest import nearest_index
 from twin.core.records import Array, ElevationMap, SurveyResult, Trajectory
+from twin.core.series import nearest_index
 from twin.judge.links import ALONG_NODES, linked_nodes, node_distance
 from twin.judge.metrics import SCHEMA, empty_metrics, timing_metrics
 from twin.judge.self_check import self_check_metrics

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import root_scalar
 from scipy.special import ndtr, ndtri
 
-from twin.core.floor_rays import ray_grid
 from twin.core.geometry import Array
+from twin.core.height_field import ray_grid
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.core.records import StereoRig
 from twin.surrogate import error_model_file

@@ -11,8 +11,8 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.nearest import nearest_index
 from twin.core.records import Frame, Readings, SensorNoise, StereoRig, Trajectory
+from twin.core.series import nearest_index
 from twin.core.settings import EstimatorSettings
 from twin.datasets.readings import RecordedReadings, SensorSeries
 from twin.estimate import Navigator

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.interrupts import StageGuard
 from twin.core.output_folder import sole_writer
-from twin.core.paths import is_file, resolved
 from twin.core.records import ElevationMap, SensorNoise, StereoRig, SurveyResult, Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch, timing_summary
+from twin.core.user_files import is_file, resolved
 from twin.datasets.bag import is_bag
 from twin.datasets.bag_reader import BagTopics
 from twin.datasets.calibration_files import read_calibration

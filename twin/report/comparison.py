@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.core.paths import resolved
+from twin.core.user_files import resolved
 from twin.errors import TwinError
 from twin.report import wording
 from twin.report.comparison_figures import draw_comparison, run_colours

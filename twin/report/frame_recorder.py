@@ -11,8 +11,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from twin.core.growing_array import GrowingArray
 from twin.core.records import Array, Frame, Image, ImuReadings, Readings
+from twin.core.series import GrowingArray
 
 Record = Literal["none", "keyframes", "all"]
 #: Last columns of frames/frames.csv; an empty cell is a missing reading.

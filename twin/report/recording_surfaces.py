@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.grid_triangles import raster_triangles
-from twin.core.map_slopes import map_slopes
+from twin.core.height_field import map_slopes, raster_triangles
 from twin.core.records import Array, Image, MapGrid, StereoRig
 from twin.report.run_folder import Raster
 

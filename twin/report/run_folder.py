@@ -12,10 +12,9 @@ import rasterio
 from numpy.typing import NDArray
 from rasterio.enums import Resampling
 
-from twin.core.paths import is_file, path_problem
 from twin.core.raster_files import open_raster
 from twin.core.records import Array, MapGrid, Trajectory
-from twin.core.user_files import read_json, read_text, reading
+from twin.core.user_files import is_file, path_problem, read_json, read_text, reading
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.report.run_files import checked_environment, checked_index, checked_metrics, checked_scenario

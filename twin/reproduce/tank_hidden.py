@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.floor_rays import cast_ray, map_height_field
 from twin.core.geometry import Array
+from twin.core.height_field import cast_ray, map_height_field
 from twin.core.records import MapGrid, StereoRig
 from twin.kernels import kernel
 

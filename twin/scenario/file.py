@@ -15,8 +15,7 @@ from typing import Any, TypeVar
 import tomlkit
 from pydantic import BaseModel, ValidationError
 
-from twin.core.paths import is_file, resolved
-from twin.core.user_files import read_text
+from twin.core.user_files import is_file, read_text, resolved
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.model import Scenario, Source
 from twin.scenario.toml_lines import key_lines

@@ -24,9 +24,9 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from twin.core import geometry
-from twin.core.paths import path_problem
 from twin.core.records import SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
+from twin.core.user_files import path_problem
 from twin.errors import TwinError
 from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 

@@ -10,9 +10,9 @@ from collections import deque
 from collections.abc import Callable
 from typing import Literal
 
-from twin.core.braking import BLIND_S, BRAKING_S
 from twin.core.quality import ActionTimes
 from twin.core.records import Estimate
+from twin.core.settings import BLIND_S, BRAKING_S
 from twin.world.mission import Mission
 from twin.world.pace import FULL, Pace
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.orthomosaic import mean_colours, window
+from twin.core.ortho_tiles import mean_colours, window
 from twin.core.records import ElevationMap, SurveyResult, Truth
 from twin.core.timing import StageTimer
 from twin.estimate.mapping.orthomosaic import Restore

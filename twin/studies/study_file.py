@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr
 
-from twin.core.paths import is_file
+from twin.core.user_files import is_file
 from twin.errors import ScenarioError, TwinError
 from twin.judge.metrics import empty_metrics
 from twin.judge.require import SIGNED, check_metric_names

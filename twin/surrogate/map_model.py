@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter, uniform_filter
 
 from twin.core import geometry
-from twin.core.floor_rays import HeightField, cast_camera_ray
 from twin.core.geometry import Array
-from twin.core.map_slopes import map_slopes
+from twin.core.height_field import HeightField, cast_camera_ray, map_slopes
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch

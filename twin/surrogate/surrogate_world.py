@@ -13,8 +13,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.floor_rays import HeightField, cast_pixels, height_field
 from twin.core.geometry import Array
+from twin.core.height_field import HeightField, cast_pixels, height_field
 from twin.core.records import StereoRig
 from twin.core.timing import StageTimer
 from twin.errors import TwinError, UnmodelledError

@@ -18,12 +18,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.braking import braking_factor
-from twin.core.floor_rays import HeightField, cast_pixels
 from twin.core.geometry import Array
+from twin.core.height_field import HeightField, cast_pixels
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
-from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE, EstimatorSettings
+from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE, EstimatorSettings, braking_factor
 from twin.core.timing import StageTimer
 from twin.estimate.mapping import elevation
 from twin.estimate.vision import stereo

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.floor_rays import HeightField, cast_pixels, ray_grid
 from twin.core.geometry import Array
+from twin.core.height_field import HeightField, cast_pixels, ray_grid
 from twin.core.image_overlap import RAY_COLUMNS, image_overlap
 from twin.core.records import MapGrid, StereoRig
 from twin.judge.overlap import KeyframePoses

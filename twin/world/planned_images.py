@@ -6,8 +6,8 @@ import numpy as np
 
 from twin.controllers.survey_plan import SurveyPlan
 from twin.core import geometry
-from twin.core.floor_rays import HeightField, height_field
 from twin.core.geometry import Array
+from twin.core.height_field import HeightField, height_field
 from twin.core.image_overlap import image_overlap
 from twin.core.records import StereoRig
 from twin.judge.overlap import ImagePairs, KeyframePoses, across_pairs, along_pairs

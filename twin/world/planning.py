@@ -10,7 +10,7 @@ import numpy as np
 from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
-from twin.core.floor_rays import HeightField
+from twin.core.height_field import HeightField
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.scenario.model import Scenario

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.growing_array import GrowingArray
 from twin.core.records import Exposure, Frame, Image, MapGrid, StereoRig, Trajectory, Truth
+from twin.core.series import GrowingArray
 from twin.core.timing import StageTimer
 from twin.errors import TwinError
 from twin.simulate.compiled_vehicle import CompiledVehicle

@@ -1,6 +1,6 @@
 """Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
 
-It is made tile by tile (`twin.core.orthomosaic.tile_side_px`); one tile (24 bytes per pixel) and two images are in
+It is made tile by tile (`twin.core.ortho_tiles.tile_side_px`); one tile (24 bytes per pixel) and two images are in
 memory at a time, whatever the size of the survey.
 """
 
@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.orthomosaic import OrthoTile, finer_grid, tile_side_px, window
+from twin.core.ortho_tiles import OrthoTile, finer_grid, tile_side_px, window
 from twin.core.records import Array, ElevationMap, Exposure, Image, MapGrid, StereoRig
 from twin.estimate.mapping import exposure_balance
 from twin.estimate.mapping.orthophoto import Colours, OrthoLayers, add_view, empty_layers, footprint

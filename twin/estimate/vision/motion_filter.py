@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from twin.core import geometry
-from twin.core.braking import braking_factor
 from twin.core.geometry import Array
+from twin.core.settings import braking_factor
 
 #: Standard deviation of the acceleration of an underwater vehicle [rotation, translation] (rad/s2, m/s2).
 _ACCELERATION = np.full(6, 2.0)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.camera.port import pinhole
 from twin.imaging.light.spectra import CENTRE_NM
 from twin.kernels import kernel

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Exposure, Image, StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.camera.photons import electrons_per_cd, vignetting
 from twin.imaging.camera.pixels import PixelResponse, Raw, read_out
 from twin.imaging.camera.sensor import Array, AutoExposure, ExposureSetting, PlainSensor, Radiance

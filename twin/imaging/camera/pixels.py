@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.camera.random_numbers import NORMAL_BITS, NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.kernels import kernel
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core.interpolation import bspline_weights
 from twin.core.records import Image
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.light.vector_math import sum_of_pixels
 from twin.kernels import kernel
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Exposure, Image
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.camera.random_numbers import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.kernels import kernel

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.light.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.light.spread import NODES_M, Absorbed, camera_mixture, over_path
 from twin.imaging.light.vector_math import sum_of_entries

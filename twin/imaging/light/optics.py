@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Image, StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.light.backscatter import backscatter_table, grid_of, grid_rays, table_range_m
 from twin.imaging.light.daylight import DaylightVeil, Sky, floor_daylight, world_axes
 from twin.imaging.light.forward_scatter import ForwardScatter, Place

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.grid_triangles import rises
+from twin.core.height_field import rises
 from twin.core.records import StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.light.illumination import Daylight
 from twin.imaging.light.optics import Depth, Lit
 from twin.imaging.scene.facets import Heights

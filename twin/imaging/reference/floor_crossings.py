@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.core.floor_rays import cast_ray
-from twin.core.grid_triangles import rises
+from twin.core.height_field import cast_ray, rises
 from twin.kernels import kernel
 
 LIFT_M = 1e-6  # distance by which a path vertex on the floor is moved off the floor, along the normal

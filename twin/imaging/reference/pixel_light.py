@@ -11,7 +11,7 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.floor_rays import HeightField, height_field
+from twin.core.height_field import HeightField, height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
 from twin.imaging.light.lamp_light import LAMP_RADIUS_M

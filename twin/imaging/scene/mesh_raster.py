@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.kernels import kernel
 from twin.terrains.objects.mesh import Mesh
 from twin.terrains.objects.parts import PART_FACES, UNKNOWN, Parts

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.imaging.scene.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.scene.object_view import Objects
 from twin.kernels import kernel

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.grid_triangles import rises
+from twin.core.height_field import rises
 from twin.core.records import Image
-from twin.core.row_parallel import in_row_bands
+from twin.core.threads import in_row_bands
 from twin.kernels import kernel
 from twin.terrains import Terrain
 

@@ -1,14 +1,16 @@
-"""Ray casting on a floor given as a height grid: exact intersection with the two triangles of each cell."""
+"""Floor as heights on a regular grid: the two triangles of each cell, its slopes, and the rays that meet it.
+
+Cells are split along the diagonal from south-west to north-east.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.core.grid_triangles import rises
 from twin.core.records import MapGrid, StereoRig
 from twin.kernels import kernel
 
@@ -146,3 +148,53 @@ def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
         if gap_b <= 0:
             return a + (b - a) * gap_a / (gap_a - gap_b)
     return np.inf
+
+
+def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
+    """Returns the triangles of a grid, counter-clockwise as seen from above, cell by cell.
+
+    Args:
+        vertices: (rows, cols) vertex numbers; rows run from south to north, columns from west to east.
+
+    Returns:
+        (2 (rows - 1) (cols - 1), 3) vertex numbers, of the same integer type.
+    """
+    sw, se, ne, nw = vertices[:-1, :-1], vertices[:-1, 1:], vertices[1:, 1:], vertices[1:, :-1]
+    return np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
+
+
+def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Returns the triangles that connect the centres of valid raster cells, counter-clockwise as seen from above.
+
+    Args:
+        valid: (rows, cols) bool; row 0 is the northernmost.
+
+    Returns:
+        (n, 3) indices of the cells at the corners, in the flattened (row-major) raster.
+    """
+    cells = np.arange(valid.size).reshape(valid.shape)
+    triangles = grid_triangles(cells[::-1])
+    return triangles[valid.reshape(-1)[triangles].all(axis=1)]
+
+
+@kernel(inline="always")
+def rises(south_west, south_east, north_west, north_east, east_part, north_part):
+    """Returns the rise over a cell towards east and north of its triangle at a point, given as parts of the cell."""
+    lower = east_part >= north_part
+    east = south_east - south_west if lower else north_east - north_west
+    return east, north_east - south_east if lower else north_west - south_west
+
+
+def map_slopes(height_m: Array, cell_m: float) -> tuple[Array, Array]:
+    """Returns the slopes of a map towards the east and towards the north, each (rows, cols), by central differences.
+
+    At the edges of the map, the differences are one-sided. Along an axis with a single cell, the slope is 0.
+
+    Args:
+        height_m: (rows, cols) heights; row 0 is the northernmost, column 0 the westernmost.
+    """
+    south, east = (
+        np.gradient(height_m, cell_m, axis=axis) if height_m.shape[axis] > 1 else np.zeros_like(height_m)
+        for axis in (0, 1)
+    )
+    return np.asarray(east, np.float64), -np.asarray(south, np.float64)

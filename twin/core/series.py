@@ -1,4 +1,4 @@
-"""Array that grows along its first axis."""
+"""Rows in order of time: an array that grows along its first axis, and the row nearest to a time."""
 
 from __future__ import annotations
 
@@ -43,3 +43,14 @@ class GrowingArray:
             grown[: self._n] = self.array
             self._buffer = grown
         self._buffer[self._n : end], self._n = rows, end
+
+
+def nearest_index(sorted_s: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Returns the index (n,) of the element of the sorted times (m,) that is nearest to each of the times (n,) [s].
+
+    The sorted times must not be empty. Of two elements at the same distance, the earlier one is chosen.
+    """
+    after = np.clip(np.searchsorted(sorted_s, times_s), 1, max(len(sorted_s) - 1, 1))
+    last = len(sorted_s) - 1
+    low, high = np.minimum(after - 1, last), np.minimum(after, last)
+    return np.where(np.abs(sorted_s[high] - times_s) < np.abs(sorted_s[low] - times_s), high, low)

@@ -5,7 +5,7 @@ import types
 import numpy as np
 import pytest
 
-from twin.core import geometry, row_parallel
+from twin.core import geometry, threads
 from twin.imaging.image_formation import ImageFormation, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.scenario.model import Scenario
@@ -28,21 +28,21 @@ SPIKES = types.SimpleNamespace(
 
 @pytest.mark.parametrize(("n_rows", "rows_per_row", "n_bands"), [(63, 1, 1), (64, 1, 2), (8, 8, 2), (7, 8, 1)])
 def test_an_image_is_split_where_it_has_enough_rows(monkeypatch, n_rows, rows_per_row, n_bands):
-    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
+    monkeypatch.setattr(threads, "_n_processors", lambda: threads.THREADS)
     bands = []
-    row_parallel.in_row_bands(lambda *band: bands.append(band), n_rows, rows_per_row)
+    threads.in_row_bands(lambda *band: bands.append(band), n_rows, rows_per_row)
     assert len(bands) == n_bands
 
 
 @pytest.mark.parametrize("n_rows", [1, 63, 64, 65, 481])
 def test_every_row_is_processed_once(monkeypatch, n_rows):
-    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
+    monkeypatch.setattr(threads, "_n_processors", lambda: threads.THREADS)
     count = np.zeros(n_rows, int)
 
     def work(first, end):
         count[first:end] += 1
 
-    row_parallel.in_row_bands(work, n_rows)
+    threads.in_row_bands(work, n_rows)
     assert (count == 1).all()
 
 
@@ -53,7 +53,7 @@ def test_radiance_is_the_same_with_one_and_two_threads(monkeypatch):
     depth = np.random.default_rng(2).uniform(1.7, 2.0, (120, 160)).astype(np.float32)
     images = []
     for processors in (1, 2):
-        monkeypatch.setattr(row_parallel, "_n_processors", lambda n=processors: n)
+        monkeypatch.setattr(threads, "_n_processors", lambda n=processors: n)
         light = ImageFormation(SCENARIO, illumination_of(SCENARIO), SPIKES, np.random.default_rng(0))
         images += [light.radiance(albedo, depth, camera, StampedPose(pose, 0.0)) for camera in (0, 1)]
     np.testing.assert_array_equal(images[0], images[2])
@@ -62,27 +62,27 @@ def test_radiance_is_the_same_with_one_and_two_threads(monkeypatch):
 
 @pytest.mark.parametrize("bad_row", [0, 499])
 def test_an_exception_in_any_band_is_raised(monkeypatch, bad_row):
-    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
+    monkeypatch.setattr(threads, "_n_processors", lambda: threads.THREADS)
 
     def work(first, end):
         if first <= bad_row < end:
             raise ValueError(bad_row)
 
     with pytest.raises(ValueError, match=str(bad_row)):
-        row_parallel.in_row_bands(work, 500)
+        threads.in_row_bands(work, 500)
 
 
 @pytest.mark.parametrize("processors", [1, 2])
 def test_a_pair_is_computed_without_splitting_images(monkeypatch, processors):
     """Each image in one band, and images are split again afterwards."""
-    monkeypatch.setattr(row_parallel, "_n_processors", lambda: processors)
+    monkeypatch.setattr(threads, "_n_processors", lambda: processors)
     bands = {"left": [], "right": [], "after": []}
 
     def image(name):
-        row_parallel.in_row_bands(lambda *band: bands[name].append(band), 500)
+        threads.in_row_bands(lambda *band: bands[name].append(band), 500)
         return name
 
-    assert row_parallel.in_pair(lambda: image("left"), lambda: image("right")) == ("left", "right")
+    assert threads.in_pair(lambda: image("left"), lambda: image("right")) == ("left", "right")
     image("after")
     assert bands["left"] == bands["right"] == [(0, 500)]
     assert len(bands["after"]) == processors
@@ -91,7 +91,7 @@ def test_a_pair_is_computed_without_splitting_images(monkeypatch, processors):
 @pytest.mark.parametrize("fails", ["left", "right"])
 def test_an_exception_in_an_image_of_a_pair_is_raised(monkeypatch, fails):
     """The other image is completed first, and images are split again afterwards."""
-    monkeypatch.setattr(row_parallel, "_n_processors", lambda: row_parallel.THREADS)
+    monkeypatch.setattr(threads, "_n_processors", lambda: threads.THREADS)
     completed = []
 
     def image(name):
@@ -100,8 +100,8 @@ def test_an_exception_in_an_image_of_a_pair_is_raised(monkeypatch, fails):
         completed.append(name)
 
     with pytest.raises(ValueError, match=fails):
-        row_parallel.in_pair(lambda: image("left"), lambda: image("right"))
+        threads.in_pair(lambda: image("left"), lambda: image("right"))
     assert len(completed) == 1
     bands = []
-    row_parallel.in_row_bands(lambda *band: bands.append(band), 500)
-    assert len(bands) == row_parallel.THREADS
+    threads.in_row_bands(lambda *band: bands.append(band), 500)
+    assert len(bands) == threads.THREADS
