@@ -23,7 +23,6 @@ _TITLES = {"lamps": "[[lamps]]", "beacons": "[[beacons]]", "objects": "[[objects
 _UNIT = re.compile(r"\s*\[([^\[\],]+)\](?=$|;)")
 _BOUNDS = {
     "minimum": ">= {}", "exclusiveMinimum": "> {}", "maximum": "<= {}", "exclusiveMaximum": "< {}",
-    "ge": ">= {}", "gt": "> {}", "le": "<= {}", "lt": "< {}",
 }  # fmt: skip
 
 

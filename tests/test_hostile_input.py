@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from hostile_scenarios import BASE, LOOSE, ODD, attempt, draw, mutations, write_case, write_inline
+from hostile_scenarios import LOOSE, ODD, attempt, draw, mutations, write_case, write_inline
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from judge_synthetic import write_folder
@@ -22,7 +22,6 @@ from twin.errors import ScenarioError, TwinError
 from twin.report.run_folder import load_run
 from twin.report.survey_page import write_report
 from twin.scenario.file import load_scenario
-from twin.scenario.toml_lines import key_lines
 from twin.studies.study_file import load_study
 from twin.world import planning
 
@@ -82,16 +81,6 @@ def test_the_limits_are_stated_with_the_number_and_the_remedy(tmp_path):
     file, _ = write_case(tmp_path, [])
     outcome = attempt(file, ["map.cell_m=0.0011", "plan.altitude_m=20.0"])
     assert f"cells of the map are too many (allowed: up to {planning.MAX_MAP_CELLS}: a cell of" in outcome
-
-
-def test_lines_of_keys_are_found_in_a_text_too_long_for_tomlkit():
-    text = BASE + "".join(f"# {'x' * 96}\n" for _ in range(600)) + "[sun]\ndepth_m = 3\n[[lamps]]\ntilt_deg = 1\n"
-    lines, short = key_lines(text), key_lines(BASE)
-    assert {key: lines[key] for key in ("plan.area_m", "terrain.grid_m", "seed")} == {
-        key: short[key] for key in ("plan.area_m", "terrain.grid_m", "seed")
-    }
-    rows = text.split("\n")
-    assert rows[lines["sun.depth_m"] - 1] == "depth_m = 3" and rows[lines["lamps.1.tilt_deg"] - 1] == "tilt_deg = 1"
 
 
 def test_a_study_of_too_many_surveys_is_refused(tmp_path):

@@ -22,9 +22,10 @@ from twin.scenario.toml_lines import key_lines
 from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVELS, parse_toml, value_errors
 
 Model = TypeVar("Model", bound=BaseModel)
+#: Keys whose value is the path of a file, without the numbers of list items.
 _PATH_KEYS = (
-    "imaging.error_model", "plan.polygon", "terrain.height_file", "terrain.mesh_file", "terrain.orthophoto_file",
-    "terrain.texture_file", "water.spectrum_file",
+    "imaging.error_model", "objects.mesh_file", "plan.polygon", "terrain.height_file", "terrain.mesh_file",
+    "terrain.orthophoto_file", "terrain.texture_file", "water.spectrum_file",
 )  # fmt: skip
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {
@@ -32,12 +33,9 @@ _RENAMED_KEYS = {
     "imaging.calibration": "imaging.error_model",
     "imaging.forward_scatter": "imaging.scattering",
 }
-#: Key `mesh_file` of an item of `[[objects]]`.
-_OBJECT_FILE = re.compile(r"objects\.\d+\.mesh_file")
 #: Sections with a key `plugin`, and the group of its entry points.
 _PLUGIN_SECTIONS = {"control": "controllers", "estimate": "estimators", "terrain": "terrains"}
 _IN_PYTHON = "in Python: allow_plugins=True"
-_ABSENT = object()
 #: Keys of [terrain] that say which floor it is.
 _FLOOR_KEYS = ("kind", "plugin", "height_file", "mesh_file")
 #: Largest number of errors that are listed.
@@ -49,16 +47,15 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins
 
     Args:
         path: path of a scenario file, or name of a scenario in scenes/.
-        overrides: strings `key=value` with a dotted key and a TOML value; a value that is not valid TOML is taken as a
-            string.
-        allow_plugins: whether the file and the overrides may name a plug-in as module:Class, which runs code of any
-            module that can be imported; the names of installed entry points are always allowed.
+        overrides: strings `key=value` with a dotted key and a TOML value; other values are taken as strings.
+        allow_plugins: whether a plug-in may be named as module:Class, which runs code of any module that can be
+            imported; the names of installed entry points are always allowed.
 
     Raises:
         ScenarioError: there is no such scenario, or a file or an override is invalid; lists the errors of files as
             `FILE:LINE: key: problem (allowed: ...)`, and those of overrides in lines that begin with `--set`.
     """
-    tree, source, errors = _read_with_base(find_scene(path), including_files=())
+    tree, source, errors = _read_with_base(find_scene(path))
     base = copy.deepcopy(tree)
     source = source.model_copy(update={"overrides": tuple(overrides), "allow_plugins": allow_plugins})
     for override in overrides:
@@ -66,28 +63,23 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins
             _apply_override(tree, override)
         except ScenarioError as error:
             errors += error.lines
-    _leave_objects_on_their_floor(tree, base)
     try:
-        scenario = validated(tree, Scenario, source)
+        scenario = _on_its_floor(tree, base, source)
     except ScenarioError as error:
         raise ScenarioError([*errors, *error.lines]) from None
     if errors:
         raise ScenarioError(errors)
-    scenario._source = source
     return scenario
 
 
 def read_tree(path: str | Path) -> dict[str, Any]:
     """Returns the keys and values of a scenario, merged over those of its base file; the values are not validated.
 
-    Args:
-        path: path of a scenario file, or name of a scenario in scenes/.
-
     Raises:
         ScenarioError: there is no such scenario, or a file cannot be read, is not TOML, exceeds the limits of
             `toml_text`, extends itself or an unknown file, or contains the old name of a renamed key.
     """
-    tree, _, errors = _read_with_base(find_scene(path), including_files=())
+    tree, _, errors = _read_with_base(find_scene(path))
     if errors:
         raise ScenarioError(errors)
     return tree
@@ -109,32 +101,22 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
     for key, value in values.items():
         if new_key := _renamed(key):
             raise ScenarioError([source.describe(TwinError(key, f"renamed to {new_key}"))])
-        is_path = _is_path_key(key) and isinstance(value, str)
-        if is_path and not value:
+        if value == "" and _is_path_key(key):
             continue
         try:
-            _assign(changed, key, str(_expand(value, source.path.parent)) if is_path else value, key)
+            _assign(changed, key, _absolute(key, value, source.path.parent), key)
         except ScenarioError as error:
             problem = error.lines[0].removeprefix(f"{key}: ")
             raise ScenarioError([source.describe(TwinError(key, problem))]) from None
-    _leave_objects_on_their_floor(changed, tree)
-    scenario = validated(changed, Scenario, source)
-    scenario._source = source
-    return scenario
+    return _on_its_floor(changed, tree, source)
 
 
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
     """Returns the model of a tree of keys and values.
 
-    A plug-in that is named as module:Class is an error unless the source allows it.
-
-    Args:
-        tree: keys and values.
-        model: class of the model.
-        source: origin of the keys, for error messages.
-
     Raises:
-        ScenarioError: a key or a value is invalid; lists up to `_MAX_ERRORS` errors and the number of the others.
+        ScenarioError: a key or a value is invalid, or a plug-in is named as module:Class and the source does not allow
+            it; lists up to `_MAX_ERRORS` errors and the number of the others.
     """
     if refused := [] if source.allow_plugins else [source.describe(error) for error in _plugin_errors(tree)]:
         raise ScenarioError(refused)
@@ -145,6 +127,14 @@ def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Mo
         lines = [source.describe(_as_twin_error(item, model)) for item in items[:_MAX_ERRORS]]
         more = [f"... and {len(items) - _MAX_ERRORS} more"] if len(items) > _MAX_ERRORS else []
         raise ScenarioError(lines + more) from None
+
+
+def _on_its_floor(tree: dict[str, Any], base: Mapping[str, Any], source: Source) -> Scenario:
+    """Returns the scenario of a tree, without the objects of its base if they lie on another floor."""
+    _leave_objects_on_their_floor(tree, base)
+    scenario = validated(tree, Scenario, source)
+    scenario._source = source
+    return scenario
 
 
 def _plugin_errors(tree: Mapping[str, Any]) -> Iterator[TwinError]:
@@ -163,10 +153,7 @@ def plugin_error(key: str, name: str, kind: str) -> TwinError:
 
 
 def find_scene(path: str | Path) -> Path:
-    """Returns the path of a scenario file.
-
-    Args:
-        path: path of an existing file, or name of a scenario in scenes/, with or without "scenes/" and ".toml".
+    """Returns the path of a file, or of the scenario of this name in scenes/, with or without "scenes/" and ".toml".
 
     Raises:
         ScenarioError: there is neither a file nor a scenario of this name.
@@ -198,10 +185,7 @@ def dump_toml(scenario: Scenario) -> str:
 
 
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
-    """Reads one TOML file; a file that it extends is not read.
-
-    Returns:
-        Keys and values, and the line number of each dotted key, see `toml_lines.key_lines`.
+    """Returns the keys and values of one TOML file, and the line number of each dotted key (`key_lines`).
 
     Raises:
         ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
@@ -222,38 +206,35 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     return tree, lines
 
 
-def _read_with_base(file: Path, including_files: tuple[Path, ...]) -> tuple[dict[str, Any], Source, list[str]]:
-    """Reads a file and merges it over its base file.
-
-    Args:
-        file: the scenario file.
-        including_files: absolute paths of the files that extend this one, directly or indirectly.
+def _read_with_base(file: Path, including: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Source, list[str]]:
+    """Reads a file and merges it over its base file; `including` are the absolute paths of the files that extend it.
 
     Returns:
         The merged keys and values, with absolute file paths and without old names of renamed keys; the files and line
         numbers that they come from; and one error for each old name.
 
     Raises:
-        ScenarioError: the file extends itself, its base file does not exist, or a file is invalid, see `read_toml`.
+        ScenarioError: the file extends itself, its base file does not exist, or a file is invalid (`read_toml`).
     """
-    if resolved(file) in including_files:
+    if resolved(file) in including:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
     tree, lines = read_toml(file)
+    source = Source(path=file, lines=lines)
     renamed = [TwinError(old, f"renamed to {new}") for old, new in _RENAMED_KEYS.items() if _remove(tree, old)]
-    errors = [Source(path=file, lines=lines).describe(error) for error in renamed]
-    _resolve_paths(tree, file.parent)
+    errors = [source.describe(error) for error in renamed]
+    tree = _absolute("", tree, file.parent)
     base = tree.pop("extends", None)
     if base is None:
-        return tree, Source(path=file, lines=lines), errors
-    base_file = _base_file(str(base), file.parent)
-    if base_file is None:
-        line, name, allowed = lines.get("extends", 1), shown(repr(str(base))), ", ".join(_built_in_scenes())
-        message = f"no such file {name} (allowed: a path relative to this file, or one of {allowed})"
-        raise ScenarioError([*errors, f"{file}:{line}: extends: {message}"])
-    base_tree, base_source, base_errors = _read_with_base(base_file, (*including_files, resolved(file)))
+        return tree, source, errors
+    base_file = resolved(file.parent / str(base))
+    if not is_file(base_file) and (base_file := _built_in_scenes().get(str(base))) is None:
+        allowed = f"a path relative to this file, or one of {', '.join(_built_in_scenes())}"
+        message = f"no such file {shown(repr(str(base)))} (allowed: {allowed})"
+        raise ScenarioError([*errors, f"{file}:{lines.get('extends', 1)}: extends: {message}"])
+    base_tree, base_source, base_errors = _read_with_base(base_file, (*including, resolved(file)))
     merged = _merge(base_tree, tree)
     _leave_objects_on_their_floor(merged, base_tree)
-    return merged, Source(path=file, lines=lines, base=base_source), errors + base_errors
+    return merged, source.model_copy(update={"base": base_source}), errors + base_errors
 
 
 def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:
@@ -264,36 +245,25 @@ def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any])
         tree.pop("objects", None)
 
 
-def _base_file(base: str, folder: Path) -> Path | None:
-    """Returns the file that `extends` names: a path relative to `folder`, or a name in scenes/; None if neither."""
-    file = resolved(folder / base)
-    return file if is_file(file) else _built_in_scenes().get(base)
-
-
 def _remove(tree: dict[str, Any], key: str) -> bool:
-    """Removes a dotted key from the tree; returns whether it was there."""
-    *sections, leaf = key.split(".")
-    node: Any = tree
-    for section in sections:
-        node = node.get(section) if isinstance(node, dict) else None
-    return isinstance(node, dict) and node.pop(leaf, _ABSENT) is not _ABSENT
-
-
-def _resolve_paths(tree: dict[str, Any], folder: Path) -> None:
-    """Makes the file paths in a tree absolute, in place; relative paths refer to `folder`."""
-    for section, key in (name.split(".") for name in _PATH_KEYS):
-        keys = tree.get(section)
-        if isinstance(keys, dict) and isinstance(keys.get(key), str):
-            keys[key] = str(_expand(keys[key], folder))
-    items = tree.get("objects")
-    for item in items if isinstance(items, list) else ():
-        if isinstance(item, dict) and isinstance(item.get("mesh_file"), str):
-            item["mesh_file"] = str(_expand(item["mesh_file"], folder))
+    """Removes a dotted key of up to two parts from the tree; returns whether it was there."""
+    section, _, leaf = key.rpartition(".")
+    node = tree.get(section) if section else tree
+    return isinstance(node, dict) and node.pop(leaf, tree) is not tree
 
 
 def _is_path_key(key: str) -> bool:
     """Returns whether a dotted key of the scenario has a file path as its value."""
-    return key in _PATH_KEYS or _OBJECT_FILE.fullmatch(key) is not None
+    return re.sub(r"\.\d+\b", "", key) in _PATH_KEYS
+
+
+def _absolute(key: str, value: Any, folder: Path) -> Any:
+    """Returns the value of a key, with absolute file paths in it; relative paths refer to `folder`."""
+    if isinstance(value, dict):
+        return {name: _absolute(f"{key}.{name}" if key else name, item, folder) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_absolute(key, item, folder) if isinstance(item, dict) else item for item in value]
+    return str(_expand(value, folder)) if isinstance(value, str) and _is_path_key(key) else value
 
 
 def _expand(value: str, folder: Path) -> Path:
@@ -317,12 +287,7 @@ def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
-    """Sets a key of the tree to the value of an override `key=value`; relative file paths refer to the current folder.
-
-    Raises:
-        ScenarioError: the override is not of this form, or its key is too long, renamed or cannot be set, or its value
-            exceeds the limits of `toml_text`.
-    """
+    """Sets a key of the tree to the value of an override `key=value`; raises ScenarioError if this is impossible."""
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -333,18 +298,12 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     if new_key := _renamed(key):
         raise ScenarioError([f"--set: {key}: renamed to {new_key}"])
     value = _override_value(key, text)
-    if "." not in key:
-        _resolve_paths({key: value}, Path.cwd())
-    is_path = _is_path_key(key) and not isinstance(value, list)
-    _assign(tree, key, str(_expand(str(value), Path.cwd())) if is_path else value, f"--set {shown(override)}")
+    value = str(value) if _is_path_key(key) and not isinstance(value, list) else value
+    _assign(tree, key, _absolute(key, value, Path.cwd()), f"--set {shown(override)}")
 
 
 def _override_value(key: str, text: str) -> Any:
-    """Returns the TOML value in the text of an override; the text itself if it is not a single TOML value.
-
-    Raises:
-        ScenarioError: the text or the value exceeds the limits of `toml_text`.
-    """
+    """Returns the TOML value in the text of an override, within limits; the text itself if it is not a single value."""
     try:
         given = parse_toml(f"v = {text}")
     except tomllib.TOMLDecodeError:
@@ -359,17 +318,9 @@ def _override_value(key: str, text: str) -> Any:
 
 
 def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
-    """Sets a dotted key in the tree.
+    """Sets a dotted key in the tree; raises ScenarioError, whose message begins with `origin`, if there is no place.
 
-    Args:
-        tree: keys and values, modified in place.
-        key: the dotted key.
-        value: its new value.
-        origin: text that names the source of the value, at the beginning of error messages.
-
-    Raises:
-        ScenarioError: a part of the key other than the last one is a value instead of a section, or the key leads to a
-            list without naming an existing item of it and a key of this item.
+    All parts of the key but the last one must be sections, or existing items of a list.
     """
     *parents, leaf = key.split(".")
     if parents[:1] == ["require"]:
@@ -388,11 +339,7 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
 
 
 def _child(node: Any, part: str, origin: str) -> Any:
-    """Returns the value of the key or list item `part` of a node; a missing key gets an empty section as its value.
-
-    Raises:
-        ScenarioError: the list has no such item; the message begins with `origin`.
-    """
+    """Returns the value of the key or list item `part` of a node; a missing key gets an empty section as its value."""
     if not isinstance(node, list):
         return node.setdefault(part, {})
     if not part.isdecimal() or int(part) >= len(node):
@@ -442,15 +389,12 @@ _ALLOWED = {
 
 
 def shown(text: str, longest: int = 200) -> str:
-    """Returns the text for an error message.
-
-    A text of more than `longest` characters is cut off after half of this number, and its length is stated.
-    """
+    """Returns the text for an error message: a longer text is cut off at half of `longest`, and its length stated."""
     return text if len(text) <= longest else f"{text[: longest // 2]}... ({len(text)} characters)"
 
 
 def _fields(location: Iterable[Any], model: Any) -> list[str]:
-    """Returns the keys allowed in a section of the model, given the location of the section as a sequence of keys."""
+    """Returns the keys allowed in a section of the model; `location` are the keys that lead to it."""
     for part in location:
         if part not in model.model_fields:  # an item of a list, a key of a table
             continue

@@ -13,15 +13,16 @@ import numpy as np
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     ConfigDict,
     Field,
+    GetJsonSchemaHandler,
     PrivateAttr,
+    Strict,
     ValidationInfo,
     create_model,
     field_validator,
 )
-from pydantic_core import PydanticCustomError
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from twin.core import geometry
 from twin.core.records import SensorNoise, StereoRig
@@ -38,14 +39,7 @@ JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", 
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
 
 
-def _number(value: Any) -> Any:
-    """Returns the value unchanged. Raises PydanticCustomError for text and booleans, which pydantic would convert."""
-    if isinstance(value, str | bool):
-        raise PydanticCustomError("float_type", "a number")
-    return value
-
-
-Number = Annotated[float, BeforeValidator(_number)]
+Number = Annotated[float, Strict()]  #: no text and no Booleans
 Coordinate = Annotated[Number, Field(ge=-1e5, le=1e5)]
 Vector2 = tuple[Coordinate, Coordinate]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
@@ -61,7 +55,7 @@ RelativeIntensity = Annotated[Number, Field(ge=0, le=100)]
 
 
 def _path(text: str) -> str:
-    """Returns the text unchanged. Raises PydanticCustomError if the file system rejects it (`path_problem`)."""
+    """Returns the text, checked by `path_problem`."""
     if problem := path_problem(Path(text)):
         raise PydanticCustomError("path", "a path; it {problem}", {"problem": problem})
     return text
@@ -70,10 +64,18 @@ def _path(text: str) -> str:
 FilePath = Annotated[str, AfterValidator(_path)]
 
 
-class Section(BaseModel):
-    """Base class of the sections, which are immutable and reject unknown keys, NaN and infinity."""
+_NUMBER_KINDS: dict[Any, Literal["int_type", "float_type"]] = {
+    int: "int_type", int | None: "int_type", float: "float_type", float | None: "float_type",
+}  # fmt: skip
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+class Section(BaseModel):
+    """Base class of the sections, which are immutable and reject unknown keys, NaN and infinity.
+
+    The text below a key describes it in the schema and in docs/reference.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Returns a copy with some fields changed, validated like new values.
@@ -91,149 +93,115 @@ class Section(BaseModel):
     @field_validator("*", mode="before")
     @classmethod
     def _require_number(cls, value: Any, info: ValidationInfo) -> Any:
-        """Returns the value unchanged. Raises PydanticCustomError for text and booleans where a number is required.
+        """Refuses text and Booleans where a number is required; the items of a list are checked by `Number`."""
+        kind = _NUMBER_KINDS.get(cls.model_fields[info.field_name or ""].annotation)
+        if kind and isinstance(value, str | bool):
+            raise PydanticCustomError(kind, "a number")
+        return value
 
-        The items of a list are checked by `Number`.
-        """
-        kind = cls.model_fields[info.field_name or ""].annotation
-        if kind is int and isinstance(value, str | bool):
-            raise PydanticCustomError("int_type", "an integer")
-        return _number(value) if kind in (float, float | None) else value
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Returns the JSON schema with each description in one line."""
+        found = handler(schema)
+        for key in handler.resolve_ref_schema(found)["properties"].values():
+            if "description" in key:
+                key["description"] = " ".join(key["description"].split())
+        return found
 
 
 class TerrainConfig(Section):
     """Sea floor."""
 
-    kind: Literal["flat", "ripples", "fractal", "reef", "cliffs", "file", "mesh"] = Field(
-        default="reef",
-        description="generator of the heights, file for a measured DEM, or mesh for the triangles of mesh_file, which "
-        "may overhang",
-    )
-    plugin: str | None = Field(
-        default=None, max_length=200, pattern=PLUGIN_NAME,
-        description="generator of another package for the heights, which replaces that of kind and its relief_m and "
-        "base_m: module:Class, or the name of an entry point twin.terrains; it runs code of that package",
-    )  # fmt: skip
-    size_m: tuple[Metres, Metres] = Field(
-        default=(10.0, 10.0), description="extent along x and y, centred at the origin [m]"
-    )
-    relief_m: float = Field(
-        default=0.6, ge=0, le=20, description="highest minus lowest point of a generated sea floor [m]"
-    )
-    base_m: float = Field(
-        default=0.0, ge=-50, le=50, description="height of the lowest point above the reference plane z = 0 [m]"
-    )
-    grid_m: float = Field(
-        default=0.05, gt=0.001, le=1,
-        description="spacing of a generated height grid; of the height grid on which the survey of a mesh is planned, "
-        "the largest spacing: with shorter edges of the mesh it is finer, with more than 2 million nodes coarser [m]",
-    )  # fmt: skip
-    mesh_file: FilePath | None = Field(
-        default=None,
-        description="PLY, OBJ or GLB file with a texture or vertex colours that is the whole sea floor, centred at the "
-        "origin, its lowest point at z = 0; needs kind = mesh; ${TWIN_DATA} is expanded",
-    )
-    mesh_up: Literal["z", "y"] | None = Field(
-        default=None, description="axis of mesh_file that points up; default: y for GLB, z for other files"
-    )
-    mesh_scale: float = Field(default=1.0, ge=1e-4, le=1e4, description="metres per unit of mesh_file")
-    height_file: FilePath | None = Field(
-        default=None,
-        description="DEM: GeoTIFF, 16-bit PNG or .npy; heights are in metres unless a GeoTIFF names another unit; "
-        "${TWIN_DATA} is expanded",
-    )
-    height_spacing_m: float = Field(
-        default=0.01, gt=0, le=10, description="grid spacing of a PNG or .npy height file [m]"
-    )
-    height_range_m: float = Field(
-        default=1.0, gt=0, le=1000, description="height of full white above full black in a PNG height file [m]"
-    )
-    z: Literal["up", "down"] | None = Field(
-        default=None,
-        description="direction in which the values of height_file increase: up for elevations, down for depths; "
-        "default: determined from the file; an ambiguous file is an error",
-    )
-    cover: Literal["sand", "rubble", "rock", "reef", "coral", "seagrass", "mud"] | None = Field(
-        default=None,
-        description="materials of a generated texture; reef: sand, rubble, rock and coral by height and slope; "
-        "coral: sand, fragments of coral and rock with crustose algae; "
-        "default: that of the kind of floor; not with texture_file",
-    )
-    texture_file: FilePath | None = Field(
-        default=None, description="photo of a piece of sea floor, which becomes the texture; default: a generated one"
-    )
-    texture_tiling: Literal["stochastic", "repeat"] = Field(
-        default="stochastic",
-        description="stochastic: the texture is made of pieces of the photo, evenly lit, without visible repetition; "
-        "repeat: the photo is repeated unchanged; needs texture_file",
-    )
-    orthophoto_file: FilePath | None = Field(
-        default=None,
-        description="colour GeoTIFF in any CRS that is laid over the texture of a height file with coordinates",
-    )
-    texture_px_m: float | None = Field(
-        default=None,
-        gt=0.0005,
-        le=1,
-        description="size of a texture pixel, and of a pixel of the photo, on the sea floor [m]; default: 0.005, or "
-        "without a photo the ground sample distance of the images at plan.altitude_m, 0.0006 to 0.005; larger on a "
-        "sea floor that would have more than 40 million texture pixels",
-    )
-    wall_texture: Literal["triplanar", "draped"] = Field(
-        default="triplanar",
-        description="texture of slopes of more than 50 deg. triplanar: projected horizontally, with the detail of "
-        "level ground, and blended with the texture from above up to 65 deg; wherever orthophoto_file has data, its "
-        "colours stay. draped: the texture from above, stretched on slopes. Not with a mesh",
-    )
-    material: Literal["lambert", "oren_nayar", "hapke"] = Field(
-        default="lambert",
-        description="reflection of the light of lamps. lambert: ideally diffuse; oren_nayar: rough, brighter towards "
-        "the light; hapke: a layer of grains with an opposition effect. The texture is the albedo",
-    )
-    roughness_deg: float = Field(
-        default=20.0, ge=0, le=60,
-        description="standard deviation of the slopes too small for the height grid; oren_nayar only [deg]",
-    )  # fmt: skip
-    specular: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="fraction of the light of lamps that is mirrored in highlights, for wet or metallic floors; the "
-        "rest is reflected by the material",
-    )
-    specular_width_deg: float = Field(
-        default=15.0, ge=2, le=45, description="width of the highlights: slope of the mirroring facets (GGX) [deg]"
-    )
+    kind: Literal["flat", "ripples", "fractal", "reef", "cliffs", "file", "mesh"] = "reef"
+    """generator of the heights, file for a measured DEM, or mesh for the triangles of mesh_file, which may overhang"""
+    plugin: str | None = Field(default=None, max_length=200, pattern=PLUGIN_NAME)
+    """generator of another package for the heights, which replaces that of kind and its relief_m and base_m:
+    module:Class, or the name of an entry point twin.terrains; it runs code of that package"""
+    size_m: tuple[Metres, Metres] = (10.0, 10.0)
+    """extent along x and y, centred at the origin [m]"""
+    relief_m: float = Field(default=0.6, ge=0, le=20)
+    """highest minus lowest point of a generated sea floor [m]"""
+    base_m: float = Field(default=0.0, ge=-50, le=50)
+    """height of the lowest point above the reference plane z = 0 [m]"""
+    grid_m: float = Field(default=0.05, gt=0.001, le=1)
+    """spacing of a generated height grid; of the height grid on which the survey of a mesh is planned, the largest
+    spacing: with shorter edges of the mesh it is finer, with more than 2 million nodes coarser [m]"""
+    mesh_file: FilePath | None = None
+    """PLY, OBJ or GLB file with a texture or vertex colours that is the whole sea floor, centred at the origin, its
+    lowest point at z = 0; needs kind = mesh; ${TWIN_DATA} is expanded"""
+    mesh_up: Literal["z", "y"] | None = None
+    """axis of mesh_file that points up; default: y for GLB, z for other files"""
+    mesh_scale: float = Field(default=1.0, ge=1e-4, le=1e4)
+    """metres per unit of mesh_file"""
+    height_file: FilePath | None = None
+    """DEM: GeoTIFF, 16-bit PNG or .npy; heights are in metres unless a GeoTIFF names another unit; ${TWIN_DATA} is
+    expanded"""
+    height_spacing_m: float = Field(default=0.01, gt=0, le=10)
+    """grid spacing of a PNG or .npy height file [m]"""
+    height_range_m: float = Field(default=1.0, gt=0, le=1000)
+    """height of full white above full black in a PNG height file [m]"""
+    z: Literal["up", "down"] | None = None
+    """direction in which the values of height_file increase: up for elevations, down for depths; default: determined
+    from the file; an ambiguous file is an error"""
+    cover: Literal["sand", "rubble", "rock", "reef", "coral", "seagrass", "mud"] | None = None
+    """materials of a generated texture; reef: sand, rubble, rock and coral by height and slope; coral: sand, fragments
+    of coral and rock with crustose algae; default: that of the kind of floor; not with texture_file"""
+    texture_file: FilePath | None = None
+    """photo of a piece of sea floor, which becomes the texture; default: a generated one"""
+    texture_tiling: Literal["stochastic", "repeat"] = "stochastic"
+    """stochastic: the texture is made of pieces of the photo, evenly lit, without visible repetition; repeat: the photo
+    is repeated unchanged; needs texture_file"""
+    orthophoto_file: FilePath | None = None
+    """colour GeoTIFF in any CRS that is laid over the texture of a height file with coordinates"""
+    texture_px_m: float | None = Field(default=None, gt=0.0005, le=1)
+    """size of a texture pixel, and of a pixel of the photo, on the sea floor [m]; default: 0.005, or without a photo
+    the ground sample distance of the images at plan.altitude_m, 0.0006 to 0.005; larger on a sea floor that would have
+    more than 40 million texture pixels"""
+    wall_texture: Literal["triplanar", "draped"] = "triplanar"
+    """texture of slopes of more than 50 deg. triplanar: projected horizontally, with the detail of level ground, and
+    blended with the texture from above up to 65 deg; wherever orthophoto_file has data, its colours stay. draped: the
+    texture from above, stretched on slopes. Not with a mesh"""
+    material: Literal["lambert", "oren_nayar", "hapke"] = "lambert"
+    """reflection of the light of lamps. lambert: ideally diffuse; oren_nayar: rough, brighter towards the light; hapke:
+    a layer of grains with an opposition effect. The texture is the albedo"""
+    roughness_deg: float = Field(default=20.0, ge=0, le=60)
+    """standard deviation of the slopes too small for the height grid; oren_nayar only [deg]"""
+    specular: float = Field(default=0.0, ge=0, le=1)
+    """fraction of the light of lamps that is mirrored in highlights, for wet or metallic floors; the rest is reflected
+    by the material"""
+    specular_width_deg: float = Field(default=15.0, ge=2, le=45)
+    """width of the highlights: slope of the mirroring facets (GGX) [deg]"""
 
 
 class VehicleConfig(Section):
     """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); factors scale its drag and its added mass."""
 
-    dynamics: Literal["rigid", "kinematic"] = Field(
-        default="rigid",
-        description="rigid: a rigid body under thrust, drag and current; kinematic: stays level at constant height, "
-        "keeps its heading and moves exactly at the commanded horizontal velocity, without forces",
-    )
-    buoyancy_n: float = Field(
-        default=1.0, ge=-20, le=20, description="buoyancy minus weight after trimming, positive upwards [N]"
-    )
-    drag_factor: float = Field(default=1.0, ge=0.05, le=20, description="multiplies linear and quadratic drag")
-    added_mass_factor: float = Field(default=1.0, ge=0, le=5, description="multiplies the added mass")
+    dynamics: Literal["rigid", "kinematic"] = "rigid"
+    """rigid: a rigid body under thrust, drag and current; kinematic: stays level at constant height, keeps its heading
+    and moves exactly at the commanded horizontal velocity, without forces"""
+    buoyancy_n: float = Field(default=1.0, ge=-20, le=20)
+    """buoyancy minus weight after trimming, positive upwards [N]"""
+    drag_factor: float = Field(default=1.0, ge=0.05, le=20)
+    """multiplies linear and quadratic drag"""
+    added_mass_factor: float = Field(default=1.0, ge=0, le=5)
+    """multiplies the added mass"""
 
 
 class RigConfig(Section):
     """Calibrated stereo pair that looks down, with the top of the image towards the bow."""
 
-    image_width_px: int = Field(default=320, ge=64, le=4096, description="image width [px]")
-    image_height_px: int = Field(default=240, ge=48, le=4096, description="image height [px]")
-    hfov_deg: float = Field(default=60.0, gt=5, lt=150, description="horizontal field of view in water [deg]")
-    baseline_m: float = Field(default=0.15, gt=0.005, le=3, description="distance between the cameras [m]")
-    frame_rate_hz: float = Field(
-        default=30.0, ge=5, le=120, description="rate of frames and commands; at low rates the control oscillates [Hz]"
-    )
-    mount_m: Vector3 = Field(
-        default=(0.0, 0.0, -0.15), description="midpoint of the cameras in the body frame: forward, left, up [m]"
-    )
+    image_width_px: int = Field(default=320, ge=64, le=4096)
+    """image width [px]"""
+    image_height_px: int = Field(default=240, ge=48, le=4096)
+    """image height [px]"""
+    hfov_deg: float = Field(default=60.0, gt=5, lt=150)
+    """horizontal field of view in water [deg]"""
+    baseline_m: float = Field(default=0.15, gt=0.005, le=3)
+    """distance between the cameras [m]"""
+    frame_rate_hz: float = Field(default=30.0, ge=5, le=120)
+    """rate of frames and commands; at low rates the control oscillates [Hz]"""
+    mount_m: Vector3 = (0.0, 0.0, -0.15)
+    """midpoint of the cameras in the body frame: forward, left, up [m]"""
 
 
 #: How light is scattered: see `imaging.scattering`.
@@ -243,39 +211,27 @@ ScatteringModel = Literal["full", "single", "none"]
 class ImagingConfig(Section):
     """Image formation."""
 
-    fidelity: Literal["rendered", "surrogate"] = Field(
-        default="rendered",
-        description="rendered: images are rendered and matched; surrogate: measurements are sampled from a fitted "
-        "error model, about a hundred times faster",
-    )
-    error_model: FilePath | None = Field(
-        default=None, description="error model of the surrogate, written by `twin fit-surrogate`; default: built-in"
-    )
-    extrapolate: bool = Field(
-        default=False,
-        description="run a surrogate survey that lies outside the fitted range of its error model, with a warning; "
-        "false: such a survey is refused; set by --extrapolate",
-    )
-    gray_level: float = Field(
-        default=0.45, gt=0.01, lt=1, description="target of auto-exposure: mean image level, a fraction of full scale"
-    )
-    noise_sd: float = Field(
-        default=0.008, ge=0, le=0.5, description="read noise (1 sigma), a fraction of full scale; unused with [sensor]"
-    )
-    shot_noise: float = Field(
-        default=0.006, ge=0, le=0.5,
-        description="shot noise (1 sigma) at full scale, as a fraction of it; grows as the square root of the signal; "
-        "unused with [sensor]",
-    )  # fmt: skip
-    shadows: bool = Field(
-        default=False, description="the sea floor and objects cast shadows in the light of lamps and sun"
-    )
-    scattering: ScatteringModel = Field(
-        default="full",
-        description="full: multiple scattering, which softens the beams, blurs the image and brightens the "
-        "backscatter; single: light scattered once is the backscatter, all other scattered light is lost; "
-        "none: the water absorbs but does not scatter",
-    )
+    fidelity: Literal["rendered", "surrogate"] = "rendered"
+    """rendered: images are rendered and matched; surrogate: measurements are sampled from a fitted error model, about a
+    hundred times faster"""
+    error_model: FilePath | None = None
+    """error model of the surrogate, written by `twin fit-surrogate`; default: built-in"""
+    extrapolate: bool = False
+    """run a surrogate survey that lies outside the fitted range of its error model, with a warning; false: such a
+    survey is refused; set by --extrapolate"""
+    gray_level: float = Field(default=0.45, gt=0.01, lt=1)
+    """target of auto-exposure: mean image level, a fraction of full scale"""
+    noise_sd: float = Field(default=0.008, ge=0, le=0.5)
+    """read noise (1 sigma), a fraction of full scale; unused with [sensor]"""
+    shot_noise: float = Field(default=0.006, ge=0, le=0.5)
+    """shot noise (1 sigma) at full scale, as a fraction of it; grows as the square root of the signal; unused with
+    [sensor]"""
+    shadows: bool = False
+    """the sea floor and objects cast shadows in the light of lamps and sun"""
+    scattering: ScatteringModel = "full"
+    """full: multiple scattering, which softens the beams, blurs the image and brightens the backscatter; single: light
+    scattered once is the backscatter, all other scattered light is lost; none: the water absorbs but does not
+    scatter"""
 
 
 class SensorConfig(Section):
@@ -284,55 +240,45 @@ class SensorConfig(Section):
     The defaults are typical of a colour machine-vision camera with a global shutter and 3.45 um pixels.
     """
 
-    exposure_min_ms: float = Field(default=0.05, gt=0, le=1000, description="shortest exposure time [ms]")
-    exposure_max_ms: float = Field(
-        default=15.0, gt=0, le=1000,
-        description="longest exposure time, at most the frame interval; in less light the gain is raised [ms]",
-    )  # fmt: skip
-    exposure_lag_s: float = Field(default=0.5, ge=0, le=60, description="time constant (1/e) of auto-exposure [s]")
-    gain_max_db: float = Field(
-        default=24.0, ge=0, le=60, description="largest analogue gain; 20 dB is a factor of 10 [dB]"
-    )
-    f_number: float = Field(default=2.8, ge=0.7, le=64, description="focal length divided by aperture diameter")
-    pixel_um: float = Field(default=3.45, ge=0.5, le=100, description="side of a square pixel [um]")
-    quantum_efficiency: tuple[Efficiency, Efficiency, Efficiency] = Field(
-        default=(0.4, 0.55, 0.45), description="electrons per photon for R, G, B, including filters and lens"
-    )
-    full_well_e: float = Field(
-        default=10000.0, ge=100, le=1e7, description="full-well capacity, which is full scale at gain 1 [e-]"
-    )
-    read_noise_e: float = Field(default=2.4, ge=0, le=1000, description="read noise of a pixel (1 sigma) [e-]")
-    bits: Literal[8, 12] = Field(
-        default=12, description="bit depth of the analogue-to-digital converter; delivered images have 8 bits"
-    )
-    bayer: bool = Field(
-        default=True, description="Bayer filter (RGGB) with interpolated colours; false: three bands per pixel"
-    )
-    vignetting_power: float = Field(
-        default=4.0, ge=0, le=8,
-        description="irradiance falls with this power of the cosine of the field angle; 4: natural vignetting, 0: none",
-    )  # fmt: skip
-    motion_blur: bool = Field(default=True, description="motion during the exposure blurs the image")
-    readout_ms: float = Field(
-        default=0.0, ge=0, le=1000, description="rolling shutter: first to last row; 0 is a global shutter [ms]"
-    )
-    tone_curve: Literal["linear", "srgb", "log"] = Field(
-        default="linear",
-        description="level of the delivered image as a function of the signal: proportional; sRGB (IEC 61966-2-1); or "
-        "logarithmic over 6 stops; imaging.gray_level is the level after the curve",
-    )
-    white_balance: Literal["white_light", "gains", "grey_world", "temperature", "water"] = Field(
-        default="white_light",
-        description="what appears grey: a grey surface in white light; gains: white_gains are set by hand; grey_world: "
-        "the mean of the image; temperature: a grey surface in light of white_temperature_k; water: a grey floor seen "
-        "from the planned altitude in the water of the scenario",
-    )
-    white_gains: tuple[WhiteGain, WhiteGain, WhiteGain] = Field(
-        default=(1.0, 1.0, 1.0), description="gains: factors of the raw signals R, G, B"
-    )
-    white_temperature_k: float = Field(
-        default=6500.0, ge=1000, le=40000, description="temperature: colour temperature of the light [K]"
-    )
+    exposure_min_ms: float = Field(default=0.05, gt=0, le=1000)
+    """shortest exposure time [ms]"""
+    exposure_max_ms: float = Field(default=15.0, gt=0, le=1000)
+    """longest exposure time, at most the frame interval; in less light the gain is raised [ms]"""
+    exposure_lag_s: float = Field(default=0.5, ge=0, le=60)
+    """time constant (1/e) of auto-exposure [s]"""
+    gain_max_db: float = Field(default=24.0, ge=0, le=60)
+    """largest analogue gain; 20 dB is a factor of 10 [dB]"""
+    f_number: float = Field(default=2.8, ge=0.7, le=64)
+    """focal length divided by aperture diameter"""
+    pixel_um: float = Field(default=3.45, ge=0.5, le=100)
+    """side of a square pixel [um]"""
+    quantum_efficiency: tuple[Efficiency, Efficiency, Efficiency] = (0.4, 0.55, 0.45)
+    """electrons per photon for R, G, B, including filters and lens"""
+    full_well_e: float = Field(default=10000.0, ge=100, le=1e7)
+    """full-well capacity, which is full scale at gain 1 [e-]"""
+    read_noise_e: float = Field(default=2.4, ge=0, le=1000)
+    """read noise of a pixel (1 sigma) [e-]"""
+    bits: Literal[8, 12] = 12
+    """bit depth of the analogue-to-digital converter; delivered images have 8 bits"""
+    bayer: bool = True
+    """Bayer filter (RGGB) with interpolated colours; false: three bands per pixel"""
+    vignetting_power: float = Field(default=4.0, ge=0, le=8)
+    """irradiance falls with this power of the cosine of the field angle; 4: natural vignetting, 0: none"""
+    motion_blur: bool = True
+    """motion during the exposure blurs the image"""
+    readout_ms: float = Field(default=0.0, ge=0, le=1000)
+    """rolling shutter: first to last row; 0 is a global shutter [ms]"""
+    tone_curve: Literal["linear", "srgb", "log"] = "linear"
+    """level of the delivered image as a function of the signal: proportional; sRGB (IEC 61966-2-1); or logarithmic over
+    6 stops; imaging.gray_level is the level after the curve"""
+    white_balance: Literal["white_light", "gains", "grey_world", "temperature", "water"] = "white_light"
+    """what appears grey: a grey surface in white light; gains: white_gains are set by hand; grey_world: the mean of the
+    image; temperature: a grey surface in light of white_temperature_k; water: a grey floor seen from the planned
+    altitude in the water of the scenario"""
+    white_gains: tuple[WhiteGain, WhiteGain, WhiteGain] = (1.0, 1.0, 1.0)
+    """gains: factors of the raw signals R, G, B"""
+    white_temperature_k: float = Field(default=6500.0, ge=1000, le=40000)
+    """temperature: colour temperature of the light [K]"""
 
 
 class LensConfig(Section):
@@ -343,24 +289,25 @@ class LensConfig(Section):
     water if there is no port.
     """
 
-    k1: float = Field(default=0.0, ge=-2, le=2, description="radial distortion, coefficient of r^2")
-    k2: float = Field(default=0.0, ge=-5, le=5, description="radial distortion, coefficient of r^4")
-    k3: float = Field(default=0.0, ge=-10, le=10, description="radial distortion, coefficient of r^6")
-    p1: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion along the columns")
-    p2: float = Field(default=0.0, ge=-0.2, le=0.2, description="tangential distortion along the rows")
-    diffraction: bool = Field(default=False, description="blur by diffraction at sensor.f_number; needs [sensor]")
-    blur_px: tuple[BlurPx, BlurPx, BlurPx] = Field(
-        default=(0.0, 0.0, 0.0),
-        description="blur by aberrations: standard deviation of a Gaussian point spread function for R, G, B [px]",
-    )
-    lateral_colour: tuple[LateralColour, LateralColour] = Field(
-        default=(0.0, 0.0), description="magnification of the images in R and in B relative to that in G, minus 1"
-    )
-    focus_m: float = Field(
-        default=0.0, ge=0, le=1000,
-        description="depth in focus; other depths are blurred by the aperture (sensor.f_number); 0: all depths are in "
-        "focus; needs [sensor] [m]",
-    )  # fmt: skip
+    k1: float = Field(default=0.0, ge=-2, le=2)
+    """radial distortion, coefficient of r^2"""
+    k2: float = Field(default=0.0, ge=-5, le=5)
+    """radial distortion, coefficient of r^4"""
+    k3: float = Field(default=0.0, ge=-10, le=10)
+    """radial distortion, coefficient of r^6"""
+    p1: float = Field(default=0.0, ge=-0.2, le=0.2)
+    """tangential distortion along the columns"""
+    p2: float = Field(default=0.0, ge=-0.2, le=0.2)
+    """tangential distortion along the rows"""
+    diffraction: bool = False
+    """blur by diffraction at sensor.f_number; needs [sensor]"""
+    blur_px: tuple[BlurPx, BlurPx, BlurPx] = (0.0, 0.0, 0.0)
+    """blur by aberrations: standard deviation of a Gaussian point spread function for R, G, B [px]"""
+    lateral_colour: tuple[LateralColour, LateralColour] = (0.0, 0.0)
+    """magnification of the images in R and in B relative to that in G, minus 1"""
+    focus_m: float = Field(default=0.0, ge=0, le=1000)
+    """depth in focus; other depths are blurred by the aperture (sensor.f_number); 0: all depths are in focus; needs
+    [sensor] [m]"""
 
 
 class PortConfig(Section):
@@ -371,31 +318,25 @@ class PortConfig(Section):
     distance of the floor. The position of a camera is the projection centre of its equivalent pinhole camera.
     """
 
-    kind: Literal["none", "flat", "dome"] = Field(
-        default="none", description="none: pinhole in water; flat: plane port; dome: concentric spheres"
-    )
-    thickness_m: float = Field(default=0.01, gt=0, le=0.2, description="thickness of the glass [m]")
-    distance_m: float = Field(
-        default=0.02, gt=0, le=1, description="flat: distance from the entrance pupil of the lens to the glass [m]"
-    )
-    tilt_deg: float = Field(
-        default=0.0, ge=-30, le=30,
-        description="flat: rotation about the image rows, positive moves the lower side away from the lens [deg]",
-    )  # fmt: skip
-    radius_m: float = Field(default=0.05, gt=0, le=1, description="dome: inner radius [m]")
-    offset_m: Vector3 = Field(
-        default=(0.0, 0.0, 0.0),
-        description="dome: centre relative to the entrance pupil, along right, down, forward [m]",
-    )
-    glass_index: float = Field(
-        default=1.49, ge=1, le=3, description="refractive index of the window of the port: acrylic 1.49, glass 1.52"
-    )
-    water_index: float = Field(default=SEA_WATER_INDEX, ge=1, le=2, description="refractive index of sea water")
-    calibrated_at_m: float = Field(
-        default=0.0, ge=0, le=100,
-        description="depth along the optical axis for which images are rectified exactly, as after a calibration in "
-        "water; 0: the port is modelled as a change of focal length [m]",
-    )  # fmt: skip
+    kind: Literal["none", "flat", "dome"] = "none"
+    """none: pinhole in water; flat: plane port; dome: concentric spheres"""
+    thickness_m: float = Field(default=0.01, gt=0, le=0.2)
+    """thickness of the glass [m]"""
+    distance_m: float = Field(default=0.02, gt=0, le=1)
+    """flat: distance from the entrance pupil of the lens to the glass [m]"""
+    tilt_deg: float = Field(default=0.0, ge=-30, le=30)
+    """flat: rotation about the image rows, positive moves the lower side away from the lens [deg]"""
+    radius_m: float = Field(default=0.05, gt=0, le=1)
+    """dome: inner radius [m]"""
+    offset_m: Vector3 = (0.0, 0.0, 0.0)
+    """dome: centre relative to the entrance pupil, along right, down, forward [m]"""
+    glass_index: float = Field(default=1.49, ge=1, le=3)
+    """refractive index of the window of the port: acrylic 1.49, glass 1.52"""
+    water_index: float = Field(default=SEA_WATER_INDEX, ge=1, le=2)
+    """refractive index of sea water"""
+    calibrated_at_m: float = Field(default=0.0, ge=0, le=100)
+    """depth along the optical axis for which images are rectified exactly, as after a calibration in water; 0: the port
+    is modelled as a change of focal length [m]"""
 
 
 class CalibrationErrorConfig(Section):
@@ -404,71 +345,52 @@ class CalibrationErrorConfig(Section):
     The errors of focal length and baseline are relative to the values that the estimators use.
     """
 
-    focal_error: float = Field(
-        default=0.0, ge=-0.2, le=0.2, description="relative error of the focal length of both cameras"
-    )
-    left_principal_point_error_px: Vector2 = Field(
-        default=(0.0, 0.0), description="error of the left principal point, to the right and down [px]"
-    )
-    right_principal_point_error_px: Vector2 = Field(
-        default=(0.0, 0.0), description="error of the right principal point, to the right and down [px]"
-    )
-    baseline_error: float = Field(default=0.0, ge=-0.5, le=0.5, description="relative error of the baseline")
-    right_roll_deg: float = Field(
-        default=0.0, ge=-5, le=5,
-        description="rotation of the right camera about its optical axis, clockwise as seen from behind [deg]",
-    )  # fmt: skip
-    right_pitch_deg: float = Field(default=0.0, ge=-5, le=5, description="upward rotation of the right camera [deg]")
-    right_yaw_deg: float = Field(
-        default=0.0, ge=-5, le=5, description="rotation of the right camera away from the left one [deg]"
-    )
-    k1_error: float = Field(default=0.0, ge=-2, le=2, description="true lens.k1 minus its calibrated value")
-    k2_error: float = Field(default=0.0, ge=-5, le=5, description="true lens.k2 minus its calibrated value")
+    focal_error: float = Field(default=0.0, ge=-0.2, le=0.2)
+    """relative error of the focal length of both cameras"""
+    left_principal_point_error_px: Vector2 = (0.0, 0.0)
+    """error of the left principal point, to the right and down [px]"""
+    right_principal_point_error_px: Vector2 = (0.0, 0.0)
+    """error of the right principal point, to the right and down [px]"""
+    baseline_error: float = Field(default=0.0, ge=-0.5, le=0.5)
+    """relative error of the baseline"""
+    right_roll_deg: float = Field(default=0.0, ge=-5, le=5)
+    """rotation of the right camera about its optical axis, clockwise as seen from behind [deg]"""
+    right_pitch_deg: float = Field(default=0.0, ge=-5, le=5)
+    """upward rotation of the right camera [deg]"""
+    right_yaw_deg: float = Field(default=0.0, ge=-5, le=5)
+    """rotation of the right camera away from the left one [deg]"""
+    k1_error: float = Field(default=0.0, ge=-2, le=2)
+    """true lens.k1 minus its calibrated value"""
+    k2_error: float = Field(default=0.0, ge=-5, le=5)
+    """true lens.k2 minus its calibrated value"""
 
 
 class WaterConfig(Section):
     """Inherent optical properties of the water for R, G, B: those of a Jerlov type, or given explicitly."""
 
-    source: WaterSourceName = Field(
-        default="solonenko2015",
-        description="table of absorption and scattering of the Jerlov types: Solonenko & Mobley 2015 (all types, "
-        "derived from measured Kd) or Williamson & Hollins 2022 (IB, II, III, 1C, 3C, 5C; measured), whose scattering "
-        "at 550 nm is 0.29 (III) to 2.3 times (IB) as large",
-    )
-    jerlov: JERLOV = Field(
-        default="IB", description="Jerlov water type of the source, or clear (no attenuation, no scattering)"
-    )
-    turbidity: float = Field(default=1.0, ge=0, le=100, description="multiplies the scattering coefficient")
-    absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
-        default=None,
-        description="absorption coefficient for R, G, B; replaces the Jerlov type; needs scattering_per_m [1/m]",
-    )
-    scattering_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = Field(
-        default=None,
-        description="scattering coefficient for R, G, B; replaces the Jerlov type; needs absorption_per_m [1/m]",
-    )
-    spectrum_file: FilePath | None = Field(
-        default=None,
-        description="CSV of wavelength [nm], absorption and scattering [1/m]; replaces the Jerlov type; "
-        "${TWIN_DATA} is expanded",
-    )
-    phase_function: Literal["sea", "petzold", "fournier_forand", "henyey_greenstein"] = Field(
-        default="sea",
-        description="angular distribution of scattered light: sea (molecules by Morel, the rest of the scattering by "
-        "Petzold's average particle), or one function alone: petzold, fournier_forand, henyey_greenstein",
-    )
-    particle_index: float = Field(
-        default=1.1, gt=1.0, le=1.5,
-        description="fournier_forand: refractive index of the particles relative to water",
-    )  # fmt: skip
-    particle_slope: float = Field(
-        default=3.58, gt=3.0, lt=5.0,
-        description="fournier_forand: exponent of the size distribution of the particles",
-    )  # fmt: skip
-    mean_cosine: float = Field(
-        default=0.924, ge=0, le=0.99,
-        description="henyey_greenstein: mean cosine g of the scattering angle; 0 is isotropic",
-    )  # fmt: skip
+    source: WaterSourceName = "solonenko2015"
+    """table of absorption and scattering of the Jerlov types: Solonenko & Mobley 2015 (all types, derived from measured
+    Kd) or Williamson & Hollins 2022 (IB, II, III, 1C, 3C, 5C; measured), whose scattering at 550 nm is 0.29 (III) to
+    2.3 times (IB) as large"""
+    jerlov: JERLOV = "IB"
+    """Jerlov water type of the source, or clear (no attenuation, no scattering)"""
+    turbidity: float = Field(default=1.0, ge=0, le=100)
+    """multiplies the scattering coefficient"""
+    absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = None
+    """absorption coefficient for R, G, B; replaces the Jerlov type; needs scattering_per_m [1/m]"""
+    scattering_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = None
+    """scattering coefficient for R, G, B; replaces the Jerlov type; needs absorption_per_m [1/m]"""
+    spectrum_file: FilePath | None = None
+    """CSV of wavelength [nm], absorption and scattering [1/m]; replaces the Jerlov type; ${TWIN_DATA} is expanded"""
+    phase_function: Literal["sea", "petzold", "fournier_forand", "henyey_greenstein"] = "sea"
+    """angular distribution of scattered light: sea (molecules by Morel, the rest of the scattering by Petzold's average
+    particle), or one function alone: petzold, fournier_forand, henyey_greenstein"""
+    particle_index: float = Field(default=1.1, gt=1.0, le=1.5)
+    """fournier_forand: refractive index of the particles relative to water"""
+    particle_slope: float = Field(default=3.58, gt=3.0, lt=5.0)
+    """fournier_forand: exponent of the size distribution of the particles"""
+    mean_cosine: float = Field(default=0.924, ge=0, le=0.99)
+    """henyey_greenstein: mean cosine g of the scattering angle; 0 is isotropic"""
 
     @property
     def label(self) -> str:
@@ -500,126 +422,87 @@ class WaterConfig(Section):
 class LampConfig(Section):
     """Lamp on the vehicle."""
 
-    position_m: Vector3 = Field(description="position in the body frame: forward, left, up [m]")
-    tilt_deg: float = Field(
-        default=0.0,
-        ge=-90,
-        le=90,
-        description="angle of the beam axis towards the bow, from the vertical plane across the vehicle [deg]",
-    )
-    pan_deg: float = Field(
-        default=0.0,
-        ge=-90,
-        le=90,
-        description="rotation of the beam axis in the plane across the vehicle, from straight down to port [deg]",
-    )
-    intensity_cd: float = Field(default=1000.0, ge=0, le=1e6, description="luminous intensity on the beam axis [cd]")
-    beam: tuple[tuple[OffAxisDeg, RelativeIntensity], ...] = Field(
-        default=(), max_length=1000,
-        description="beam pattern: pairs of angle off the axis [deg], from 0, and intensity relative to the axis, "
-        "interpolated linearly, dark beyond the last angle; empty: the measured beam of an LED lamp",
-    )  # fmt: skip
-    colour_temperature_k: float = Field(
-        default=6500.0, ge=1000, le=40000,
-        description="colour temperature; 6500 is white; the luminous intensity does not change with it [K]",
-    )  # fmt: skip
+    position_m: Vector3
+    """position in the body frame: forward, left, up [m]"""
+    tilt_deg: float = Field(default=0.0, ge=-90, le=90)
+    """angle of the beam axis towards the bow, from the vertical plane across the vehicle [deg]"""
+    pan_deg: float = Field(default=0.0, ge=-90, le=90)
+    """rotation of the beam axis in the plane across the vehicle, from straight down to port [deg]"""
+    intensity_cd: float = Field(default=1000.0, ge=0, le=1e6)
+    """luminous intensity on the beam axis [cd]"""
+    beam: tuple[tuple[OffAxisDeg, RelativeIntensity], ...] = Field(default=(), max_length=1000)
+    """beam pattern: pairs of angle off the axis [deg], from 0, and intensity relative to the axis, interpolated
+    linearly, dark beyond the last angle; empty: the measured beam of an LED lamp"""
+    colour_temperature_k: float = Field(default=6500.0, ge=1000, le=40000)
+    """colour temperature; 6500 is white; the luminous intensity does not change with it [K]"""
 
 
 class SunConfig(Section):
     """Daylight of sun and sky through a level water surface."""
 
-    illuminance_lx: float = Field(
-        default=0.0, ge=0, le=2e5,
-        description="illuminance of a horizontal plane by white daylight, just below the surface [lx]",
-    )  # fmt: skip
-    elevation_deg: float = Field(
-        default=90.0,
-        ge=1,
-        le=90,
-        description="elevation of the sun above the horizon, in air; the surface refracts its light; 90: zenith [deg]",
-    )
-    azimuth_deg: float = Field(
-        default=0.0, ge=-360, le=360, description="direction to the sun, counter-clockwise from x (east) [deg]"
-    )
-    sky_share: float = Field(
-        default=0.2, ge=0, le=1,
-        description="share of the illuminance that is diffuse light of a uniform sky; 0.2: clear sky, high sun; "
-        "1: overcast",
-    )  # fmt: skip
-    depth_m: float = Field(
-        default=0.0, ge=0, le=500,
-        description="depth of the reference plane z = 0 below the water surface; illuminance_lx applies at the surface "
-        "and decreases with depth; 0: no surface, illuminance_lx applies on the sea floor at any height [m]",
-    )  # fmt: skip
-    caustics: float = Field(
-        default=0.0, ge=0, le=1,
-        description="fraction of the daylight that surface waves focus into caustics; needs depth_m",
-    )  # fmt: skip
-    wind_mps: float = Field(
-        default=5.0, ge=3, le=15,
-        description="wind speed 10 m above the sea, which makes the waves of the caustics; it blows towards east [m/s]",
-    )  # fmt: skip
+    illuminance_lx: float = Field(default=0.0, ge=0, le=2e5)
+    """illuminance of a horizontal plane by white daylight, just below the surface [lx]"""
+    elevation_deg: float = Field(default=90.0, ge=1, le=90)
+    """elevation of the sun above the horizon, in air; the surface refracts its light; 90: zenith [deg]"""
+    azimuth_deg: float = Field(default=0.0, ge=-360, le=360)
+    """direction to the sun, counter-clockwise from x (east) [deg]"""
+    sky_share: float = Field(default=0.2, ge=0, le=1)
+    """share of the illuminance that is diffuse light of a uniform sky; 0.2: clear sky, high sun; 1: overcast"""
+    depth_m: float = Field(default=0.0, ge=0, le=500)
+    """depth of the reference plane z = 0 below the water surface; illuminance_lx applies at the surface and decreases
+    with depth; 0: no surface, illuminance_lx applies on the sea floor at any height [m]"""
+    caustics: float = Field(default=0.0, ge=0, le=1)
+    """fraction of the daylight that surface waves focus into caustics; needs depth_m"""
+    wind_mps: float = Field(default=5.0, ge=3, le=15)
+    """wind speed 10 m above the sea, which makes the waves of the caustics; it blows towards east [m/s]"""
 
 
 class SnowConfig(Section):
     """Marine snow: particles that drift with the current through the light of lamps and sun."""
 
-    density_per_m3: float = Field(default=0.0, ge=0, le=5000, description="particles per cubic metre; 0: none [1/m3]")
-    diameter_m: float = Field(
-        default=0.001, ge=0.0001, le=0.02, description="diameter of all particles, without junge_exponent [m]"
-    )
-    junge_exponent: float | None = Field(
-        default=None, gt=1, le=8,
-        description="size distribution: the number of particles per interval of diameter falls as this power of the "
-        "diameter, from diameter_min_m to diameter_max_m (Junge); 3 to 5 in the sea; default: one diameter",
-    )  # fmt: skip
-    diameter_min_m: float = Field(
-        default=0.0003, ge=0.0001, le=0.02, description="smallest diameter of the distribution [m]"
-    )
-    diameter_max_m: float = Field(
-        default=0.01, ge=0.0001, le=0.02, description="largest diameter of the distribution [m]"
-    )
-    albedo: float = Field(default=0.5, gt=0, le=1, description="albedo of a particle, the fraction of light reflected")
+    density_per_m3: float = Field(default=0.0, ge=0, le=5000)
+    """particles per cubic metre; 0: none [1/m3]"""
+    diameter_m: float = Field(default=0.001, ge=0.0001, le=0.02)
+    """diameter of all particles, without junge_exponent [m]"""
+    junge_exponent: float | None = Field(default=None, gt=1, le=8)
+    """size distribution: the number of particles per interval of diameter falls as this power of the diameter, from
+    diameter_min_m to diameter_max_m (Junge); 3 to 5 in the sea; default: one diameter"""
+    diameter_min_m: float = Field(default=0.0003, ge=0.0001, le=0.02)
+    """smallest diameter of the distribution [m]"""
+    diameter_max_m: float = Field(default=0.01, ge=0.0001, le=0.02)
+    """largest diameter of the distribution [m]"""
+    albedo: float = Field(default=0.5, gt=0, le=1)
+    """albedo of a particle, the fraction of light reflected"""
 
 
 class CurrentConfig(Section):
     """Steady, irrotational current."""
 
-    velocity_mps: Vector3 = Field(default=(0.0, 0.0, 0.0), description="velocity: east, north, up [m/s]")
+    velocity_mps: Vector3 = (0.0, 0.0, 0.0)
+    """velocity: east, north, up [m/s]"""
 
 
 class NavigationConfig(Section):
     """Navigation sensors and their noise; the estimators receive only the readings of the sensors in `aiding`."""
 
-    aiding: tuple[AIDING, ...] = Field(default=(), description="sensors that aid vision; empty: vision only")
-    pressure_sigma_m: float = Field(
-        default=0.01, gt=0, le=10, description="standard deviation of the height from the pressure sensor [m]"
-    )
-    attitude_sigma_deg: float = Field(
-        default=0.2, gt=0, le=30, description="standard deviation of roll and pitch from the AHRS [deg]"
-    )
-    heading_sigma_deg: float = Field(
-        default=0.5, gt=0, le=90, description="standard deviation of the heading from the AHRS [deg]"
-    )
-    dvl_sigma_mps: float = Field(
-        default=SensorNoise.dvl_mps, gt=0, le=10,
-        description="standard deviation of each axis of the velocity over ground from the DVL [m/s]",
-    )  # fmt: skip
-    dvl_scale_sigma: float = Field(
-        default=SensorNoise.dvl_scale, gt=0, le=0.1,
-        description="standard deviation of the relative scale error of the DVL velocity, constant during a survey",
-    )  # fmt: skip
-    usbl_sigma_m: float = Field(
-        default=SensorNoise.usbl_m, gt=0, le=100,
-        description="standard deviation of each axis of an acoustic position fix [m]",
-    )  # fmt: skip
-    usbl_interval_s: float = Field(
-        default=1.0, gt=0, le=3600, description="shortest time between acoustic fixes, each taken at a keyframe [s]"
-    )
-    beacon_sigma_px: float = Field(
-        default=SensorNoise.beacon_px, gt=0, le=50,
-        description="standard deviation of column and row of a beacon in the image [px]",
-    )  # fmt: skip
+    aiding: tuple[AIDING, ...] = ()
+    """sensors that aid vision; empty: vision only"""
+    pressure_sigma_m: float = Field(default=0.01, gt=0, le=10)
+    """standard deviation of the height from the pressure sensor [m]"""
+    attitude_sigma_deg: float = Field(default=0.2, gt=0, le=30)
+    """standard deviation of roll and pitch from the AHRS [deg]"""
+    heading_sigma_deg: float = Field(default=0.5, gt=0, le=90)
+    """standard deviation of the heading from the AHRS [deg]"""
+    dvl_sigma_mps: float = Field(default=SensorNoise.dvl_mps, gt=0, le=10)
+    """standard deviation of each axis of the velocity over ground from the DVL [m/s]"""
+    dvl_scale_sigma: float = Field(default=SensorNoise.dvl_scale, gt=0, le=0.1)
+    """standard deviation of the relative scale error of the DVL velocity, constant during a survey"""
+    usbl_sigma_m: float = Field(default=SensorNoise.usbl_m, gt=0, le=100)
+    """standard deviation of each axis of an acoustic position fix [m]"""
+    usbl_interval_s: float = Field(default=1.0, gt=0, le=3600)
+    """shortest time between acoustic fixes, each taken at a keyframe [s]"""
+    beacon_sigma_px: float = Field(default=SensorNoise.beacon_px, gt=0, le=50)
+    """standard deviation of column and row of a beacon in the image [px]"""
 
 
 class ImuConfig(Section):
@@ -631,97 +514,67 @@ class ImuConfig(Section):
     A surrogate survey simulates no IMU.
     """
 
-    rate_hz: float | None = Field(
-        default=None, gt=0, le=1000,
-        description="rate of the readings, at most and by default that of the physics: the smallest multiple of "
-        "rig.frame_rate_hz that is at least 120 Hz; kinematic vehicle: rig.frame_rate_hz [Hz]",
-    )  # fmt: skip
-    gyroscope_noise_density: float = Field(
-        default=1.6968e-4, ge=0, le=1, description="white noise of each angular rate [rad/s/sqrt(Hz)]"
-    )
-    gyroscope_random_walk: float = Field(
-        default=1.9393e-5, ge=0, le=1, description="random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]"
-    )
-    gyroscope_bias_sigma_radps: float = Field(
-        default=8.7e-3, ge=0, le=1, description="standard deviation of the bias of each angular rate at 0 s [rad/s]"
-    )
-    accelerometer_noise_density: float = Field(
-        default=2.0e-3, ge=0, le=10, description="white noise of each specific force [m/s2/sqrt(Hz)]"
-    )
-    accelerometer_random_walk: float = Field(
-        default=3.0e-3, ge=0, le=10, description="random walk of the bias of each specific force [m/s3/sqrt(Hz)]"
-    )
-    accelerometer_bias_sigma_mps2: float = Field(
-        default=0.196, ge=0, le=10, description="standard deviation of the bias of each specific force at 0 s [m/s2]"
-    )
+    rate_hz: float | None = Field(default=None, gt=0, le=1000)
+    """rate of the readings, at most and by default that of the physics: the smallest multiple of rig.frame_rate_hz that
+    is at least 120 Hz; kinematic vehicle: rig.frame_rate_hz [Hz]"""
+    gyroscope_noise_density: float = Field(default=1.6968e-4, ge=0, le=1)
+    """white noise of each angular rate [rad/s/sqrt(Hz)]"""
+    gyroscope_random_walk: float = Field(default=1.9393e-5, ge=0, le=1)
+    """random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]"""
+    gyroscope_bias_sigma_radps: float = Field(default=8.7e-3, ge=0, le=1)
+    """standard deviation of the bias of each angular rate at 0 s [rad/s]"""
+    accelerometer_noise_density: float = Field(default=2.0e-3, ge=0, le=10)
+    """white noise of each specific force [m/s2/sqrt(Hz)]"""
+    accelerometer_random_walk: float = Field(default=3.0e-3, ge=0, le=10)
+    """random walk of the bias of each specific force [m/s3/sqrt(Hz)]"""
+    accelerometer_bias_sigma_mps2: float = Field(default=0.196, ge=0, le=10)
+    """standard deviation of the bias of each specific force at 0 s [m/s2]"""
 
 
 class BeaconConfig(Section):
     """Small light at a surveyed position."""
 
-    position_m: Vector3 = Field(description="position in the world: east, north, up [m]")
+    position_m: Vector3
+    """position in the world: east, north, up [m]"""
 
 
 class PlanConfig(Section):
     """Survey pattern to fly (Negahdaripour & Madjidi 2003, sections III and III-A)."""
 
-    pattern: Literal["lawnmower", "loops"] = Field(
-        default="lawnmower",
-        description="lawnmower: parallel legs; loops: circles through the start, which is the centre of a disc",
-    )
-    area_m: tuple[Metres, Metres] = Field(
-        default=(4.0, 2.0),
-        description="extent along and across the legs, centred at centre_m; for loops, both are the diameter of the "
-        "disc; unused with polygon [m]",
-    )
-    centre_m: Vector2 = Field(default=(0.0, 0.0), description="centre of the area: x, y in the scene [m]")
-    centre_crs: tuple[Number, Number] | None = Field(
-        default=None,
-        description="centre of the area: easting, northing in the CRS of the DEM, in the unit of the CRS; replaces "
-        "centre_m",
-    )
-    heading_deg: float = Field(
-        default=0.0, ge=-360, le=360,
-        description="direction of the first leg, and of the bow on it, counter-clockwise from x (east) [deg]",
-    )  # fmt: skip
-    polygon: str | tuple[Vector2, ...] | None = Field(
-        default=None,
-        description="area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file "
-        "with one polygon in a CRS that it names, in longitude and latitude, or in the CRS of the DEM; ${TWIN_DATA} is "
-        "expanded",
-    )
-    turns: Literal["reverse", "bow_first"] = Field(
-        default="reverse",
-        description="reverse: every second leg is flown backwards; bow_first: the vehicle yaws by 180 deg at the end "
-        "of each leg, so that it flies every leg forwards",
-    )
-    altitude_m: float = Field(
-        default=2.2, gt=0, le=100, description="height of the cameras above the reference plane z = 0 [m]"
-    )
-    speed_mps: float = Field(
-        default=0.25, gt=0.01, le=2, description="speed along legs and loops; lower on tight loops [m/s]"
-    )
-    overlap_along: float = Field(
-        default=0.9, gt=0, lt=1, description="overlap of consecutive keyframes, a fraction of the image width"
-    )
-    overlap_across: float = Field(
-        default=0.8, gt=0, lt=1, description="sidelap of neighbouring swaths, a fraction of the footprint"
-    )
-    overlap_reference: Literal["floor", "plane"] = Field(
-        default="floor",
-        description="floor: 95 % of the keyframes reach the overlaps over the sea floor; plane: the overlaps refer to "
-        "the reference plane z = 0",
-    )
-    height: Literal["plane", "floor"] = Field(
-        default="plane",
-        description="plane: altitude_m above the reference plane; floor: altitude_m above the smoothed sea floor",
-    )
-    tracks: int = Field(
-        default=0, ge=0, le=1000, description="number of tracks (two legs, or one loop); 0: enough to cover the area"
-    )
-    clearance_m: float = Field(
-        default=0.3, ge=0, le=10, description="smallest allowed vertical distance from the cameras to the sea floor [m]"
-    )
+    pattern: Literal["lawnmower", "loops"] = "lawnmower"
+    """lawnmower: parallel legs; loops: circles through the start, which is the centre of a disc"""
+    area_m: tuple[Metres, Metres] = (4.0, 2.0)
+    """extent along and across the legs, centred at centre_m; for loops, both are the diameter of the disc; unused with
+    polygon [m]"""
+    centre_m: Vector2 = (0.0, 0.0)
+    """centre of the area: x, y in the scene [m]"""
+    centre_crs: tuple[Number, Number] | None = None
+    """centre of the area: easting, northing in the CRS of the DEM, in the unit of the CRS; replaces centre_m"""
+    heading_deg: float = Field(default=0.0, ge=-360, le=360)
+    """direction of the first leg, and of the bow on it, counter-clockwise from x (east) [deg]"""
+    polygon: str | tuple[Vector2, ...] | None = None
+    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with one polygon
+    in a CRS that it names, in longitude and latitude, or in the CRS of the DEM; ${TWIN_DATA} is expanded"""
+    turns: Literal["reverse", "bow_first"] = "reverse"
+    """reverse: every second leg is flown backwards; bow_first: the vehicle yaws by 180 deg at the end of each leg, so
+    that it flies every leg forwards"""
+    altitude_m: float = Field(default=2.2, gt=0, le=100)
+    """height of the cameras above the reference plane z = 0 [m]"""
+    speed_mps: float = Field(default=0.25, gt=0.01, le=2)
+    """speed along legs and loops; lower on tight loops [m/s]"""
+    overlap_along: float = Field(default=0.9, gt=0, lt=1)
+    """overlap of consecutive keyframes, a fraction of the image width"""
+    overlap_across: float = Field(default=0.8, gt=0, lt=1)
+    """sidelap of neighbouring swaths, a fraction of the footprint"""
+    overlap_reference: Literal["floor", "plane"] = "floor"
+    """floor: 95 % of the keyframes reach the overlaps over the sea floor; plane: the overlaps refer to the reference
+    plane z = 0"""
+    height: Literal["plane", "floor"] = "plane"
+    """plane: altitude_m above the reference plane; floor: altitude_m above the smoothed sea floor"""
+    tracks: int = Field(default=0, ge=0, le=1000)
+    """number of tracks (two legs, or one loop); 0: enough to cover the area"""
+    clearance_m: float = Field(default=0.3, ge=0, le=10)
+    """smallest allowed vertical distance from the cameras to the sea floor [m]"""
 
     @field_validator("polygon", mode="before")
     @classmethod
@@ -744,96 +597,76 @@ class ObjectConfig(Section):
     """Object at `position_m` on the sea floor, or many of one kind, scattered at random with the density `per_m2`."""
 
     shape: Literal[
-        "mesh", "boulder", "brain_coral", "branching_coral", "table_coral", "sponge", "sea_star", "pipe", "crate",
-        "tyre", "bottle", "kelp",
-    ] = Field(description="built-in shape, or mesh for the triangles of mesh_file")  # fmt: skip
-    mesh_file: FilePath | None = Field(
-        default=None,
-        description="PLY, OBJ or GLB file with vertex colours or a texture; needs shape = mesh; ${TWIN_DATA} is "
-        "expanded",
-    )
-    mesh_up: Literal["z", "y"] | None = Field(
-        default=None, description="axis of mesh_file that points up; default: y for GLB, z for other files"
-    )
-    size_m: float | None = Field(
-        default=None, gt=0, le=20,
-        description="largest extent of an object, the median of a size distribution; default: that of mesh_file in "
-        "metres, or 0.4 [m]",
-    )  # fmt: skip
-    size_spread: float = Field(
-        default=0.0, ge=0, le=1,
-        description="size distribution: standard deviation of the logarithm of the size (log-normal, cut at 2 sigma); "
-        "0: all are of size_m",
-    )  # fmt: skip
-    width_m: float | None = Field(
-        default=None, gt=0, le=20, description="outer diameter of a pipe; default: an eighth of its length [m]"
-    )
-    colour: tuple[Albedo, Albedo, Albedo] | None = Field(
-        default=None,
-        description="albedo for R, G, B; default: that of the shape; a mesh with colours or a texture keeps them",
-    )
-    position_m: Vector2 | None = Field(default=None, description="position of one object: x, y in the scene [m]")
-    height_m: float | None = Field(
-        default=None, ge=-100, le=100,
-        description="height of the base of the object at position_m above the reference plane z = 0; default: on the "
-        "sea floor [m]",
-    )  # fmt: skip
-    heading_deg: float | None = Field(
-        default=None, ge=-360, le=360,
-        description="rotation about the vertical, counter-clockwise from x (east); default: random [deg]",
-    )  # fmt: skip
-    upright: bool = Field(
-        default=True, description="whether the objects stand upright; false: perpendicular to the sea floor"
-    )
-    sunk: float = Field(
-        default=0.1, ge=-5, le=0.95,
-        description="share of the height of an object that is in the sea floor; negative: above the sea floor",
-    )  # fmt: skip
-    per_m2: float | None = Field(
-        default=None, gt=0, le=1000, description="scattered objects per square metre of the ground given by `on` [1/m2]"
-    )
-    on: Literal["anywhere", "sand", "slopes"] = Field(
-        default="anywhere",
-        description="ground of scattered objects. sand: less steep than 15 deg; slopes: at least that steep",
-    )
-    area_m: tuple[Metres, Metres] | None = Field(
-        default=None, description="extent along x and y of the area of scattered objects; default: the terrain [m]"
-    )
-    centre_m: Vector2 = Field(default=(0.0, 0.0), description="centre of area_m: x, y in the scene [m]")
-    spacing_m: float = Field(
-        default=0.0, ge=0, le=1000,
-        description="least distance from the centre of a scattered object to the centres of all objects placed before "
-        "it, those of other entries too (Poisson disc); scattered objects never overlap any object [m]",
-    )  # fmt: skip
+        "mesh",
+        "boulder",
+        "brain_coral",
+        "branching_coral",
+        "table_coral",
+        "sponge",
+        "sea_star",
+        "pipe",
+        "crate",
+        "tyre",
+        "bottle",
+        "kelp",
+    ]
+    """built-in shape, or mesh for the triangles of mesh_file"""
+    mesh_file: FilePath | None = None
+    """PLY, OBJ or GLB file with vertex colours or a texture; needs shape = mesh; ${TWIN_DATA} is expanded"""
+    mesh_up: Literal["z", "y"] | None = None
+    """axis of mesh_file that points up; default: y for GLB, z for other files"""
+    size_m: float | None = Field(default=None, gt=0, le=20)
+    """largest extent of an object, the median of a size distribution; default: that of mesh_file in metres, or 0.4
+    [m]"""
+    size_spread: float = Field(default=0.0, ge=0, le=1)
+    """size distribution: standard deviation of the logarithm of the size (log-normal, cut at 2 sigma); 0: all are of
+    size_m"""
+    width_m: float | None = Field(default=None, gt=0, le=20)
+    """outer diameter of a pipe; default: an eighth of its length [m]"""
+    colour: tuple[Albedo, Albedo, Albedo] | None = None
+    """albedo for R, G, B; default: that of the shape; a mesh with colours or a texture keeps them"""
+    position_m: Vector2 | None = None
+    """position of one object: x, y in the scene [m]"""
+    height_m: float | None = Field(default=None, ge=-100, le=100)
+    """height of the base of the object at position_m above the reference plane z = 0; default: on the sea floor [m]"""
+    heading_deg: float | None = Field(default=None, ge=-360, le=360)
+    """rotation about the vertical, counter-clockwise from x (east); default: random [deg]"""
+    upright: bool = True
+    """whether the objects stand upright; false: perpendicular to the sea floor"""
+    sunk: float = Field(default=0.1, ge=-5, le=0.95)
+    """share of the height of an object that is in the sea floor; negative: above the sea floor"""
+    per_m2: float | None = Field(default=None, gt=0, le=1000)
+    """scattered objects per square metre of the ground given by `on` [1/m2]"""
+    on: Literal["anywhere", "sand", "slopes"] = "anywhere"
+    """ground of scattered objects. sand: less steep than 15 deg; slopes: at least that steep"""
+    area_m: tuple[Metres, Metres] | None = None
+    """extent along x and y of the area of scattered objects; default: the terrain [m]"""
+    centre_m: Vector2 = (0.0, 0.0)
+    """centre of area_m: x, y in the scene [m]"""
+    spacing_m: float = Field(default=0.0, ge=0, le=1000)
+    """least distance from the centre of a scattered object to the centres of all objects placed before it, those of
+    other entries too (Poisson disc); scattered objects never overlap any object [m]"""
 
 
 class ControlConfig(Section):
     """Trajectory following and station keeping."""
 
-    plugin: str | None = Field(
-        default=None, max_length=200, pattern=PLUGIN_NAME,
-        description="controller of another package, which replaces the pose controller: module:Class, or the name of "
-        "an entry point twin.controllers; it runs code of that package",
-    )  # fmt: skip
-    hold_s: float = Field(
-        default=2.0, ge=0.1, le=600, description="station keeping at the end of a track, during global alignment [s]"
-    )
-    natural_frequency_radps: float = Field(
-        default=1.2, gt=0.05, le=10, description="natural frequency of the closed position loop [rad/s]"
-    )
-    off_course_m: float | None = Field(
-        default=None, gt=0, le=1000,
-        description="largest distance from the planned path; beyond it for one second, the survey is degraded; "
-        "default: a quarter of the shorter side of the footprint [m]",
-    )  # fmt: skip
+    plugin: str | None = Field(default=None, max_length=200, pattern=PLUGIN_NAME)
+    """controller of another package, which replaces the pose controller: module:Class, or the name of an entry point
+    twin.controllers; it runs code of that package"""
+    hold_s: float = Field(default=2.0, ge=0.1, le=600)
+    """station keeping at the end of a track, during global alignment [s]"""
+    natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10)
+    """natural frequency of the closed position loop [rad/s]"""
+    off_course_m: float | None = Field(default=None, gt=0, le=1000)
+    """largest distance from the planned path; beyond it for one second, the survey is degraded; default: a quarter of
+    the shorter side of the footprint [m]"""
 
 
 class _EstimatePlugin(Section):
-    plugin: str | None = Field(
-        default=None, max_length=200, pattern=PLUGIN_NAME,
-        description="estimator of another package, which replaces motion estimation, network and alignment: "
-        "module:Class, or the name of an entry point twin.estimators; it runs code of that package",
-    )  # fmt: skip
+    plugin: str | None = Field(default=None, max_length=200, pattern=PLUGIN_NAME)
+    """estimator of another package, which replaces motion estimation, network and alignment: module:Class, or the name
+    of an entry point twin.estimators; it runs code of that package"""
 
 
 def _keys_of_settings() -> dict[str, Any]:
@@ -850,17 +683,14 @@ class EstimateConfig(create_model("EstimateKeys", __base__=_EstimatePlugin, **_k
 class MapConfig(Section):
     """Elevation map from Kalman depth filters, and orthomosaic."""
 
-    cell_m: float = Field(default=0.02, gt=0.001, le=1, description="cell size of the elevation map [m]")
-    orthomosaic: bool = Field(
-        default=True,
-        description="make an orthomosaic of the keyframe images at their ground sample distance; false: a mosaic with "
-        "the cells of the elevation map",
-    )
-    restore: bool = Field(
-        default=False,
-        description="remove lamp pattern and water from the colours of the orthomosaic, by the lamps and the water of "
-        "this scenario; false: colours as seen",
-    )
+    cell_m: float = Field(default=0.02, gt=0.001, le=1)
+    """cell size of the elevation map [m]"""
+    orthomosaic: bool = True
+    """make an orthomosaic of the keyframe images at their ground sample distance; false: a mosaic with the cells of the
+    elevation map"""
+    restore: bool = False
+    """remove lamp pattern and water from the colours of the orthomosaic, by the lamps and the water of this scenario;
+    false: colours as seen"""
 
 
 class Source(BaseModel):
@@ -909,39 +739,41 @@ class Source(BaseModel):
 class Scenario(Section):
     """Complete description of one survey."""
 
-    name: str = Field(default="survey", min_length=1, max_length=80, description="name of the survey")
-    seed: int = Field(default=0, ge=0, lt=2**32, description="seed of all random numbers")
-    record: Literal["none", "keyframes", "all"] = Field(
-        default="keyframes",
-        description="images that the run folder keeps, for `twin export` and the report. keyframes: stereo pairs of "
-        "the keyframes; all: also the left images of the frames between them; none: no images",
-    )
+    name: str = Field(default="survey", min_length=1, max_length=80)
+    """name of the survey"""
+    seed: int = Field(default=0, ge=0, lt=2**32)
+    """seed of all random numbers"""
+    record: Literal["none", "keyframes", "all"] = "keyframes"
+    """images that the run folder keeps, for `twin export` and the report. keyframes: stereo pairs of the keyframes;
+    all: also the left images of the frames between them; none: no images"""
     terrain: TerrainConfig = TerrainConfig()
     vehicle: VehicleConfig = VehicleConfig()
     rig: RigConfig = RigConfig()
     imaging: ImagingConfig = ImagingConfig()
-    sensor: SensorConfig | None = Field(
-        default=None, description="physical image sensor; default: noise as fractions of full scale, from [imaging]"
-    )
+    sensor: SensorConfig | None = None
+    """physical image sensor; default: noise as fractions of full scale, from [imaging]"""
     lens: LensConfig = LensConfig()
     port: PortConfig = PortConfig()
     calibration_error: CalibrationErrorConfig = CalibrationErrorConfig()
     water: WaterConfig = WaterConfig()
-    lamps: tuple[LampConfig, ...] = Field(default=(), max_length=64, description="lamps on the vehicle")
+    lamps: tuple[LampConfig, ...] = Field(default=(), max_length=64)
+    """lamps on the vehicle"""
     sun: SunConfig = SunConfig()
     snow: SnowConfig = SnowConfig()
     current: CurrentConfig = CurrentConfig()
     navigation: NavigationConfig = NavigationConfig()
-    imu: ImuConfig | None = Field(default=None, description="inertial measurement unit; default: none")
+    imu: ImuConfig | None = None
+    """inertial measurement unit; default: none"""
     plan: PlanConfig = PlanConfig()
     control: ControlConfig = ControlConfig()
     estimate: EstimateConfig = EstimateConfig()
     map: MapConfig = MapConfig()
-    beacons: tuple[BeaconConfig, ...] = Field(
-        default=(), max_length=1000, description="small lights at surveyed positions"
-    )
-    objects: tuple[ObjectConfig, ...] = Field(default=(), max_length=1000, description="objects on the sea floor")
-    require: dict[str, Number] = Field(default={}, description='limits on metrics, e.g. "map.le90_m" = 0.05')
+    beacons: tuple[BeaconConfig, ...] = Field(default=(), max_length=1000)
+    """small lights at surveyed positions"""
+    objects: tuple[ObjectConfig, ...] = Field(default=(), max_length=1000)
+    """objects on the sea floor"""
+    require: dict[str, Number] = {}
+    """limits on metrics, e.g. "map.le90_m" = 0.05"""
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("scenario")))
 
