@@ -83,7 +83,7 @@ MUTANTS = [
         # estimators
         ("twin/estimate/vision/motion_filter.py", "velocity * (interval_s**2 / 3), shared", "velocity * interval_s**2, shared", "estimate_motion_filter"),
         ("twin/estimate/vision/stereo.py", "return measured, joint / rig.focal_px**2", "return measured, joint / rig.focal_px", "estimate_motion estimate_link_noise"),
-        ("twin/estimate/vision/keyframes.py", "(self.accumulated_cov - earlier.accumulated_cov)", "(self.accumulated_cov + earlier.accumulated_cov)", "estimate_network estimate_positioning"),
+        ("twin/estimate/vision/stereo.py", "(self.accumulated_cov - earlier.accumulated_cov)", "(self.accumulated_cov + earlier.accumulated_cov)", "estimate_network estimate_positioning"),
         ("twin/estimate/vision/epipolar.py", "matrix @ translation / focal_baseline", "matrix @ translation * focal_baseline", "estimate_disparity estimate_depth_filter estimate_motion"),
         ("twin/estimate/vision/light_pattern.py", "np.maximum(1 - variance / np.maximum(mean**2, 1e-12), 0) * mean", "mean", "estimate_light_pattern"),
         ("twin/estimate/mapping/depth_filter.py", "variance = (depth * depth / focal_baseline * disparity.sigma_px) ** 2", "variance = (depth / focal_baseline * disparity.sigma_px) ** 2", "estimate_depth_filter"),

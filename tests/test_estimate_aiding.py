@@ -9,10 +9,9 @@ from twin.core.links import Link
 from twin.core.records import BeaconDetection, Displacement, Readings, SensorNoise, StereoRig
 from twin.estimate.alignment import align
 from twin.estimate.navigation import aiding
-from twin.estimate.navigation.dead_reckoning import readings_as_arrays
 from twin.estimate.navigation.dvl import DvlIntegrator, body_displacement, fuse_displacement, fuse_dvl
-from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, fuse_pressure_ahrs
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, fuse_pressure_ahrs, readings_as_arrays
+from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
 MOUNT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
@@ -29,7 +28,7 @@ def numeric(function, at, step=1e-6):
 def keyframes(poses, readings=None, displacements=None):
     n = len(poses)
     rows = zip(poses, readings or [Readings()] * n, displacements or [None] * n, strict=True)
-    return [Keyframe(k, k, 1, pose.copy(), None, r, d) for k, (pose, r, d) in enumerate(rows)]
+    return [Keyframe(k, k, 1, pose.copy(), None, r, dvl_displacement=d) for k, (pose, r, d) in enumerate(rows)]
 
 
 def pixels_of(pose):

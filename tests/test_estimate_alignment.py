@@ -10,7 +10,7 @@ from twin.core.links import Link
 from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.estimate import alignment
 from twin.estimate.alignment import align
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.stereo import Keyframe
 from twin.judge.consistency import nees, nees_interval
 
 RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))

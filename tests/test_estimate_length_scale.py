@@ -11,7 +11,7 @@ from twin.core.quality import EstimationQuality, LengthScale
 from twin.core.records import Displacement, Readings, SensorNoise, StereoRig
 from twin.estimate.length_scale import length_scales
 from twin.estimate.self_check import MAX_SCALE_ERROR, _scale
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.stereo import Keyframe
 
 BODY_FROM_CAMERA = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.2, 0.06, -0.1]))
 RIG = StereoRig(320, 240, 300.0, 0.12, 15.0, BODY_FROM_CAMERA)

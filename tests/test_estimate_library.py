@@ -10,7 +10,7 @@ from twin.errors import TwinError
 from twin.estimate import EstimatorSettings, Frame, MapGrid, Navigator, Readings, SensorNoise, StereoRig
 from twin.estimate.mapping import depth_filter, surface
 from twin.estimate.stereo_vision import StereoVision
-from twin.estimate.viewing_plane import viewing_plane
+from twin.estimate.vision.mosaic import viewing_plane
 
 pytestmark = pytest.mark.long
 

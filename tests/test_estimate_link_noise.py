@@ -8,10 +8,10 @@ from twin.core import geometry
 from twin.core.records import Readings
 from twin.estimate.vision import matching, pixel_locking, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.observation_equations import PairMeasurements, transfer
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.pixel_locking import PixelLocking
+from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import PairMotionSettings
 
 RIG = scene.small_rig()

@@ -24,9 +24,9 @@ from twin.estimate.trajectory import interpolate_between_keyframes
 from twin.estimate.vision import matching, stereo
 from twin.estimate.vision.f2f import FrameToFrame, constant_velocity_motion
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
+from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 from twin.judge.self_check import self_check_metrics
 
@@ -103,7 +103,8 @@ def away(first):
 
 
 def chosen_of(earlier, node, most):
-    links = link_selection.choose_links(node, earlier, poses_of(earlier), RIG, 0.45, most, PATCH_PX)
+    settings = EstimatorSettings(min_overlap=0.45, max_links=most, patch_px=PATCH_PX)
+    links = link_selection.choose_links(node, earlier, poses_of(earlier), RIG, settings)
     return [k.number for k, _ in links]
 
 
@@ -746,7 +747,7 @@ def test_a_track_without_keyframes_does_not_repeat_the_correction_of_the_online_
     poses = [scene.down_camera(0.1 * (k % 3), 0.0, 2.4) for k in range(9)]
     navigator = navigated(Script(poses, rng=np.random.default_rng(2)), [1] * 9, use_f2m=False)
     last = navigator.network.keyframes[-1]
-    assert np.abs(last.world_from_camera - navigator.log.online[-1]).max() > 1e-4
+    assert np.abs(last.world_from_camera - navigator.log.online.array[-1]).max() > 1e-4
     np.testing.assert_allclose(navigator.filter.world_from_camera, last.world_from_camera, atol=1e-12)
     navigator.align_track(2)
     np.testing.assert_allclose(navigator.filter.world_from_camera, last.world_from_camera, atol=1e-12)

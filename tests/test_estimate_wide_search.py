@@ -11,8 +11,8 @@ from twin.core.records import Frame, Readings
 from twin.core.settings import EstimatorSettings
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision import wide_search
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.pair_matching import SEARCH_PX
+from twin.estimate.vision.stereo import Keyframe
 
 RIG = scene.small_rig()
 ALTITUDE_M = 2.0

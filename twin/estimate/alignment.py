@@ -15,12 +15,16 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
 from twin.core.records import SensorNoise, StereoRig
-from twin.estimate import adjustment
-from twin.estimate.adjustment import FactorGraph, GraphState, Solution
+from twin.estimate.adjustment.pose_graph import (
+    FactorGraph,
+    GraphState,
+    Solution,
+    motion_factors,
+    optimise,
+    prior_factors,
+)
 from twin.estimate.navigation import aiding
-from twin.estimate.vision.keyframes import Keyframe
-
-Mask = NDArray[np.bool_]
+from twin.estimate.vision.stereo import Keyframe
 
 _OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; one inlier in 2 million exceeds it
 _MIN_SHARE_OF_WORST = 0.01  # a link with a chi2 below this fraction of the largest is not removed in the same round
@@ -67,27 +71,71 @@ def align(
         LinAlgError: the links, anchors and sensor readings do not constrain every node.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
+    links, dropped = Links.from_sequence(links), list[Link]()
     graph = _factor_graph(nodes, links, anchors, rig, noise)
-    window = _Window(Links.from_sequence(links), index_of, graph)
-    dropped: list[Link] = []
-    solution = window.optimise(GraphState(np.array([node.world_from_camera for node in nodes])), _ROUND_ITERATIONS)
+    solution = optimise(graph, GraphState(np.array([node.world_from_camera for node in nodes])), _ROUND_ITERATIONS)
     for _ in range(_MAX_ROUNDS):
-        outliers = window.outliers(solution.chi2[0])
+        outliers = _outliers(graph, solution.chi2[0])
         if not outliers.any():
             break
-        dropped += window.links.select(outliers)
-        window, state = window.without(outliers), solution.state
+        dropped += links.select(outliers)
+        links, state = links.select(~outliers), solution.state
         del solution  # frees its Cholesky factor before the next one is allocated
-        solution = window.optimise(state, _ROUND_ITERATIONS)
+        graph = graph._replace(binary=[motion_factors(links, index_of, _HUBER), *graph.binary[1:]])
+        solution = optimise(graph, state, _ROUND_ITERATIONS)
     if not solution.converged:
         state = solution.state
         del solution
-        solution = window.optimise(state, _MAX_ITERATIONS)
-    link_chi2 = _mean_chi2(window.links, solution.chi2[0])
-    draws = None if marginals_of is not None else _draw_positions(solution)  # `_marginals` overwrites the factor
-    covs = _marginals(solution, marginals_of, index_of)
-    independent = None if draws is None else _independent_errors(draws, covs[1:, 3:, 3:])
-    return AlignmentResult(solution.state.poses, covs, dropped, link_chi2, solution.converged, independent)
+        solution = optimise(graph, state, _MAX_ITERATIONS)
+    poses, chi2 = solution.state.poses, _mean_chi2(links, solution.chi2[0])
+    if marginals_of is None:
+        draws = _draw_positions(solution)  # before the marginals, which overwrite the factor
+        covs = solution.marginals_in_place()
+        independent = _independent_errors(draws, covs[1:, 3:, 3:])
+        return AlignmentResult(poses, covs, dropped, chi2, solution.converged, independent)
+    covs = np.zeros((len(nodes), 6, 6))
+    for number in marginals_of:
+        covs[index_of[number]] = solution.marginal(index_of[number])
+    return AlignmentResult(poses, covs, dropped, chi2, solution.converged)
+
+
+def _factor_graph(
+    nodes: Sequence[Keyframe], links: Links, anchors: dict[int, Array], rig: StereoRig, noise: SensorNoise
+) -> FactorGraph:
+    """Returns the factor graph of links, anchors and navigation sensors; the first binary factors are the links."""
+    index_of = {node.number: k for k, node in enumerate(nodes)}
+    anchored = [node for node in nodes if node.number in anchors]
+    priors = prior_factors(
+        [index_of[node.number] for node in anchored],
+        np.array([node.world_from_camera for node in anchored]).reshape(-1, 4, 4),
+        np.array([anchors[node.number] for node in anchored]).reshape(-1, 6, 6),
+    )
+    unary = [priors, *aiding.unary_factors(nodes, rig, noise)]
+    motions = motion_factors(links, index_of, _HUBER)
+    displacements = aiding.displacement_factors(nodes, rig)
+    if not len(displacements.i):
+        return FactorGraph(len(nodes), unary, [motions])
+    return FactorGraph(len(nodes), unary, [motions, displacements], noise.dvl_scale)
+
+
+def _outliers(graph: FactorGraph, chi2: Array) -> NDArray[np.bool_]:
+    """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
+
+    A link whose chi2 is below 1 % of the largest one is not removed in this round, because the link with the largest
+    chi2 may have distorted its residual. Links between consecutive nodes of the window are never removed.
+    """
+    motions = graph.binary[0]
+    chi2 = np.where(motions.j - motions.i == 1, 0.0, chi2)
+    return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
+
+
+def _mean_chi2(links: Links, chi2: Array) -> float:
+    """Returns the mean chi-square of the links per degree of freedom; 0 without links.
+
+    `chi2` (n,) was computed with inflated covariances (`link_selection.inflate_for_shared_noise`); the result refers to
+    the covariances before inflation.
+    """
+    return float(np.mean(chi2 * links.shared_by)) / 6 if len(chi2) else 0.0
 
 
 def _draw_positions(solution: Solution) -> Array:
@@ -107,69 +155,3 @@ def _independent_errors(draws: Array, covs: Array) -> float | None:
         return None
     whitened = np.linalg.solve(np.linalg.cholesky(covs[known]), draws[:, known, :, None])[..., 0]
     return float(6 / np.var(np.sum(whitened**2, axis=(1, 2)) / known.sum()))
-
-
-def _mean_chi2(links: Links, chi2: Array) -> float:
-    """Returns the mean chi-square of the links per degree of freedom; 0 without links.
-
-    `chi2` (n,) was computed with inflated covariances (`link_selection.inflate_for_shared_noise`); the result refers to
-    the covariances before inflation.
-    """
-    return float(np.mean(chi2 * links.shared_by)) / 6 if len(chi2) else 0.0
-
-
-class _Window(NamedTuple):
-    """Factor graph of the nodes that are aligned together, and the links among its factors."""
-
-    links: Links  #: links between the nodes
-    index_of: dict[int, int]  #: index of each node in the factor graph, by node number
-    graph: FactorGraph  #: factor graph; its first binary factors are the links
-
-    def optimise(self, start: GraphState, max_iterations: int) -> Solution:
-        """Returns the solution reached from `start`, at a local minimum of the cost or after `max_iterations` steps."""
-        return adjustment.optimise(self.graph, start, max_iterations)
-
-    def outliers(self, chi2: Array) -> Mask:
-        """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
-
-        A link whose chi2 is below 1 % of the largest one is not removed in this round, because the link with the
-        largest chi2 may have distorted its residual. Links between consecutive nodes of the window are never removed.
-        """
-        motions = self.graph.binary[0]
-        chi2 = np.where(motions.j - motions.i == 1, 0.0, chi2)
-        return chi2 > max(_OUTLIER_CHI2, _MIN_SHARE_OF_WORST * float(chi2.max(initial=0.0)))
-
-    def without(self, outliers: Mask) -> _Window:
-        """Returns the window without the links marked in the mask `outliers` (n,)."""
-        inliers = self.links.select(~outliers)
-        binary = [adjustment.motion_factors(inliers, self.index_of, _HUBER), *self.graph.binary[1:]]
-        return _Window(inliers, self.index_of, self.graph._replace(binary=binary))
-
-
-def _factor_graph(
-    nodes: Sequence[Keyframe], links: Sequence[Link], anchors: dict[int, Array], rig: StereoRig, noise: SensorNoise
-) -> FactorGraph:
-    """Returns the factor graph of links, anchors and navigation sensors; the first binary factors are the links."""
-    index_of = {node.number: k for k, node in enumerate(nodes)}
-    anchored = [node for node in nodes if node.number in anchors]
-    priors = adjustment.prior_factors(
-        [index_of[node.number] for node in anchored],
-        np.array([node.world_from_camera for node in anchored]).reshape(-1, 4, 4),
-        np.array([anchors[node.number] for node in anchored]).reshape(-1, 6, 6),
-    )
-    unary = [priors, *aiding.unary_factors(nodes, rig, noise)]
-    motions = adjustment.motion_factors(links, index_of, _HUBER)
-    displacements = aiding.displacement_factors(nodes, rig)
-    if not len(displacements.i):
-        return FactorGraph(len(nodes), unary, [motions])
-    return FactorGraph(len(nodes), unary, [motions, displacements], noise.dvl_scale)
-
-
-def _marginals(solution: Solution, numbers: Sequence[int] | None, index_of: dict[int, int]) -> Array:
-    """Returns the marginal covariances (n, 6, 6) of the nodes, zero for those not in `numbers` (None: all)."""
-    if numbers is None:
-        return solution.marginals_in_place()
-    covs = np.zeros((len(index_of), 6, 6))
-    for number in numbers:
-        covs[index_of[number]] = solution.marginal(index_of[number])
-    return covs

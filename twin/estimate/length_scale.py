@@ -17,7 +17,7 @@ from twin.core.links import Link, Links
 from twin.core.quality import LengthScale
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.navigation.dvl import body_displacement
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.stereo import Keyframe
 
 _MOST_SIGMA = 0.1  # a scale with a larger standard deviation is not observed
 _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together

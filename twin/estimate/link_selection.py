@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,7 +10,8 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link
 from twin.core.records import StereoRig
-from twin.estimate.vision.keyframes import Keyframe
+from twin.core.settings import EstimatorSettings
+from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 from twin.kernels import kernel
 
@@ -27,72 +27,88 @@ _RESIDUAL_STANDARD_ERROR = 0.562
 _NEAREST_M = 1e-3  # smallest depth of a visible point
 
 
-class _View(NamedTuple):
-    """Camera intrinsics and image size, for projection in compiled code."""
-
-    #: fx, fy: focal lengths along the rows (fx) and the columns (fy) of the image [px].
-    fx: float
-    fy: float
-    #: cx, cy: column and row of the principal point [px].
-    cx: float
-    cy: float
-    #: width, height: image size [px].
-    width: int
-    height: int
-    margin: int  #: smallest distance of a visible point from the image border [px]
-
-
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
     """Returns the overlap (n,), 0 to 1, of a node with the left image at each of the poses (n, 4, 4).
 
     The overlap is the fraction of the node's matched points that project into the other image, at least half a patch
-    from its border. It is predicted from poses and depths, without the assumption of a flat floor. It is 0 for a node
-    without points, and for an image whose camera is farther from the node's camera than the diagonal of the node's
-    footprint at the largest depth of its points.
+    from its border; 0 without points. It is predicted from poses and depths, without the assumption of a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
-    world = np.ascontiguousarray(geometry.transform(node.world_from_camera, node.points.xyz))
-    camera = _View(rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2)
-    position, reach_m = node.world_from_camera[:3, 3].copy(), _reach_m(node.points.xyz, rig)
+    xyz, position = node.points.xyz, node.world_from_camera[:3, 3].copy()
+    world = np.ascontiguousarray(geometry.transform(node.world_from_camera, xyz))
+    # beyond the diagonal of the footprint at the largest depth, the overlap is zero
+    reach_m = float(xyz[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
+    camera = rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.width_px, rig.height_px, patch_px // 2
     return _overlaps(world, position, np.ascontiguousarray(poses), reach_m, camera)
 
 
-def choose_links(
-    node: Keyframe,
-    earlier: Sequence[Keyframe],
-    poses: Array,
-    rig: StereoRig,
-    min_overlap: float,
-    max_links: int,
-    patch_px: int,
-) -> list[tuple[Keyframe, float]]:
-    """Selects the earlier nodes to which a new node is linked.
+@kernel
+def _overlaps(world, position, poses, reach, camera):
+    """Returns the fractions (n,) of points `world` (m, 3) in view; zero for cameras farther than `reach` [m]."""
+    fx, fy, cx, cy, width, height, margin = camera
+    shares = np.zeros(len(poses))
+    for k in range(len(poses)):
+        pose, count = poses[k], 0
+        if np.sum((position - pose[:3, 3]) ** 2) >= reach * reach:
+            continue
+        for x, y, z in world:
+            dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+            depth = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+            if depth < _NEAREST_M:
+                continue
+            u = fx * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + cx
+            v = fy * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + cy
+            count += margin <= u < width - margin and margin <= v < height - margin
+        shares[k] = count / len(world)
+    return shares
 
-    Up to `max_links` candidates with sufficient overlap are selected, in this order of priority: the two previous
+
+def choose_links(
+    node: Keyframe, earlier: Sequence[Keyframe], poses: Array, rig: StereoRig, settings: EstimatorSettings
+) -> list[tuple[Keyframe, float]]:
+    """Returns the earlier nodes to which a new node is linked, with their overlaps.
+
+    Up to `max_links` candidates with an overlap of at least `min_overlap` are chosen, in this order: the two previous
     nodes; the oldest node of the same swath, for the greatest distance along the path; the oldest node of all other
-    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap. The same swath is the unbroken
-    series of candidates with sufficient overlap before the two previous nodes. Among the remaining nodes, those that
-    directly precede or follow one selected from them earlier come last.
+    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap, where those that directly precede
+    or follow one chosen before come last. The same swath is the unbroken series of candidates before the two previous
+    nodes.
 
     Args:
-        earlier: candidate nodes in chronological order.
-        poses: (n, 4, 4) world_from_camera of the candidates.
-        min_overlap: smallest sufficient overlap, 0 to 1.
-
-    Returns:
-        The selected nodes with their overlaps (0 to 1).
+        earlier, poses: candidate nodes in chronological order, and their poses (n, 4, 4).
     """
-    shares = overlaps(node, poses, rig, patch_px)
-    linked = np.flatnonzero(shares >= min_overlap)[::-1].tolist()
-    previous = [k for k in linked if k >= len(earlier) - _SAME_SWATH]
+    shares = overlaps(node, poses, rig, settings.patch_px)
+    linked = np.flatnonzero(shares >= settings.min_overlap)[::-1].tolist()
+    newest_before = len(earlier) - _SAME_SWATH - 1
+    previous = [k for k in linked if k > newest_before]
     rest = linked[len(previous) :]
-    same = _unbroken(rest, len(earlier) - _SAME_SWATH - 1)
+    same = [k for back, k in enumerate(rest) if k == newest_before - back]
     others = sorted(rest[len(same) :], key=lambda k: -shares[k])
     oldest = [min(others)] if others else []
     rest = [k for k in others if k not in oldest]
-    chosen = (previous + same[-1:] + oldest + _spread(rest, earlier, max_links))[:max_links]
-    return [(earlier[k], float(shares[k])) for k in chosen]
+    chosen = previous + same[-1:] + oldest + _spread(rest, earlier)
+    return [(earlier[k], float(shares[k])) for k in chosen[: settings.max_links]]
+
+
+def _spread(others: list[int], earlier: Sequence[Keyframe]) -> list[int]:
+    """Returns the indices `others` of earlier nodes in their order, but neighbours of nodes before them come last.
+
+    Between neighbours there is no other node: their keyframe numbers differ by the smallest difference of candidates.
+    """
+    numbers = np.array([node.number for node in earlier])
+    stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
+    chosen: list[int] = []
+    for k in others:
+        if all(abs(numbers[k] - numbers[c]) > stride for c in chosen):
+            chosen.append(k)
+    return chosen + [k for k in others if k not in chosen]
+
+
+def to_link(node: Keyframe, other: Keyframe, overlap: float, motion: Motion) -> Link:
+    """Returns the link from the earlier node `other` to `node`, given their overlap and the measured motion."""
+    ends, share = (other.number, node.number), floor_share(motion)
+    return Link(*ends, motion.a_from_b, motion.cov, overlap, motion.n_points, 1.0, motion.closed_form, share)
 
 
 def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
@@ -111,10 +127,7 @@ def inflate_for_shared_noise(links: Sequence[Link]) -> list[Link]:
 
 
 def _links_over_a_footprint(links: Sequence[Link]) -> float:
-    """Returns the number m = 1 / (1 - q) of consecutive links during which a patch of floor stays in view.
-
-    q is the overlap of the link from the latest earlier node, limited to `_LARGEST_OVERLAP`; 0 without links.
-    """
+    """Returns m = 1 / (1 - q), with the overlap q of the link from the latest earlier node; 1 without links."""
     overlap = max(links, key=lambda link: link.i).overlap if links else 0.0
     return 1 / (1 - min(overlap, _LARGEST_OVERLAP))
 
@@ -127,66 +140,3 @@ def floor_share(motion: Motion) -> float:
     """
     limit = 1 + 2 * _RESIDUAL_STANDARD_ERROR / max(motion.n_points, 1) ** 0.5
     return 1 - motion.residual**-2 if motion.residual > limit else 0.0
-
-
-def _unbroken(linked: list[int], newest: int) -> list[int]:
-    """Returns the consecutive indices newest, newest - 1, ... (one swath) with which the descending `linked` begins."""
-    return [k for back, k in enumerate(linked) if k == newest - back]
-
-
-def _spread(others: list[int], earlier: Sequence[Keyframe], count: int) -> list[int]:
-    """Returns up to `count` of the indices `others`, in their order, but neighbours of nodes chosen before come last.
-
-    Neighbours are nodes between which there is no other node: their keyframe numbers differ by the smallest difference
-    between consecutive candidates (`EstimatorSettings.node_stride`).
-
-    Args:
-        others: indices in `earlier` of nodes of other swaths, by decreasing overlap.
-    """
-    numbers = np.array([node.number for node in earlier])
-    stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
-    chosen: list[int] = []
-    for k in others:
-        if all(abs(numbers[k] - numbers[c]) > stride for c in chosen):
-            chosen.append(k)
-    return (chosen + [k for k in others if k not in chosen])[:count]
-
-
-def _reach_m(points: Array, rig: StereoRig) -> float:
-    """Returns the distance between cameras beyond which their overlap is zero [m]: the diagonal of the footprint."""
-    return float(points[:, 2].max() * np.hypot(rig.width_px, rig.height_px) / min(rig.fx_px, rig.fy_px))
-
-
-@kernel
-def _overlaps(world, position, poses, reach, view):
-    """Kernel of `overlaps` (n,) for points `world` (m, 3) [m]; zero from the distance `reach` [m] on."""
-    shares = np.zeros(len(poses))
-    for k in range(len(poses)):
-        pose, count = poses[k], 0
-        if np.sum((position - pose[:3, 3]) ** 2) >= reach * reach:
-            continue
-        for x, y, z in world:
-            dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
-            depth = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-            if depth < _NEAREST_M:
-                continue
-            u = view.fx * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + view.cx
-            v = view.fy * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + view.cy
-            inside_columns = view.margin <= u < view.width - view.margin
-            count += inside_columns and view.margin <= v < view.height - view.margin
-        shares[k] = count / len(world)
-    return shares
-
-
-def to_link(node: Keyframe, other: Keyframe, overlap: float, result: Motion) -> Link:
-    """Returns the link from the earlier node `other` to the new `node`.
-
-    Args:
-        node, other: the two nodes.
-        overlap: predicted overlap of the two, 0 to 1.
-        result: measured motion, the pose of `node` in the camera axes of `other`.
-    """
-    return Link(
-        other.number, node.number, result.a_from_b, result.cov, overlap, result.n_points,
-        closed_form=result.closed_form, floor_share=floor_share(result),
-    )  # fmt: skip

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,16 +41,14 @@ from twin.estimate import disparity_offset
 from twin.estimate.length_scale import length_scales
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
-from twin.estimate.navigation.dead_reckoning import DeadReckoningState, FrameAiding, dead_reckon, readings_as_arrays
-from twin.estimate.navigation.dvl import DvlIntegrator
-from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, clip_covariance
-from twin.estimate.network import KeyframeNetwork
-from twin.estimate.pose_log import PoseLog
+from twin.estimate.navigation.kalman import SENSORS
+from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance
+from twin.estimate.network import KeyframeNetwork, LinkAttempt
 from twin.estimate.stereo_vision import StereoVision
-from twin.estimate.trajectory import interpolate_between_keyframes
-from twin.estimate.viewing_plane import viewing_plane
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.trajectory import PoseLog, interpolate_between_keyframes
+from twin.estimate.vision.mosaic import viewing_plane
 from twin.estimate.vision.repeated_images import REPEATS, RIGHT_REPEATS
+from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision_interface import Vision
 
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
@@ -58,14 +56,6 @@ _DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # standard deviation due to resampling in the mosaic [rad, m]
 _TILE_MARGIN = 12  # cells around a tile that are built with it, as a cell depends on its neighbours
 _SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equal, because timestamps are rounded
-
-
-class MotionSinceNode(NamedTuple):
-    """Motion since the last node of the network, from frame-to-frame motion fused with the DVL."""
-
-    motion: Array  #: (4, 4) pose of the camera at the current frame in the camera at the node
-    cov: Array  #: (6, 6) covariance of `motion` [rotation, translation] (rad, m), in the axes of the current camera
-    cov_at_node: Array  #: (6, 6) covariance of the online pose at the node, in the camera axes of the node
 
 
 class Navigator:
@@ -93,19 +83,22 @@ class Navigator:
         stopwatch: StageTimer | None = None,
     ):
         self.rig, self.settings = rig, settings or EstimatorSettings()
-        self.stopwatch = stopwatch or Stopwatch()
+        self.stopwatch, noise = stopwatch or Stopwatch(), readings_noise or SensorNoise()
         self._resources = ExitStack()
         self._resources.enter_context(one_blas_thread())
-        noise = readings_noise or SensorNoise()
         self.vision = vision or self._image_vision(folder, noise)
-        self.dvl = DvlIntegrator(rig, noise)
-        self.f2f_pose = (_DEFAULT_START if start is None else start).copy()
-        self._f2f_at_pair = self.f2f_pose.copy()
-        self.filter = PoseFilter(self.f2f_pose.copy(), rig, noise)
-        self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), np.zeros((6, 6)))
+        self.filter = PoseFilter((_DEFAULT_START if start is None else start).copy(), rig, noise)
+        self._f2f_at_pair = self.filter.f2f
         self.network = KeyframeNetwork(self.vision, rig, noise, self.settings, self.stopwatch)
         self._resources.callback(self.network.close)
         self.log = PoseLog()
+
+    def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
+        """Returns a source of visual measurements from images, which `close` closes."""
+        if folder is None:
+            folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
+        vision = StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch, noise=noise)
+        return self._resources.enter_context(vision)
 
     def __enter__(self) -> Self:
         return self
@@ -122,9 +115,9 @@ class Navigator:
 
         Args:
             cov: (6, 6) covariance of the start [rotation, translation] in camera axes (rad, m), for the online pose.
-            prior_cov: (6, 6) covariance, in the same order and axes, of the prior factor of the first node in the
-                alignments. It should be large in the directions that the readings at all nodes determine: these
-                readings are factors of the alignment, and a prior computed from them would count them twice.
+            prior_cov: (6, 6) covariance of the prior factor of the first node in the alignments. It should be large in
+                the directions that the readings at all nodes determine: these readings are factors of the alignment,
+                and a prior computed from them would count them twice.
         """
         self.filter.cov = cov
         self.network.reference_cov = prior_cov
@@ -150,23 +143,132 @@ class Navigator:
         motion, status = self.vision.track_frame(frame)
         is_measured = status in ("ok", RIGHT_REPEATS)
         self.log.n_lost += not is_measured
-        aiding, rejected = readings_as_arrays(frame.readings), self.filter.rejected
-        last = self.dead_reckoning
-        state, moved = dead_reckon(last, self.aiding(interval_s), motion.a_from_b, motion.cov, *aiding)
-        self.set_dead_reckoning(state)
+        last, rejected = self.filter.world_from_camera, self.filter.rejected
+        moved = self.filter.advance(motion, frame.readings, interval_s)
         self.filter.fuse_vertical(frame.readings)
         frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
-        step = motion.a_from_b if is_measured else geometry.inverse(last.online) @ self.filter.world_from_camera
+        step = motion.a_from_b if is_measured else geometry.inverse(last) @ self.filter.world_from_camera
         if status in REPEATS:
             self.log.repeats.setdefault(status, []).append(len(self.log))
             self.filter.fuse_position_fixes(frame.readings)
         elif self._is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
-        online, f2f = self.filter.world_from_camera.copy(), self.f2f_pose
+        online, f2f = self.filter.world_from_camera.copy(), self.filter.f2f
         self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
+
+    def _interval_s(self, time_s: float) -> float:
+        """Returns the time since the last frame [s]: the nominal one at the first frame and up to rounding errors.
+
+        Raises ValueError if the frame is not later than the last one.
+        """
+        nominal_s = 1 / self.rig.frame_rate_hz
+        interval_s = time_s - self.log.times_s.array[-1] if len(self.log) else nominal_s
+        if not interval_s > 0:
+            last_s = self.log.times_s.array[-1]
+            raise ValueError(f"time_s: {time_s} s is not later than the last frame, at {last_s} s")
+        return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
+
+    def _is_keyframe(self, frame: Frame, status: str) -> bool:
+        """Returns whether a frame is to become a keyframe by the rules of `update`, before its points are matched.
+
+        The next pair is expected after a motion equal to that since the last pair.
+        """
+        if frame.right is None or frame.keyframe is not None:
+            return bool(frame.keyframe) and frame.right is not None
+        since_pair = geometry.inverse(self._f2f_at_pair) @ self.filter.f2f
+        self._f2f_at_pair = self.filter.f2f
+        if status != "ok" or not self.network.keyframes:
+            return True
+        next_pair = self.filter.world_from_camera @ since_pair
+        return self.network.overlap_with_last(next_pair) < self.settings.keyframe_overlap
+
+    def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
+        """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
+
+        If too few points are matched in stereo, the frame does not become a keyframe and only position fixes are fused.
+
+        Returns:
+            `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
+            link from the last node measures the motion of a frame at which tracking failed.
+        """
+        points = self.vision.observe_stereo(frame, len(self.log))
+        if points is None:
+            self.filter.fuse_position_fixes(frame.readings)
+            return "too few points in stereo"
+        if (tracking_cov := self.vision.tracking_cov()) is not None:
+            self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(tracking_cov[3:, 3:]))))
+        number, depth_m = len(self.network.keyframes), float(np.median(points.xyz[:, 2]))
+        keyframe = Keyframe(
+            number, len(self.log), track, self.filter.world_from_camera, points, frame.readings, depth_m, frame.exposure
+        )
+        self._accumulate(keyframe, self.filter.since_node_cov)
+        self.network.add(keyframe)
+        is_node = number % self.settings.node_stride == 0
+        attempt = self.network.link_to_last_node(keyframe) if is_node else None
+        chain = None if attempt is None else attempt.link
+        if chain is not None:
+            self._follow_chain(keyframe, chain)
+            if status != "ok" and self.settings.wide_search:
+                self.log.n_lost, status = self.log.n_lost - 1, "ok"  # the motion was measured after all
+        # after `_follow_chain`, to correct its error too
+        keyframe.readings = self.filter.fuse_position_fixes(frame.readings)
+        with self.stopwatch("f2m"):
+            self._register_with_mosaic(keyframe, self.filter.since_node_cov if chain is None else chain.cov)
+            keyframe.world_from_camera = self.filter.world_from_camera
+            self.vision.add_to_mosaic(keyframe.number, keyframe.world_from_camera)
+        if is_node:
+            self._connect(keyframe, attempt)
+        self.vision.restart_tracking()
+        return status
+
+    def _accumulate(self, keyframe: Keyframe, step_cov: Array) -> None:
+        """Sets `accumulated_cov` of a keyframe from that of the last node and `step_cov` (6, 6) since then."""
+        if self.network.nodes:
+            to_world = geometry.adjoint(self.filter.world_from_camera)
+            keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
+
+    def _follow_chain(self, node: Keyframe, chain: Link) -> None:
+        """Replaces the F2F motion since the last node in the online pose by the measured link.
+
+        It is more accurate than accumulated F2F (Negahdaripour & Madjidi 2003, section IV-5). Corrections of the pose
+        since the last node, by navigation sensors and by F2M, are kept.
+        """
+        last = self.network.nodes[-1]
+        correction = geometry.inverse(last.world_from_camera @ self.filter.since_node) @ self.filter.world_from_camera
+        cov = geometry.transport_covariance(self.filter.cov_at_node, chain.i_from_j) + chain.cov
+        self.filter.reset(last.world_from_camera @ chain.i_from_j @ correction, cov)
+        node.world_from_camera = self.filter.world_from_camera
+
+    def _register_with_mosaic(self, keyframe: Keyframe, step_cov: Array) -> None:
+        """Corrects the online pose by registration with the mosaic (F2M).
+
+        The mosaic has the pose errors of its keyframes, so the correction is weighted by the covariance of the motion
+        since the keyframe that the compared cells come from; `step_cov` (6, 6) is that since the last node.
+        """
+        pose = self.filter.world_from_camera
+        self._accumulate(keyframe, step_cov)
+        found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None
+        if found is None:
+            return
+        since = keyframe.motion_cov(self.network.keyframes[found.reference_keyframe], pose)
+        if self.network.nodes:
+            since = clip_covariance(since, np.ascontiguousarray(step_cov), 1.0, np.inf)
+        cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
+        reduction = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
+        if reduction is not None:
+            to_world = geometry.adjoint(pose)
+            keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
+
+    def _connect(self, node: Keyframe, chain: LinkAttempt | None) -> None:
+        """Adds a node to the network, linked to the last node by `chain` or, if it failed, by the F2F motion."""
+        bridge = None
+        if chain is not None and chain.link is None:
+            cov = self.filter.since_node_cov + np.eye(6) * 1e-10
+            bridge = Link(self.network.nodes[-1].number, node.number, self.filter.since_node, cov, 0.0, 0)
+        self.network.connect(node, chain, bridge, self.filter.start_from_node(node.number))
 
     def align_track(self, track: int) -> None:
         """Aligns the window of tracks that ends with `track`, and corrects the online pose.
@@ -178,10 +280,17 @@ class Navigator:
             OSError: images could not be read or written.
         """
         keyframes = self.network.keyframes
-        before = keyframes[-1].world_from_camera if keyframes else None
+        before = keyframes[-1].world_from_camera if keyframes else np.eye(4)
         node_cov = self.network.align_window(track)
-        if node_cov is not None and before is not None:
-            self._follow_last_keyframe(before, node_cov)
+        if node_cov is not None:
+            last_from_now = geometry.inverse(before) @ self.filter.world_from_camera
+            cov = geometry.transport_covariance(node_cov, last_from_now)
+            self.filter.reset(keyframes[-1].world_from_camera @ last_from_now, cov)
+            self.filter.cov_at_node = node_cov
+
+    def abandon_alignment(self) -> None:
+        """Drops the pending link measurements and disables the final alignment, so that `finish` is quick."""
+        self.network.abandon_alignment()
 
     def finish(self) -> SurveyResult:
         """Runs the final global alignment over all nodes, unless it is switched off or abandoned.
@@ -197,14 +306,14 @@ class Navigator:
         keyframes, history, log = self.network.keyframes, self.network.history, self.log
         cov = np.tile(self.filter.cov, (len(keyframes), 1, 1))
         aligned_cov = self.network.align_all()
-        rows = np.array([k.row for k in keyframes], dtype=np.int64)
-        final = log.online
+        rows, times_s = np.array([k.row for k in keyframes], dtype=np.int64), log.times_s.array
+        final = log.online.array
         if self.settings.use_ga and len(rows):
-            final = interpolate_between_keyframes(log.steps, log.variances, rows, self.network.poses)
+            final = interpolate_between_keyframes(log.steps.array, log.variances.array, rows, self.network.poses)
         return SurveyResult(
-            f2f=Trajectory(log.times_s, log.f2f),
-            online=Trajectory(log.times_s, log.online),
-            final=Trajectory(log.times_s, final),
+            f2f=Trajectory(times_s, log.f2f.array),
+            online=Trajectory(times_s, log.online.array),
+            final=Trajectory(times_s, final),
             keyframe_rows=rows,
             track_of_keyframe=np.array([k.track for k in keyframes], dtype=np.int64),
             node_cov=cov if aligned_cov is None else aligned_cov,
@@ -217,9 +326,32 @@ class Navigator:
             quality=self._quality(),
         )
 
-    def abandon_alignment(self) -> None:
-        """Drops the pending link measurements and disables the final alignment, so that `finish` is quick."""
-        self.network.abandon_alignment()
+    def _quality(self) -> EstimationQuality:
+        history, nodes = self.network.history, self.network.nodes
+        residuals, alignments = np.array(history.link_residuals), history.alignments
+        failed, counts = np.isnan(residuals), self.filter.gates.counts
+        poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
+        n_views = disparity_offset.mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
+        offset = disparity_offset.combine(history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px)
+        across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
+        return EstimationQuality(
+            frames_lost=self.log.n_lost,
+            repeats=self.log.repeats,
+            nodes_bridged=history.nodes_bridged,
+            links_tried=len(residuals),
+            links_failed=int(failed.sum()),
+            link_residual=None if failed.all() else float(np.median(residuals[~failed])),
+            link_chi2=alignments[-1].link_chi2 if alignments else None,
+            alignment_converged=not alignments or alignments[-1].converged,
+            epipolar=self.vision.epipolar_error(),
+            frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
+            disparity_offset=offset,
+            independent_errors=history.independent_errors,
+            length_scale=across,
+            depth_scale=along,
+            readings_rejected=dict(zip(SENSORS, counts[:, 1].tolist(), strict=True)),
+            readings_disputed=dict(zip(SENSORS, counts[:, 2].tolist(), strict=True)),
+        )
 
     def build_map(
         self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None
@@ -242,15 +374,14 @@ class Navigator:
         """
         if not len(result.keyframe_rows):
             return None
-        linked = np.flatnonzero(~result.unlinked)
-        turned, map_from_world = _in_map(_of_keyframes(result, linked))
-        cells, n_keyframes = grid or footprint_grid(turned, self.rig), len(linked)
+        turned, linked, map_from_world = _linked_in_map(result)
 
         def report(n_done: int) -> None:
             if progress is not None:
-                progress(n_done / n_keyframes)
+                progress(n_done / len(linked))
 
-        found = self.vision.build_map(turned, cells, steps_between(result.step_cov, linked), report)
+        grid = grid or footprint_grid(turned, self.rig)
+        found = self.vision.build_map(turned, grid, steps_between(result.step_cov, linked), report)
         return replace(found, map_from_world=map_from_world)
 
     def build_tiles(
@@ -274,14 +405,11 @@ class Navigator:
         """
         if not len(result.keyframe_rows):
             return
-        linked = np.flatnonzero(~result.unlinked)
-        turned, map_from_world = _in_map(_of_keyframes(result, linked))
+        turned, linked, map_from_world = _linked_in_map(result)
         tiles = footprint_tiles(turned, self.rig)
         for k, tile in enumerate(tiles):
-            part = _of_keyframes(turned, tile.keyframes)
-            steps = steps_between(result.step_cov, linked[tile.keyframes])
-            larger = with_margin(tile.grid, _TILE_MARGIN)
-            found = self.vision.build_map(part, larger, steps, lambda _: None)
+            part, steps = _of_keyframes(turned, tile.keyframes), steps_between(result.step_cov, linked[tile.keyframes])
+            found = self.vision.build_map(part, with_margin(tile.grid, _TILE_MARGIN), steps, lambda _: None)
             inner = np.s_[_TILE_MARGIN:-_TILE_MARGIN, _TILE_MARGIN:-_TILE_MARGIN]
             layers = found.height_m[inner], found.sigma_m[inner], found.mosaic[inner]
             yield tile, ElevationMap(tile.grid, *layers, map_from_world)
@@ -322,197 +450,13 @@ class Navigator:
         views = Views(poses, result.keyframe_depth_m, [exposures[int(row)] for row in rows], load)
         return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress)
 
-    def _quality(self) -> EstimationQuality:
-        history = self.network.history
-        residuals = np.array(history.link_residuals)
-        failed = np.isnan(residuals)
-        nodes = self.network.nodes
-        poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
-        n_views = disparity_offset.mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
-        across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
-        return EstimationQuality(
-            frames_lost=self.log.n_lost,
-            repeats=self.log.repeats,
-            nodes_bridged=history.nodes_bridged,
-            links_tried=len(residuals),
-            links_failed=int(failed.sum()),
-            link_residual=None if failed.all() else float(np.median(residuals[~failed])),
-            link_chi2=history.alignments[-1].link_chi2 if history.alignments else None,
-            alignment_converged=history.alignments[-1].converged if history.alignments else True,
-            epipolar=self.vision.epipolar_error(),
-            frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
-            disparity_offset=disparity_offset.combine(
-                history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px
-            ),
-            independent_errors=history.independent_errors,
-            length_scale=across,
-            depth_scale=along,
-            readings_rejected=dict(zip(SENSORS, self.filter.gates.counts[:, 1].tolist(), strict=True)),
-            readings_disputed=dict(zip(SENSORS, self.filter.gates.counts[:, 2].tolist(), strict=True)),
-        )
 
-    @property
-    def dead_reckoning(self) -> DeadReckoningState:
-        """Returns the dead-reckoning state at the last frame; `dead_reckon` advances it by one frame."""
-        online = self.filter.world_from_camera, np.ascontiguousarray(self.filter.cov)
-        return DeadReckoningState(self.f2f_pose, *online, self.since_node.motion, self.since_node.cov)
-
-    def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the sensors' error models for the interval since the last frame [s], and the DVL state."""
-        return FrameAiding(self.filter.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.filter.gates)
-
-    def set_dead_reckoning(self, state: DeadReckoningState) -> None:
-        """Replaces the F2F pose, the online pose and the motion since the last node by those of a given state."""
-        self.f2f_pose = state.f2f
-        self.since_node = self.since_node._replace(motion=state.since_node, cov=state.since_node_cov)
-        self.filter.world_from_camera, self.filter.cov = state.online, state.cov
-
-    def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
-        """Returns a source of visual measurements from images, which stores them in `folder`.
-
-        If `folder` is None, a temporary folder is created. `close` closes the source and removes the temporary folder.
-        """
-        if folder is None:
-            folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
-        vision = StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch, noise=noise)
-        return self._resources.enter_context(vision)
-
-    def _interval_s(self, time_s: float) -> float:
-        """Returns the time since the last frame [s].
-
-        The nominal interval is returned at the first frame, and where the time since the last frame differs from the
-        nominal interval only by rounding.
-
-        Raises:
-            ValueError: the frame is not later than the last one.
-        """
-        nominal_s = 1 / self.rig.frame_rate_hz
-        interval_s = time_s - self.log.times_s[-1] if len(self.log) else nominal_s
-        if not interval_s > 0:
-            raise ValueError(f"time_s: {time_s} s is not later than the last frame, at {self.log.times_s[-1]} s")
-        return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
-
-    def _is_keyframe(self, frame: Frame, status: str) -> bool:
-        """Returns whether a frame is to become a keyframe by the rules of `update`, before its points are matched.
-
-        It does if, after a motion equal to that since the last pair, the next pair would overlap with the last keyframe
-        by less than `settings.keyframe_overlap`.
-        """
-        if frame.right is None or frame.keyframe is not None:
-            return bool(frame.keyframe) and frame.right is not None
-        since_pair = geometry.inverse(self._f2f_at_pair) @ self.f2f_pose
-        self._f2f_at_pair = self.f2f_pose.copy()
-        if status != "ok" or not self.network.keyframes:
-            return True
-        next_pair = self.filter.world_from_camera @ since_pair
-        return self.network.overlap_with_last(next_pair) < self.settings.keyframe_overlap
-
-    def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
-        """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
-
-        If too few points are matched in stereo, the frame does not become a keyframe and only position fixes are fused.
-
-        Returns:
-            `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
-            link from the last node measures the motion of a frame at which tracking failed.
-        """
-        row = len(self.log)
-        points = self.vision.observe_stereo(frame, row)
-        if points is None:
-            self.filter.fuse_position_fixes(frame.readings)
-            return "too few points in stereo"
-        if (tracking_cov := self.vision.tracking_cov()) is not None:
-            self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(tracking_cov[3:, 3:]))))
-        pose = self.filter.world_from_camera
-        depth_m = float(np.median(points.xyz[:, 2]))
-        number = len(self.network.keyframes)
-        keyframe = Keyframe(number, row, track, pose, points, frame.readings, depth_m=depth_m, exposure=frame.exposure)
-        self._accumulate(keyframe, self.since_node.cov)
-        self.network.add(keyframe)
-        is_node = self.network.is_node(keyframe)
-        chain = self._follow_chain(keyframe) if is_node else None
-        if chain is not None and status != "ok" and self.settings.wide_search:
-            self.log.n_lost, status = self.log.n_lost - 1, "ok"  # the motion was measured after all
-        keyframe.readings = self.filter.fuse_position_fixes(
-            frame.readings
-        )  # after `_follow_chain`, to correct its error too
-        with self.stopwatch("f2m"):
-            self._register_with_mosaic(keyframe, chain)
-            keyframe.world_from_camera = self.filter.world_from_camera
-            self.vision.add_to_mosaic(keyframe.number, keyframe.world_from_camera)
-        if is_node:
-            self._connect(keyframe, chain)
-        self.vision.restart_tracking()
-        return status
-
-    def _follow_chain(self, node: Keyframe) -> Link | None:
-        """Measures the motion from the last node (None if it fails); it replaces the F2F motion in the online pose.
-
-        It is more accurate than accumulated F2F (Negahdaripour & Madjidi 2003, section IV-5). Corrections of the pose
-        since the last node, by navigation sensors and by F2M, are kept.
-        """
-        link = self.network.link_to_last_node(node)
-        if link is None:
-            return None
-        last = self.network.nodes[-1]
-        correction = geometry.inverse(last.world_from_camera @ self.since_node.motion) @ self.filter.world_from_camera
-        cov = geometry.transport_covariance(self.since_node.cov_at_node, link.i_from_j) + link.cov
-        self.filter.reset(last.world_from_camera @ link.i_from_j @ correction, cov)
-        node.world_from_camera = self.filter.world_from_camera
-        return link
-
-    def _register_with_mosaic(self, keyframe: Keyframe, chain: Link | None) -> None:
-        """Corrects the online pose by registration with the mosaic (F2M).
-
-        The mosaic has the pose errors of its keyframes, so the correction is weighted by the covariance of the motion
-        since the keyframe that the compared cells come from.
-        """
-        nodes, keyframes = self.network.nodes, self.network.keyframes
-        pose, step_cov = self.filter.world_from_camera, self.since_node.cov if chain is None else chain.cov
-        self._accumulate(keyframe, step_cov)
-        found = self.vision.register_with_mosaic(pose) if self.settings.use_f2m else None
-        if found is not None:
-            accumulated = keyframe.motion_cov(keyframes[found.reference_keyframe], pose)
-            since = clip_covariance(accumulated, np.ascontiguousarray(step_cov), 1.0, np.inf) if nodes else accumulated
-            cov = found.correction.cov + np.diag(_F2M_SIGMA**2)
-            reduction = self.filter.correct_pose(pose @ found.correction.a_from_b, cov, since)
-            if reduction is not None:
-                to_world = geometry.adjoint(pose)
-                keyframe.accumulated_cov = keyframe.accumulated_cov - to_world @ reduction @ to_world.T
-
-    def _accumulate(self, keyframe: Keyframe, step_cov: Array) -> None:
-        """Sets `accumulated_cov` of a keyframe from that of the last node and `step_cov` (6, 6) since then."""
-        if self.network.nodes:
-            to_world = geometry.adjoint(self.filter.world_from_camera)
-            keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
-
-    def _connect(self, node: Keyframe, chain: Link | None) -> None:
-        """Adds a node to the network, linked to the last node by `chain` or, if None, by the F2F motion since then."""
-        bridge = None
-        if self.network.nodes and chain is None:
-            cov = self.since_node.cov + np.eye(6) * 1e-10
-            bridge = Link(self.network.nodes[-1].number, node.number, self.since_node.motion, cov, 0.0, 0)
-        self.network.connect(node, chain, bridge, self.dvl.displacement_at_node(node.number))
-        self.since_node = MotionSinceNode(np.eye(4), np.zeros((6, 6)), self.filter.cov)
-
-    def _follow_last_keyframe(self, before: Array, node_cov: Array) -> None:
-        """Applies to the online pose the correction that an alignment made to the last keyframe, whose pose was
-        `before`.
-        """
-        last = self.network.keyframes[-1]
-        last_from_now = geometry.inverse(before) @ self.filter.world_from_camera
-        self.filter.reset(
-            last.world_from_camera @ last_from_now, geometry.transport_covariance(node_cov, last_from_now)
-        )
-        self.since_node = self.since_node._replace(cov_at_node=node_cov)
-
-
-def _in_map(result: SurveyResult) -> tuple[SurveyResult, Array]:
-    """Returns a result with its final trajectory in the frame of the map, and map_from_world (4, 4)."""
-    final = result.final
-    map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[0]])
+def _linked_in_map(result: SurveyResult) -> tuple[SurveyResult, NDArray[np.int64], Array]:
+    """Returns the result with linked keyframes only, in the map frame; their numbers; and map_from_world (4, 4)."""
+    linked, final = np.flatnonzero(~result.unlinked), result.final
+    map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[linked[0]]])
     turned = Trajectory(final.times_s, map_from_world @ final.world_from_camera)
-    return replace(result, final=turned), map_from_world
+    return replace(_of_keyframes(result, linked), final=turned), linked, map_from_world
 
 
 def _of_keyframes(result: SurveyResult, chosen: NDArray[np.int64]) -> SurveyResult:

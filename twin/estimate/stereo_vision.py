@@ -27,18 +27,16 @@ from twin.core.records import (
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
-from twin.estimate.viewing_plane import viewing_plane
 from twin.estimate.vision import disparity, epipolar_calibration, image_scale, matching, stereo, wide_search
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.light_pattern import LightPattern, light_pattern, pattern_fit
-from twin.estimate.vision.mosaic import Mosaic, Registration
+from twin.estimate.vision.mosaic import Mosaic, Registration, viewing_plane
 from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
 from twin.estimate.vision.repeated_images import LEFT_REPEATS, RepeatedImages
 from twin.estimate.vision.repetition import repetition
-from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe

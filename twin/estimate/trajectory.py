@@ -1,16 +1,48 @@
-"""Poses of all frames, interpolated between the poses of the keyframes."""
+"""Poses of all frames: their record, and their interpolation between the poses of the keyframes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.series import GrowingArray
 from twin.kernels import kernel
 
 _LEAST_VARIANCE = 1e-12  # of a component of a step [rad^2, m^2]
 _MAX_ITERATIONS = 10  # of the closure, which converges quadratically
+
+
+@dataclass
+class PoseLog:
+    """Times and estimated poses of all n frames; each frame takes 360 bytes of memory."""
+
+    times_s: GrowingArray = field(default_factory=GrowingArray)  #: (n,) [s]
+    #: (n, 4, 4) world_from_camera from frame-to-frame motion alone.
+    f2f: GrowingArray = field(default_factory=lambda: GrowingArray(4, 4))
+    online: GrowingArray = field(default_factory=lambda: GrowingArray(4, 4))  #: (n, 4, 4) world_from_camera
+    #: (n, 6) twists from frame to frame: those of vision, or of the online pose where vision failed. The online pose
+    #: also has the noise of the navigation sensors, but where vision fails they determine it.
+    steps: GrowingArray = field(default_factory=lambda: GrowingArray(6))
+    #: (n, 6) variances of `steps` [rad^2, m^2], in the axes of the later frame.
+    variances: GrowingArray = field(default_factory=lambda: GrowingArray(6))
+    n_lost: int = 0  #: number of frames whose motion was not measured but predicted
+    #: rows of the frames at which a camera was frozen, by status (`vision.repeated_images`).
+    repeats: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
+
+    def __len__(self) -> int:
+        return len(self.times_s)
+
+    def append(self, times_s: float | Array, f2f: Array, online: Array, steps: Array, variances: Array) -> None:
+        """Appends one frame, or n frames with a leading axis n."""
+        self.times_s.append(times_s)
+        self.f2f.append(f2f)
+        self.online.append(online)
+        self.steps.append(steps)
+        self.variances.append(variances)
 
 
 def interpolate_between_keyframes(
@@ -22,8 +54,7 @@ def interpolate_between_keyframes(
     variances: a step that failed takes nearly all of it.
 
     Args:
-        steps: (n, 6) twist of the camera from the previous frame to each frame [rad, m]; the first is not used.
-        variances: (n, 6) variance of each component of the steps, in the axes of the later frame [rad^2, m^2].
+        steps, variances: those of `PoseLog`; the first step is not used.
         rows: (m,) indices of the frames that are keyframes, ascending; m > 0.
         keyframe_poses: (m, 4, 4) aligned poses of these keyframes.
 

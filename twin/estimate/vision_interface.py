@@ -12,9 +12,8 @@ from typing import Protocol
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, SurveyResult
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
-from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
 

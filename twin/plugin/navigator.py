@@ -13,7 +13,7 @@ from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision, check_image_sizes
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.stereo import Keyframe
 from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import ESTIMATORS
 from twin.plugin.protocols import EstimatorSetup
@@ -84,7 +84,7 @@ class PluginNavigator(Navigator):
             self._pose = self._plugin.poses("update", found, (4, 4))
         self._cov = np.zeros((6, 6)) if cov is None else self._plugin.covariance("covariance", cov)
         self.log.n_lost += found is None
-        self.f2f_pose = self.filter.world_from_camera = self._pose  # by which keyframes are chosen
+        self.filter.f2f = self.filter.world_from_camera = self._pose  # by which keyframes are chosen
         if frozen != "ok":
             self.log.repeats.setdefault(frozen, []).append(len(self.log))
         keyframe = self._stereo_keyframe(frame, track) if frozen == "ok" else None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.core import geometry
-from twin.estimate.navigation.dead_reckoning import dead_reckon
+from twin.estimate.navigation.pose_filter import dead_reckon
 from twin.estimate.pipeline import Navigator
 from twin.kernels import kernel
 from twin.simulate.compiled_vehicle import CompiledVehicle, advance, body_twist, has_ended
@@ -43,13 +43,13 @@ def compiled_loop(
         with world.stopwatch("physics"):
             n, state, true, f2f, online, steps, variances = _fly(
                 vision.last_pose, vision.last_normals, vehicle.state, sensors, errors,
-                navigator.dead_reckoning, navigator.aiding(interval_s), pilot.state, reference, numbers, n_steps,
+                navigator.filter.state, navigator.filter.aiding(interval_s), pilot.state, reference, numbers, n_steps,
                 interval_s,
             )  # fmt: skip
         times_s = np.arange(len(world), len(world) + n) / rate_hz
         world.record(true[:n])
         vision.last_pose, vision.last_normals = true[n - 1], numbers[0][n - 1]
-        navigator.set_dead_reckoning(state)
+        navigator.filter.state = state
         navigator.log.append(times_s, f2f[:n], online[:n], steps[:n], variances[:n])
         vehicle.advance_clock(n / rate_hz)
         return first + n

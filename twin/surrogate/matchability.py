@@ -268,7 +268,7 @@ def _bound_px(images: FloorImages, albedo: Image, depth_m: float, rng: np.random
     matched = _matched_images(images.sensor(), *images.pair(albedo, depth_m), binning, rng)
     noise = float(matched.difference.std()) / np.sqrt(2)
     gradient = float(np.sqrt(np.mean(np.diff(matched.signal, axis=1) ** 2)))
-    return np.sqrt(2) * noise / (images.scenario.estimate.patch_px * max(gradient, 1e-6))
+    return np.sqrt(2) * noise / (images.scenario.estimator_settings().patch_px * max(gradient, 1e-6))
 
 
 def _in_snow(images: FloorImages, albedo: Image, depth_m: float, binning: int) -> tuple[float, float]:
@@ -279,7 +279,7 @@ def _in_snow(images: FloorImages, albedo: Image, depth_m: float, binning: int) -
     difference = _noise_difference(sensor, clean[0], setting, binning, np.random.default_rng(0))
     noise = float(difference.std()) / np.sqrt(2)
     signals = [[_grey(light, setting.gain, binning) for light in lights] for lights in (clean, snowy)]
-    effect = snow_effect(signals[0], signals[1], noise, images.scenario.estimate.patch_px)
+    effect = snow_effect(signals[0], signals[1], noise, images.scenario.estimator_settings().patch_px)
     return float(np.sqrt(effect.variance_px2)), effect.matched_share
 
 
@@ -360,7 +360,7 @@ def unevenness_px(
             centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
         binning: see `precision`.
     """
-    focal_px, patch_px = scenario.believed_rig().binned(binning).focal_px, scenario.estimate.patch_px
+    focal_px, patch_px = scenario.believed_rig().binned(binning).focal_px, scenario.estimator_settings().patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)
     x, y = (part.ravel() for part in np.meshgrid(side, side))
     plane = np.column_stack([np.ones_like(x), x, y])

@@ -28,9 +28,8 @@ from twin.estimate.mapping import elevation
 from twin.estimate.vision import stereo
 from twin.estimate.vision.f2f import MAX_POINTS as F2F_POINTS
 from twin.estimate.vision.f2f import MIN_MATCHED, constant_velocity_motion
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
-from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel

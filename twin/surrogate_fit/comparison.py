@@ -20,9 +20,8 @@ from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, SurveyResult
 from twin.estimate.stereo_vision import StereoVision
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.mosaic import Registration
-from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate.error_model import BinnedDepthLaw, BorderErrorLaw, DepthLaw, ErrorModel, ScatterLaw, SigmaLaw
 from twin.surrogate.map_model import WALL_SLOPE

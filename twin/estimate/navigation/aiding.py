@@ -1,29 +1,34 @@
-"""Factors of the navigation sensors in the graph of the global alignment.
+"""Factors of the navigation sensors in the graph of the global alignment; residuals are predicted minus measured.
 
 The scale error of the DVL is one parameter shared by all displacements: as noise of each, it would average out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import symmetric_inverses
 from twin.core.records import SensorNoise, StereoRig
-from twin.estimate.adjustment import BinaryFactors, UnaryFactors, pose_residual_jacobians, pose_residuals
+from twin.estimate.adjustment.pose_graph import (
+    BinaryFactors,
+    UnaryFactors,
+    pose_residual_jacobians,
+    pose_residuals,
+)
 from twin.estimate.navigation import pose_filter
 from twin.estimate.navigation.dvl import body_displacement
-from twin.estimate.vision.keyframes import Keyframe
+from twin.estimate.vision.stereo import Keyframe
 from twin.kernels import kernel
 
 
 def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> list[UnaryFactors]:
     """Returns the factors of pressure, attitude, position fixes, beacons and verticals, in this order.
-
-    All residuals are predicted minus measured.
 
     Args:
         nodes: nodes, in the order of the poses in the graph.
@@ -37,27 +42,42 @@ def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise)
     ]
 
 
+def _readings(nodes: Sequence[Keyframe], name: str) -> tuple[NDArray[np.int64], Any]:
+    """Returns the indices (m,) of the nodes with a reading of this name, and their readings (m, ...)."""
+    index = [k for k, node in enumerate(nodes) if getattr(node.readings, name) is not None]
+    return np.array(index, np.int64), np.array([getattr(nodes[k].readings, name) for k in index], np.float64)
+
+
+def _factors(
+    index: NDArray[np.int64],
+    information: Array,
+    residuals: Callable[[Array], Array],
+    jacobians: Callable[[Array, Array], Array],
+) -> UnaryFactors:
+    """Returns factors with the same information matrix (d, d)."""
+    return UnaryFactors(index, np.tile(information, (len(index), 1, 1)), residuals, jacobians)
+
+
 def _height_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    index = [k for k, node in enumerate(nodes) if node.readings.pressure_z_m is not None]
-    height_m = np.array([nodes[k].readings.pressure_z_m for k in index], dtype=np.float64)
+    index, height_m = _readings(nodes, "pressure_z_m")
 
     def jacobians(poses: Array, _: Array) -> Array:
         by_pose = np.zeros((len(poses), 1, 6))
         by_pose[:, 0, 3:] = poses[:, 2, :3]
         return by_pose
 
-    information = np.full((len(index), 1, 1), noise.pressure_m**-2)
-    return UnaryFactors(
-        np.array(index, np.int64), information, lambda poses: poses[:, 2, 3:] - height_m[:, None], jacobians
+    return _factors(
+        index, np.eye(1) * noise.pressure_m**-2, lambda poses: poses[:, 2, 3:] - height_m[:, None], jacobians
     )
 
 
 def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    index = [k for k, node in enumerate(nodes) if node.readings.ahrs_rpy_rad is not None]
-    angles = np.array([nodes[k].readings.ahrs_rpy_rad for k in index]).reshape(-1, 3)
-    camera_from_body = geometry.inverse(rig.body_from_camera)
-    cov = pose_filter.camera_attitude(np.zeros(3), camera_from_body, noise)[1]  # independent of the angles
-    measured = _camera_poses_at_origin(angles, rig.body_from_camera)
+    index, angles = _readings(nodes, "ahrs_rpy_rad")
+    camera_from_body, origin = geometry.inverse(rig.body_from_camera), np.zeros(3)
+    cov = pose_filter.camera_attitude(origin, camera_from_body, noise.attitude_sigmas_rad)[1]  # for any angles
+    mount = geometry.pose(rig.body_from_camera[:3, :3], origin)
+    bodies = [geometry.pose(geometry.rotation_from_rpy(*rpy_rad), origin) for rpy_rad in angles]
+    measured = np.array([geometry.compose(body, mount) for body in bodies]).reshape(-1, 4, 4)
 
     def residuals(poses: Array) -> Array:
         rotations = poses.copy()
@@ -67,54 +87,37 @@ def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
     def jacobians(_: Array, residuals: Array) -> Array:
         return pose_residual_jacobians(np.column_stack([residuals, np.zeros_like(residuals)]))[:, :3]
 
-    information = np.tile(symmetric_inverses(cov[None]), (len(index), 1, 1))
-    return UnaryFactors(np.array(index, np.int64), information, residuals, jacobians)
-
-
-@kernel
-def _camera_poses_at_origin(angles, body_from_camera):
-    """Returns world_from_camera (m, 4, 4), with zero translation, for roll, pitch and yaw (m, 3) of the body [rad]."""
-    poses, mount_rotation = np.empty((len(angles), 4, 4)), body_from_camera.copy()
-    mount_rotation[:3, 3] = 0.0
-    for k in range(len(angles)):
-        body = geometry.pose(geometry.rotation_from_rpy(angles[k, 0], angles[k, 1], angles[k, 2]), np.zeros(3))
-        geometry.copy_into(poses[k], geometry.compose(body, mount_rotation))
-    return poses
+    return _factors(index, symmetric_inverses(cov[None])[0], residuals, jacobians)
 
 
 def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    index = [k for k, node in enumerate(nodes) if node.readings.usbl_m is not None]
-    position_m = np.array([nodes[k].readings.usbl_m for k in index]).reshape(-1, 3)
+    index, position_m = _readings(nodes, "usbl_m")
+    position_m = position_m.reshape(-1, 3)
 
     def jacobians(poses: Array, _: Array) -> Array:
         by_pose = np.zeros((len(poses), 3, 6))
         by_pose[:, :, 3:] = poses[:, :3, :3]
         return by_pose
 
-    information = np.tile(np.eye(3) * noise.usbl_m**-2, (len(index), 1, 1))
-    return UnaryFactors(np.array(index, np.int64), information, lambda poses: poses[:, :3, 3] - position_m, jacobians)
+    return _factors(index, np.eye(3) * noise.usbl_m**-2, lambda poses: poses[:, :3, 3] - position_m, jacobians)
 
 
 def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
-    """Returns the factors of the beacons seen in the left image.
-
-    The residuals are the predicted minus the detected positions [px]; 0 for a beacon predicted behind the camera.
-    """
+    """Returns the factors of the beacons seen in the left image; a beacon predicted behind the camera adds nothing."""
     sightings = [(k, sighting) for k, node in enumerate(nodes) for sighting in node.readings.beacons or ()]
-    beacon_m = np.array([noise.beacons_m[sighting.beacon] for _, sighting in sightings]).reshape(-1, 3)
-    pixels = np.array([sighting.pixel for _, sighting in sightings]).reshape(-1, 2)
+    beacon_m = [np.array(noise.beacons_m[sighting.beacon], np.float64) for _, sighting in sightings]
 
     def evaluate(poses: Array) -> tuple[Array, Array]:
         residuals, by_pose = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, 6))
         for k, pose in enumerate(poses):
             expected, jacobian = pose_filter.project_beacon(pose, beacon_m[k], rig)
-            if np.isfinite(expected).all():  # a beacon behind the camera adds no constraint
-                residuals[k], by_pose[k] = expected - pixels[k], jacobian
+            if np.isfinite(expected).all():
+                residuals[k], by_pose[k] = expected - sightings[k][1].pixel, jacobian
         return residuals, by_pose
 
     index = np.array([k for k, _ in sightings], np.int64)
-    information = np.tile(np.eye(2) * noise.beacon_px**-2, (len(index), 1, 1))
-    return UnaryFactors(index, information, lambda poses: evaluate(poses)[0], lambda poses, _: evaluate(poses)[1])
+    information = np.eye(2) * noise.beacon_px**-2
+    return _factors(index, information, lambda poses: evaluate(poses)[0], lambda poses, _: evaluate(poses)[1])
 
 
 def _vertical_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
@@ -124,22 +127,17 @@ def _vertical_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
     The error of the accelerometer is common to all n readings, so each has n times the variance: all together, they
     determine the direction as precisely as one.
     """
-    index = [k for k, node in enumerate(nodes) if node.readings.up is not None]
-    measured = np.array([nodes[k].readings.up for k in index]).reshape(-1, 3) @ rig.body_from_camera[:3, :3]
-    across = np.array([pose_filter.perpendicular_axes(up) for up in measured]).reshape(-1, 2, 3)
+    index, up = _readings(nodes, "up")
+    measured = up.reshape(-1, 3) @ rig.body_from_camera[:3, :3]
+    across = np.array([pose_filter.perpendicular_axes(axis) for axis in measured]).reshape(-1, 2, 3)
 
     def jacobians(poses: Array, _: Array) -> Array:
         by_pose = np.zeros((len(poses), 2, 6))
-        by_pose[:, :, :3] = across @ np.array([geometry.skew(up) for up in poses[:, 2, :3]]).reshape(-1, 3, 3)
+        by_pose[:, :, :3] = across @ np.array([geometry.skew(axis) for axis in poses[:, 2, :3]]).reshape(-1, 3, 3)
         return by_pose
 
-    information = np.tile(np.eye(2) * noise.up_rad**-2 / max(len(index), 1), (len(index), 1, 1))
-    return UnaryFactors(
-        np.array(index, np.int64),
-        information,
-        lambda poses: np.einsum("nij,nj->ni", across, poses[:, 2, :3]),
-        jacobians,
-    )
+    information = np.eye(2) * noise.up_rad**-2 / max(len(index), 1)
+    return _factors(index, information, lambda poses: np.einsum("nij,nj->ni", across, poses[:, 2, :3]), jacobians)
 
 
 def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFactors:
@@ -147,9 +145,6 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
     d is the displacement of the body's origin, in the body axes at the earlier node; s is the scale error of the DVL,
     one parameter shared by all factors. A displacement whose earlier node is not in `nodes` is left out.
-
-    Args:
-        nodes: nodes, in the order of the poses in the graph.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     with_dvl = [(k, node.dvl_displacement) for k, node in enumerate(nodes) if node.dvl_displacement is not None]

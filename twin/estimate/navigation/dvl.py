@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Displacement, SensorNoise, StereoRig
-from twin.estimate.navigation.pose_filter import DVL, fuse_reading
+from twin.estimate.navigation.kalman import DVL, fuse_reading
 from twin.kernels import kernel
 
 
@@ -45,21 +45,14 @@ class DvlIntegrator:
     Each reading has half weight in two consecutive displacements. The variance of their sum, (n - 1/2) (sigma dt)^2 for
     readings of deviation sigma, is approximated by independent displacements of variance (sigma dt)^2.
 
-    Attributes:     state: integration since the last node.
+    Attributes:
+        state: integration since the last node.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
-        self._rig, self._noise = rig, noise
-        self.state = DvlState(
-            velocity=np.full(3, np.nan),
-            node_from_body=np.eye(3),
-            rotation_cov=np.zeros((3, 3)),
-            displacement_m=np.zeros(3),
-            cov=np.zeros((3, 3)),
-            path_m=np.zeros(1),
-            complete=np.ones(1, np.bool_),
-        )
-        self._node = 0
+        self._rig, self._noise, self._node = rig, noise, 0
+        displacement = np.zeros(3), np.zeros((3, 3)), np.zeros(1)
+        self.state = DvlState(np.full(3, np.nan), np.eye(3), np.zeros((3, 3)), *displacement, np.ones(1, np.bool_))
 
     def model(self, interval_s: float) -> DvlModel:
         """Returns the error model for a given interval between frames [s]."""
@@ -71,10 +64,12 @@ class DvlIntegrator:
 
         None if the reading at the last node or at a frame after it is missing.
         """
-        node, self._node, state = self._node, number, self.state
+        state, node, self._node = self.state, self._node, number
         complete = state.complete[0]
         displacement = Displacement(node, state.displacement_m.copy(), _displacement_cov(state)) if complete else None
-        _restart(state)
+        state.node_from_body[:], state.complete[:] = np.eye(3), True
+        for sums in (state.rotation_cov, state.displacement_m, state.cov, state.path_m):
+            sums[:] = 0.0
         return displacement
 
 
@@ -82,8 +77,7 @@ class DvlIntegrator:
 def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, Array]:
     """Returns the displacement (3,) [m] of the body's origin for a motion of the camera, in the body axes before it.
 
-    Also its Jacobian (3, 6) with respect to an increment [rotation, translation] (rad, m), in the axes of the later
-    camera.
+    Also its Jacobian (3, 6) with respect to an increment of the motion, in the axes of the later camera.
     """
     camera_from_body = geometry.inverse(body_from_camera)
     body_a_from_b = geometry.compose(body_from_camera, a_from_b)
@@ -101,7 +95,6 @@ def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
     """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
     Args:
-        a_from_b, cov: (4, 4), (6, 6) visual motion of the camera and its covariance.
         velocity: (3,) reading of this frame, in body axes [m/s]; NaN if there is none.
 
     Returns:
@@ -174,14 +167,6 @@ def _displacement_cov(state):
     """Returns the covariance (3, 3) [m^2] of the displacement since the node due to white noise and attitude error."""
     lever = geometry.skew(state.displacement_m)  # conservative: applies the final attitude error to the whole path
     return state.cov + geometry.product(geometry.product(lever, state.rotation_cov), lever.T)
-
-
-@kernel
-def _restart(state):
-    """Resets the integration at a node, in place; the last reading is kept."""
-    geometry.copy_into(state.node_from_body, np.eye(3))
-    state.rotation_cov[:], state.displacement_m[:], state.cov[:], state.path_m[:] = 0.0, 0.0, 0.0, 0.0
-    state.complete[:] = True
 
 
 @kernel

@@ -1,7 +1,7 @@
-"""Extended Kalman filter of the online pose.
+"""Dead reckoning from frame to frame, and the extended Kalman filter of the online pose.
 
-Frame-to-frame motion predicts the pose; registrations with the mosaic (F2M) and navigation sensors correct it. All
-covariances of poses and motions refer to [rotation, translation] (rad, m) in camera axes.
+Visual motion fused with the DVL predicts the pose; registrations with the mosaic (F2M) and navigation sensors correct
+it. Covariances of poses and motions refer to [rotation, translation] (rad, m) in the axes of the current camera.
 """
 
 from __future__ import annotations
@@ -14,36 +14,176 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Readings, SensorNoise, StereoRig
+from twin.core.records import Displacement, Readings, SensorNoise, StereoRig
+from twin.estimate.navigation.dvl import DvlIntegrator, DvlModel, DvlState, fuse_dvl
+from twin.estimate.navigation.kalman import (
+    AHRS,
+    BEACONS,
+    PRESSURE,
+    SENSORS,
+    USBL,
+    VERTICAL,
+    ReadingGates,
+    fuse_reading,
+)
+from twin.estimate.vision.two_view_motion import Motion
 from twin.kernels import kernel
 
 _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a pose in `correct_pose`; above it, the pose is rejected
-SENSORS = ("pressure", "ahrs", "dvl", "usbl", "beacons", "vertical")  # navigation sensors, in the order of their gates
-PRESSURE, AHRS, DVL, USBL, BEACONS, VERTICAL = range(6)
-#: Largest chi2 of a reading with 1, 2 and 3 components; one in 1e9 exceeds it.
-_READING_GATES = (37.3, 41.4, 44.8)
-#: Number of consecutive readings of each sensor that are rejected before it is believed: 10 s at 30 frames per second,
-#: for the DVL, whose readings contradict each motion of vision anew, 2 s.
-_PATIENCE = (300, 300, 30, 5, 20, 300)
+
+
+class DeadReckoningState(NamedTuple):
+    """State of dead reckoning after a frame. The arrays are not modified in place."""
+
+    f2f: Array  #: (4, 4) world_from_camera from frame-to-frame motion alone
+    #: online, cov: (4, 4), (6, 6) online estimate of world_from_camera, and its covariance.
+    online: Array
+    cov: Array
+    #: since_node, since_node_cov: (4, 4), (6, 6) motion since the last node from vision and DVL, and its covariance.
+    since_node: Array
+    since_node_cov: Array
+
+
+class PressureAhrsModel(NamedTuple):
+    """Error model of the pressure sensor and the AHRS."""
+
+    camera_from_body: Array  #: (4, 4) pose of the body in the camera
+    pressure_m2: float  #: variance of the height measured by the pressure sensor [m^2]
+    attitude_sigmas_rad: Array  #: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad]
+
+
+class FrameAiding(NamedTuple):
+    """Error models of the sensors that are read at every frame; states, whose arrays are modified in place."""
+
+    pressure_ahrs: PressureAhrsModel
+    dvl: DvlModel
+    dvl_state: DvlState
+    gates: ReadingGates
+
+
+def readings_as_arrays(readings: Readings) -> tuple[float, Array, Array]:
+    """Returns height z [m], roll, pitch, yaw (3,) [rad] and body velocity (3,) [m/s]; NaN where there is no reading."""
+    height, angles, velocity = readings.pressure_z_m, readings.ahrs_rpy_rad, readings.dvl_mps
+    missing = np.full(3, np.nan)
+    return (
+        np.nan if height is None else height,
+        missing if angles is None else angles,
+        missing if velocity is None else velocity,
+    )
+
+
+@kernel
+def dead_reckon(
+    last: DeadReckoningState,
+    aiding: FrameAiding,
+    a_from_b: Array,
+    cov: Array,
+    height_m: float,
+    rpy_rad: Array,
+    velocity_mps: Array,
+) -> tuple[DeadReckoningState, Array]:
+    """Advances dead reckoning by one frame: returns its state, and the motion (4, 4) after fusion with the DVL.
+
+    Args:
+        a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
+        height_m, rpy_rad, velocity_mps: readings (`readings_as_arrays`).
+    """
+    motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)
+    online, online_cov = predict(last.online, last.cov, motion, motion_cov)
+    online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding.pressure_ahrs, height_m, rpy_rad, aiding.gates)
+    since_node, since_node_cov = predict(last.since_node, last.since_node_cov, motion, motion_cov)
+    f2f = geometry.compose(last.f2f, a_from_b)
+    return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion
+
+
+@kernel
+def predict(world_from_camera, cov, a_from_b, motion_cov):
+    """Returns the pose (4, 4) and its covariance (6, 6) after a motion `a_from_b` with covariance `motion_cov`.
+
+    These are equations (3) to (5) of Negahdaripour & Madjidi (2003).
+    """
+    return geometry.compose(world_from_camera, a_from_b), geometry.transport_covariance(cov, a_from_b) + motion_cov
+
+
+@kernel
+def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad, gates):
+    """Returns a pose (4, 4) and its covariance (6, 6) after the update with the readings of height and attitude."""
+    pose = world_from_camera
+    if not np.isnan(height_m):
+        by_pose, residual, height_cov = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
+        geometry.copy_into(by_pose[0, 3:], pose[2, :3])
+        residual[0], height_cov[0, 0] = height_m - pose[2, 3], model.pressure_m2
+        pose, cov, _ = fuse_reading(pose, cov, residual, by_pose, height_cov, gates, PRESSURE)
+    if not np.isnan(rpy_rad[0]):
+        measured, attitude_cov = camera_attitude(rpy_rad, model.camera_from_body, model.attitude_sigmas_rad)
+        residual = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
+        pose, cov, _ = fuse_reading(pose, cov, residual, np.eye(3, 6), attitude_cov, gates, AHRS)
+    return pose, cov
+
+
+@kernel
+def camera_attitude(rpy_rad: Array, camera_from_body: Array, sigmas_rad: Array) -> tuple[Array, Array]:
+    """Returns the rotation world_from_camera (3, 3) of an AHRS reading (3,), and its covariance in camera axes.
+
+    The errors of roll, pitch and yaw, of standard deviations (3,), are rotations about the x, y and z axes of the body.
+    """
+    to_camera = np.ascontiguousarray(camera_from_body[:3, :3])
+    root = to_camera * sigmas_rad
+    return geometry.rotation_from_rpy(rpy_rad[0], rpy_rad[1], rpy_rad[2]) @ to_camera.T, root @ root.T
 
 
 class PoseFilter:
-    """Extended Kalman filter of one pose.
+    """Extended Kalman filter of the online pose, with the state of dead reckoning.
 
-    Errors are motions [rotation, translation] (rad, m) in camera axes: pose = true pose @ exp(error). The initial pose
-    is known with a standard deviation of 1e-4 rad and 1e-4 m.
+    Errors are motions in camera axes: pose = true pose @ exp(error). The initial pose is known with a standard
+    deviation of 1e-4 rad and 1e-4 m.
 
-    Attributes:     world_from_camera, cov: (4, 4), (6, 6) estimated pose and covariance of its error.
-    pressure_ahrs: error model of the pressure sensor and the AHRS.     gates: states of the gates of all sensors.
+    Attributes:
+        world_from_camera, cov: (4, 4), (6, 6) online pose and covariance of its error.
+        f2f: (4, 4) world_from_camera from frame-to-frame motion alone.
+        since_node, since_node_cov: (4, 4), (6, 6) motion since the last node from vision and DVL, and its covariance.
+        cov_at_node: (6, 6) covariance of the online pose at the last node, in the camera axes there.
+        gates: states of the gates of all sensors.
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
         self.world_from_camera: Array = world_from_camera
-        self.cov: Array = np.diag([1e-8] * 3 + [1e-8] * 3)
+        self.cov: Array = np.eye(6) * 1e-8
+        self.f2f: Array = world_from_camera.copy()
+        self.since_node, self.since_node_cov, self.cov_at_node = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
         self.rig, self.noise = rig, noise
         camera_from_body = geometry.inverse(rig.body_from_camera)
         self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
         self.gates = ReadingGates(np.zeros((len(SENSORS), 3), np.int64), np.zeros((len(SENSORS), 3)))
+        self.dvl = DvlIntegrator(rig, noise)
+
+    @property
+    def state(self) -> DeadReckoningState:
+        """The state of dead reckoning at the last frame; `dead_reckon` advances it by one frame."""
+        cov = np.ascontiguousarray(self.cov)
+        return DeadReckoningState(self.f2f, self.world_from_camera, cov, self.since_node, self.since_node_cov)
+
+    @state.setter
+    def state(self, state: DeadReckoningState) -> None:
+        self.f2f, self.world_from_camera, self.cov, self.since_node, self.since_node_cov = state
+
+    def aiding(self, interval_s: float) -> FrameAiding:
+        """Returns the sensors' error models for the interval since the last frame [s], and the states."""
+        return FrameAiding(self.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.gates)
+
+    def advance(self, motion: Motion, readings: Readings, interval_s: float) -> Array:
+        """Advances by a frame with a visual motion; returns the motion (4, 4) after fusion with the DVL."""
+        arrays = readings_as_arrays(readings)
+        self.state, moved = dead_reckon(self.state, self.aiding(interval_s), motion.a_from_b, motion.cov, *arrays)
+        return moved
+
+    def start_from_node(self, number: int) -> Displacement | None:
+        """Restarts the motion since the last node at the node `number`; returns the displacement by the DVL until then.
+
+        None if the reading at the last node or at a frame after it is missing.
+        """
+        self.since_node, self.since_node_cov, self.cov_at_node = np.eye(4), np.zeros((6, 6)), self.cov
+        return self.dvl.displacement_at_node(number)
 
     def correct_pose(self, measured: Array, cov: Array, motion_cov: Array) -> Array | None:
         """Fuses a pose measured relative to an earlier pose, such as the result of a registration with the mosaic.
@@ -64,8 +204,7 @@ class PoseFilter:
     def fuse_position_fixes(self, readings: Readings) -> Readings:
         """Fuses the readings that are taken only at keyframes: an acoustic position fix, and the beacons detected.
 
-        Returns:
-            The readings without the position fix and the beacons that were rejected.
+        Returns the readings without those that were rejected.
         """
         counts, beacons = self.rejected, []
         if readings.usbl_m is not None:
@@ -143,159 +282,18 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
     return rig.project(point)[0], by_point @ np.hstack([geometry.skew(point[0]), -np.eye(3)])
 
 
-class ReadingGates(NamedTuple):
-    """States of the gates that reject readings, one row per sensor in `SENSORS`; arrays are modified in place."""
-
-    #: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used although
-    #: they contradict the pose.
-    counts: NDArray[np.int64]
-    residuals: Array  #: (6, 3) residual of the last reading that contradicted the pose
-
-
-class PressureAhrsModel(NamedTuple):
-    """Error model of the pressure sensor and the AHRS."""
-
-    camera_from_body: Array  #: (4, 4) pose of the body in the camera
-    pressure_m2: float  #: variance of the height measured by the pressure sensor [m^2]
-    attitude_sigmas_rad: Array  #: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad]
-
-
-@kernel
-def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad, gates):
-    """Updates a pose with readings of height and attitude (Kalman update).
-
-    Args:
-        world_from_camera, cov: (4, 4), (6, 6) pose and covariance before the update.
-        height_m, rpy_rad: readings of the height of the left camera in the world [m], and of roll, pitch and yaw (3,)
-            of the body in the world [rad]; NaN where there is no reading.
-
-    Returns:
-        Pose (4, 4) and covariance (6, 6) after the update.
-    """
-    pose = world_from_camera
-    if not np.isnan(height_m):
-        by_pose, residual, height_cov = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
-        geometry.copy_into(by_pose[0, 3:], pose[2, :3])
-        residual[0], height_cov[0, 0] = height_m - pose[2, 3], model.pressure_m2
-        pose, cov, _ = fuse_reading(pose, cov, residual, by_pose, height_cov, gates, PRESSURE)
-    if not np.isnan(rpy_rad[0]):
-        measured, attitude_cov = _camera_attitude(rpy_rad, model.camera_from_body[:3, :3], model.attitude_sigmas_rad)
-        residual = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
-        pose, cov, _ = fuse_reading(pose, cov, residual, np.eye(3, 6), attitude_cov, gates, AHRS)
-    return pose, cov
-
-
-@kernel
-def predict(world_from_camera, cov, a_from_b, motion_cov):
-    """Returns the pose (4, 4) and its covariance (6, 6) after a motion `a_from_b` with covariance `motion_cov`.
-
-    These are equations (3) to (5) of Negahdaripour & Madjidi (2003).
-    """
-    return geometry.compose(world_from_camera, a_from_b), geometry.transport_covariance(cov, a_from_b) + motion_cov
-
-
 @kernel
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
     """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
-    The limits apply to the eigenvalues of L^-1 cov L^-T, with L L^T = reference (Cholesky factor L).
-
-    Raises:
-        LinAlgError: the reference covariance is not positive definite.
+    The limits apply to the eigenvalues of L^-1 cov L^-T, with L L^T = reference. Raises LinAlgError if the reference is
+    not positive definite.
     """
     root = np.linalg.cholesky(reference)
     inverse_root = np.linalg.inv(root)
     values, axes = np.linalg.eigh(inverse_root @ cov @ inverse_root.T)
     axes = root @ axes
     return axes * np.minimum(np.maximum(values, lower), upper) @ axes.T
-
-
-@kernel
-def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
-    """Updates a pose with a reading (Kalman update), unless the reading contradicts the pose.
-
-    It does if the chi-square of its residual is above the limit. If many readings in succession contradict the pose in
-    the same way, the pose is taken to be wrong: its covariance is increased by that of the error they imply.
-
-    Args:
-        sensor: index of the sensor in `SENSORS`.
-
-    Returns:
-        Pose (4, 4) and covariance (6, 6) after the update, and whether the reading was used.
-    """
-    counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
-    innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov
-    if _chi2(residual, innovation_cov) > _READING_GATES[n - 1]:
-        as_before = _chi2(residual - last[:n], innovation_cov) <= _READING_GATES[n - 1]
-        counts[0] = counts[0] + 1 if as_before else 1
-        geometry.copy_into(last[:n], residual)
-        if counts[0] <= _PATIENCE[sensor]:
-            counts[1] += 1
-            return world_from_camera, prior, False
-        counts[2] += 1
-        error = jacobian.T @ np.linalg.solve(geometry.product(jacobian, jacobian.T), residual)
-        prior = prior + np.outer(error, error)
-    else:
-        counts[0] = 0
-    pose, cov = kalman_update(world_from_camera, prior, residual, jacobian, cov)
-    return pose, cov, True
-
-
-@kernel
-def _chi2(residual, cov):
-    return np.sum(residual * np.linalg.solve(cov, residual))
-
-
-@kernel
-def kalman_update(world_from_camera, prior, residual, jacobian, cov):
-    """Updates a pose with an observation (Kalman update in Joseph form).
-
-    Args:
-        world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
-        residual, jacobian, cov: (k,), (k, 6), (k, k) observation minus its prediction, Jacobian of the prediction with
-            respect to an increment of the pose, and covariance of the observation.
-
-    Returns:
-        Pose (4, 4) and covariance (6, 6) after the update.
-    """
-    gain = _gain(prior, jacobian, cov)
-    keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)
-    for i in range(6):
-        for m in range(len(residual)):
-            step[i] += gain[i, m] * residual[m]
-            for k in range(6):
-                keep[i, k] -= gain[i, m] * jacobian[m, k]
-                for n in range(len(residual)):
-                    noise[i, k] += gain[i, m] * cov[m, n] * gain[k, n]
-    return geometry.compose(world_from_camera, geometry.exp(step)), geometry.transform_covariance(keep, prior) + noise
-
-
-@kernel
-def _gain(prior, jacobian, cov):
-    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by elimination; P `prior` (6, 6), R `cov` (k, k)."""
-    size = len(cov)
-    gain, innovation_cov = np.zeros((6, size)), cov.copy()
-    for m in range(size):
-        for i in range(6):
-            for k in range(6):
-                gain[i, m] += prior[i, k] * jacobian[m, k]
-    for m in range(size):
-        for n in range(size):
-            for i in range(6):
-                innovation_cov[m, n] += jacobian[m, i] * gain[i, n]
-    for m in range(size):
-        for n in range(m + 1, size):
-            ratio = innovation_cov[m, n] / innovation_cov[m, m]
-            for k in range(m, size):
-                innovation_cov[k, n] -= ratio * innovation_cov[k, m]
-            for i in range(6):
-                gain[i, n] -= ratio * gain[i, m]
-    for m in range(size - 1, -1, -1):
-        for i in range(6):
-            gain[i, m] /= innovation_cov[m, m]
-            for n in range(m):
-                gain[i, n] -= innovation_cov[m, n] * gain[i, m]
-    return gain
 
 
 @kernel
@@ -306,20 +304,3 @@ def _correct(world_from_camera, prior, measured, cov, motion_cov):
     inverse = np.linalg.inv(motion_cov + cov)
     gain = motion_cov @ inverse
     return residual @ inverse @ residual, world_from_camera @ geometry.exp(gain @ residual), gain @ motion_cov
-
-
-def camera_attitude(rpy_rad: Array, camera_from_body: Array, noise: SensorNoise) -> tuple[Array, Array]:
-    """Returns the rotation world_from_camera (3, 3) of an AHRS reading (3,) [rad], and its covariance (3, 3) in camera
-    axes.
-
-    The errors of roll, pitch and yaw are treated as rotations about the x, y and z axes of the body.
-    """
-    return _camera_attitude(rpy_rad, camera_from_body[:3, :3], noise.attitude_sigmas_rad)
-
-
-@kernel
-def _camera_attitude(rpy, camera_from_body, sigmas):
-    """Compiled kernel of `camera_attitude`, for a rotation `camera_from_body` (3, 3) and `sigmas` (3,) [rad]."""
-    to_camera = np.ascontiguousarray(camera_from_body)
-    root = to_camera * sigmas
-    return geometry.rotation_from_rpy(rpy[0], rpy[1], rpy[2]) @ to_camera.T, root @ root.T

@@ -60,9 +60,6 @@ def _filtered(times_s, rates, forces, rate_density2, rate_walk2, force_density2)
     """Returns the vertical (n, 3) after each reading and its variance (n,) about each perpendicular axis [rad^2].
 
     Errors of the state are [rotation in body axes, gyroscope bias]: true rotation = rotation @ exp(error).
-
-    Args:
-        times_s, rates, forces: (n,), (n, 3), (n, 3) readings.
     """
     n = len(times_s)
     up, variance, bias = np.empty((n, 3)), np.empty(n), np.zeros(3)

@@ -15,9 +15,9 @@ from twin.core.records import StereoRig
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
 from twin.estimate.vision import matching, observation_equations, patches, pixel_locking, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.keyframes import Keyframe
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.pixel_locking import PixelLocking
+from twin.estimate.vision.stereo import Keyframe
 
 _LEVELS = 2  # pyramid levels above the full image
 SEARCH_PX = 8.0  #: largest error of a predicted image position from which a point is found, with these levels [px]

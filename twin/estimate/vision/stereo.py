@@ -1,15 +1,17 @@
-"""Sparse stereo at a keyframe: well-textured points with their disparity and its covariance."""
+"""Keyframes, and their sparse stereo: well-textured points with their disparity and its covariance."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import StereoRig
+from twin.core.records import Displacement, Exposure, Readings, StereoRig
 from twin.estimate.vision import epipolar, matching, patches
 
 _EPIPOLAR_PX = 1.0
@@ -36,11 +38,42 @@ class StereoPoints(NamedTuple):
 
     def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
         """Returns the points where `keep` (n,) is true."""
-        return StereoPoints(
-            self.pixels[keep], self.disparity_slope[keep], self.mean_disparity_px[keep],
-            self.measured[keep], self.cov[keep], self.xyz[keep], self.row_difference_px[keep],
-            self.noise_ratio,
-        )  # fmt: skip
+        *columns, noise_ratio = self
+        return StereoPoints._make([*(column[keep] for column in columns), noise_ratio])
+
+
+@dataclass
+class Keyframe:
+    """Frame with a stereo pair whose pose the network estimates ("key point" in Negahdaripour & Madjidi 2003).
+
+    Its fields are updated in place during the survey.
+    """
+
+    number: int  #: index of the keyframe, from 0
+    row: int  #: index of its frame in the trajectories
+    track: int  #: number of its track, from 1
+    world_from_camera: Array  #: (4, 4) latest estimate of the pose
+    points: StereoPoints | None  #: matched stereo points; None once a newer keyframe has been added
+    readings: Readings  #: readings of the navigation sensors
+    depth_m: float = np.nan  #: median depth of the matched points [m]
+    exposure: Exposure | None = None  #: exposure of its images; None if it was not reported
+    #: displacement since the previous node, measured by the DVL; None if it was not measured, or if the link to the
+    #: previous node is the F2F motion, which already includes the DVL readings.
+    dvl_displacement: Displacement | None = None
+    #: (6, 6) sum of the covariances of all motions since the start, minus the decreases due to registrations with the
+    #: mosaic; in world axes [rotation, translation] (rad, m). The difference between the values of two keyframes is the
+    #: covariance of the motion between them.
+    accumulated_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+
+    def motion_cov(self, earlier: Keyframe, world_from_camera: Array | None = None) -> Array:
+        """Returns the covariance (6, 6) of the motion since an earlier keyframe [rotation, translation] (rad, m).
+
+        It is in the axes of this keyframe, or of `world_from_camera` (4, 4); too large after global alignments, which
+        do not decrease `accumulated_cov`.
+        """
+        pose = self.world_from_camera if world_from_camera is None else world_from_camera
+        from_world = geometry.adjoint(geometry.inverse(pose))
+        return from_world @ (self.accumulated_cov - earlier.accumulated_cov) @ from_world.T
 
 
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:

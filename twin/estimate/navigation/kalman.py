@@ -1,0 +1,114 @@
+"""Kalman updates of a pose with readings, and the gates that reject readings which contradict the pose."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.kernels import kernel
+
+SENSORS = ("pressure", "ahrs", "dvl", "usbl", "beacons", "vertical")  # navigation sensors, in the order of their gates
+PRESSURE, AHRS, DVL, USBL, BEACONS, VERTICAL = range(6)
+#: Largest chi2 of a reading with 1, 2 and 3 components; one in 1e9 exceeds it.
+_READING_GATES = (37.3, 41.4, 44.8)
+#: Number of consecutive readings of each sensor that are rejected before it is believed: 10 s at 30 frames per second,
+#: for the DVL, whose readings contradict each motion of vision anew, 2 s.
+_PATIENCE = (300, 300, 30, 5, 20, 300)
+
+
+class ReadingGates(NamedTuple):
+    """States of the gates that reject readings, one row per sensor in `SENSORS`; arrays are modified in place."""
+
+    #: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used although
+    #: they contradict the pose.
+    counts: NDArray[np.int64]
+    residuals: Array  #: (6, 3) residual of the last reading that contradicted the pose
+
+
+@kernel
+def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
+    """Updates a pose with a reading of a sensor, unless the chi-square of its residual is above the limit.
+
+    If many readings in succession contradict the pose in the same way, the pose is taken to be wrong: its covariance is
+    increased by that of the error they imply.
+
+    Returns:
+        Pose (4, 4) and covariance (6, 6) after the update, and whether the reading was used.
+    """
+    counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
+    innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov
+    if _chi2(residual, innovation_cov) > _READING_GATES[n - 1]:
+        as_before = _chi2(residual - last[:n], innovation_cov) <= _READING_GATES[n - 1]
+        counts[0] = counts[0] + 1 if as_before else 1
+        geometry.copy_into(last[:n], residual)
+        if counts[0] <= _PATIENCE[sensor]:
+            counts[1] += 1
+            return world_from_camera, prior, False
+        counts[2] += 1
+        error = jacobian.T @ np.linalg.solve(geometry.product(jacobian, jacobian.T), residual)
+        prior = prior + np.outer(error, error)
+    else:
+        counts[0] = 0
+    pose, cov = kalman_update(world_from_camera, prior, residual, jacobian, cov)
+    return pose, cov, True
+
+
+@kernel
+def _chi2(residual, cov):
+    return np.sum(residual * np.linalg.solve(cov, residual))
+
+
+@kernel
+def kalman_update(world_from_camera, prior, residual, jacobian, cov):
+    """Updates a pose with an observation (Kalman update in Joseph form).
+
+    Args:
+        world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
+        residual, jacobian, cov: (k,), (k, 6), (k, k) observation minus its prediction, Jacobian of the prediction with
+            respect to an increment of the pose, and covariance of the observation.
+
+    Returns:
+        Pose (4, 4) and covariance (6, 6) after the update.
+    """
+    gain = _gain(prior, jacobian, cov)
+    keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)
+    for i in range(6):
+        for m in range(len(residual)):
+            step[i] += gain[i, m] * residual[m]
+            for k in range(6):
+                keep[i, k] -= gain[i, m] * jacobian[m, k]
+                for n in range(len(residual)):
+                    noise[i, k] += gain[i, m] * cov[m, n] * gain[k, n]
+    return geometry.compose(world_from_camera, geometry.exp(step)), geometry.transform_covariance(keep, prior) + noise
+
+
+@kernel
+def _gain(prior, jacobian, cov):
+    """Returns the Kalman gain P J' (J P J' + R)^-1 (6, k), by elimination; P `prior` (6, 6), R `cov` (k, k)."""
+    size = len(cov)
+    gain, innovation_cov = np.zeros((6, size)), cov.copy()
+    for m in range(size):
+        for i in range(6):
+            for k in range(6):
+                gain[i, m] += prior[i, k] * jacobian[m, k]
+    for m in range(size):
+        for n in range(size):
+            for i in range(6):
+                innovation_cov[m, n] += jacobian[m, i] * gain[i, n]
+    for m in range(size):
+        for n in range(m + 1, size):
+            ratio = innovation_cov[m, n] / innovation_cov[m, m]
+            for k in range(m, size):
+                innovation_cov[k, n] -= ratio * innovation_cov[k, m]
+            for i in range(6):
+                gain[i, n] -= ratio * gain[i, m]
+    for m in range(size - 1, -1, -1):
+        for i in range(6):
+            gain[i, m] /= innovation_cov[m, m]
+            for n in range(m):
+                gain[i, n] -= innovation_cov[m, n] * gain[i, m]
+    return gain
