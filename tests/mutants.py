@@ -105,7 +105,7 @@ MUTANTS = [
         ("twin/judge/consistency.py", "tail = (1 - share) / 2", "tail = 1 - share", "judge_metrics judge_trajectory"),
         ("twin/judge/map_error.py", "1.4826 * np.median(np.abs(error - np.median(error)))", "1.4826 * np.median(np.abs(error))", "judge_metrics judge_true_map"),
         ("twin/judge/map_error.py", "percent, method=\"higher\")", "percent, method=\"lower\")", "judge_area judge_metrics"),
-        ("twin/judge/trajectory.py", "return first_true @ geometry.inverse(first_estimated)", "return first_estimated @ geometry.inverse(first_true)", "judge_trajectory"),
+        ("twin/judge/trajectory_errors.py", "return first_true @ geometry.inverse(first_estimated)", "return first_estimated @ geometry.inverse(first_true)", "judge_trajectory"),
         ("twin/judge/colour_difference.py", "hue = np.where(coloured, (h1 + h2) / 2 + across, h1 + h2)", "hue = np.where(coloured, (h1 + h2) / 2, h1 + h2)", "judge_metrics orthomosaic"),
         ("twin/judge/require.py", "value >= limit if more_is_better(name) else value <= limit", "value > limit if more_is_better(name) else value < limit", "judge_metrics"),
         # exchange
@@ -127,7 +127,7 @@ MUTANTS = [
         ("twin/report/wording.py", "if gain > 1 else f\"{ratio(1 / gain)} larger\"", "if gain > 1 else f\"{ratio(gain)} larger\"", "report_survey_page report_figures"),
         ("twin/report/verdict.py", "'at least' if more_is_better(name) else 'at most'", "'at most' if more_is_better(name) else 'at least'", "report_verdict"),
         # data sets, surrogate's fit, studies, app, reproduction
-        ("twin/recordings/aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),
+        ("twin/recordings/recorded_aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),
         ("twin/datasets/readings.py", "times_s, values = table.values[:, 0] * 1e-9,", "times_s, values = table.values[:, 0] * 1e-6,", "datasets_readings"),
         ("twin/studies/statistics.py", "centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)", "centre = (p + z**2 / n) / (1 + z**2 / n)", "study_statistics"),
         ("twin/studies/surveys.py", "0 if plan.paired else sample.point * plan.seeds", "sample.point * plan.seeds if plan.paired else 0", "study_sampling study_runner"),

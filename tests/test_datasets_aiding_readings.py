@@ -8,7 +8,7 @@ from twin.core import geometry
 from twin.core.records import Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.datasets.readings import RecordedReadings, SensorSeries
-from twin.recordings.aiding import Aiding, Opening
+from twin.recordings.recorded_aiding import Aiding
 
 START_S, RATE_HZ = 5.0, 10.0  # time of the first frame in the clock of the data set, rate of frames and readings
 BODY_FROM_LEFT = geometry.pose(geometry.rotation_from_rpy(np.pi, 0.1, 0.7), np.array([0.2, 0.1, -0.3]))
@@ -44,14 +44,14 @@ def exact(monkeypatch, **chosen):
 
 
 def opening(pose):
-    return Opening((), RIG, EstimatorSettings(), pose)
+    return (), RIG, EstimatorSettings(), pose
 
 
 def test_the_start_and_the_heights_follow_from_exact_readings(monkeypatch):
     aiding = exact(monkeypatch, attitude=True, height=True)
     assert aiding.used == ["pressure", "attitude"]
     np.testing.assert_allclose(aiding.body_from_camera, BODY_FROM_CAMERA)
-    start = aiding.start(opening(geometry.pose(np.eye(3), np.array([9.0, 9.0, 1.5]))))
+    start = aiding.start(*opening(geometry.pose(np.eye(3), np.array([9.0, 9.0, 1.5]))))
     np.testing.assert_allclose(start.world_from_camera[:3, :3], path()[0][:3, :3], atol=1e-9)
     np.testing.assert_allclose(start.world_from_camera[:3, 3], [0, 0, 1.5])
     heights = [aiding.at(k / RATE_HZ).pressure_z_m for k in range(5)]
@@ -62,20 +62,20 @@ def test_a_start_from_verticals_is_level_and_keeps_the_heading_over_the_plane(mo
     """The plane is tilted against the horizontal by a rotation about a horizontal axis, so no heading is lost."""
     aiding = exact(monkeypatch, vertical=True)
     tilt = geometry.so3_exp(np.array([0.15, -0.1, 0.0]))
-    start = aiding.start(opening(geometry.pose(tilt @ path()[0][:3, :3], np.array([0, 0, 2.0]))))
+    start = aiding.start(*opening(geometry.pose(tilt @ path()[0][:3, :3], np.array([0, 0, 2.0]))))
     np.testing.assert_allclose(start.world_from_camera[:3, :3], path()[0][:3, :3], atol=1e-9)
     assert start.world_from_camera[2, 3] == 2.0
 
 
 def test_the_uncertainty_of_a_start_has_the_axes_of_the_sensor(monkeypatch):
     rotation = path()[0][:3, :3]
-    start = exact(monkeypatch, attitude=True, height=True).start(opening(np.eye(4)))
+    start = exact(monkeypatch, attitude=True, height=True).start(*opening(np.eye(4)))
     variances = BODY_FROM_CAMERA[:3, :3].T @ np.diag([0.02**2, 0.02**2, 0.03**2]) @ BODY_FROM_CAMERA[:3, :3]
     np.testing.assert_allclose(start.cov[:3, :3], np.diag(np.diag(variances)) / 5, rtol=1e-9)  # of five readings
     np.testing.assert_allclose(start.prior_cov[:3, :3], 0.1**2 * np.eye(3), atol=1e-12)
     world = rotation @ start.prior_cov[3:, 3:] @ rotation.T
     np.testing.assert_allclose(np.diag(world), [1e-12, 1e-12, 1.0], rtol=1e-3)
-    level = exact(monkeypatch, vertical=True).start(opening(np.eye(4)))
+    level = exact(monkeypatch, vertical=True).start(*opening(np.eye(4)))
     turned = level.world_from_camera[:3, :3]
     for cov, tilt in ((level.cov, 0.05), (level.prior_cov, 0.1)):  # heading and height define the world
         in_world = turned @ cov[:3, :3] @ turned.T
@@ -92,7 +92,7 @@ def test_the_noise_of_the_estimators_is_that_of_the_readings(monkeypatch):
 @pytest.mark.parametrize("late_s", [0.0, 0.1])
 def test_residuals_are_zero_on_the_true_path_and_count_standard_deviations(monkeypatch, late_s):
     aiding = exact(monkeypatch, attitude=True, height=True)
-    aiding.start(opening(geometry.pose(np.eye(3), np.array([0, 0, 1.5]))))
+    aiding.start(*opening(geometry.pose(np.eye(3), np.array([0, 0, 1.5]))))
     times_s, moved = np.arange(4) / RATE_HZ, path()[:4].copy()
     found = aiding.residuals(Trajectory(times_s + late_s, moved))
     if late_s:  # the path rises by 4 cm per frame, of a standard deviation of 4 mm
@@ -159,8 +159,8 @@ def test_readings_that_no_first_frame_has_are_not_used_later(monkeypatch, attitu
     height = height._replace(times_s=height.times_s + height_s)
     aiding = Aiding(RecordedReadings(np.eye(4), height=height, attitude=attitude), np.eye(4), 5.0, 10.0)
     at_start = geometry.pose(np.eye(3), np.array([0.0, 0.0, 1.5]))
-    monkeypatch.setattr(Aiding, "_first_motions", lambda self, _: [(np.eye(4), self.at(k / 10)) for k in range(60)])
-    start = aiding.start(Opening((), RIG, EstimatorSettings(), at_start), known)
+    monkeypatch.setattr(Aiding, "_first_motions", lambda self, *_: [(np.eye(4), self.at(k / 10)) for k in range(60)])
+    start = aiding.start((), RIG, EstimatorSettings(), at_start, known)
     assert aiding.used == used and len(aiding.notes) == 2 - len(used)
     assert (start is None) == (not used)
     later = aiding.at(25.0)

@@ -28,7 +28,7 @@ from twin.estimate.vision.mosaic import Mosaic, Registration
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
-from twin.judge.self_check import self_check_metrics
+from twin.judge.survey_quality import self_check_metrics
 
 PATCH_PX = 11
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import twin.session.conclusion
+import twin.session.flown_survey
 from twin import cli, survey
 from twin.app import doctor
 from twin.app.termination import sigterm_as_interrupt
@@ -69,7 +70,7 @@ def in_first_call(function, number):
 STAGES = {
     "alignment": (Navigator, "finish"),
     "map": (Navigator, "build_map"),
-    "orthomosaic": (twin.session.conclusion, "make_orthomosaic"),
+    "orthomosaic": (twin.session.flown_survey, "make_orthomosaic"),
     "evaluation": (twin.session.conclusion, "evaluate"),
     "maps": (mesh, "write_glb"),
     "report": (survey_page, "write_report"),

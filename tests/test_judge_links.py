@@ -9,8 +9,7 @@ from judge_synthetic import link_between, survey
 from twin.core import geometry
 from twin.core.links import Link, Links
 from twin.core.records import Trajectory
-from twin.judge.links import link_metrics
-from twin.judge.stages import compose_chain, stage_metrics
+from twin.judge.network_errors import compose_chain, link_metrics, stage_metrics
 
 RESULT, _, TRUTH, _ = survey()
 KEYS = TRUTH.trajectory.world_from_camera[RESULT.keyframe_rows]

@@ -13,12 +13,11 @@ from twin.core.links import Links
 from twin.core.records import ElevationMap, MapGrid, Trajectory, Truth
 from twin.errors import TwinError
 from twin.judge.consistency import consistency_metrics, nees, nees_interval
-from twin.judge.control import control_metrics
+from twin.judge.flown_path import control_metrics, leg_numbers, travel_direction
 from twin.judge.map_error import map_metrics
 from twin.judge.metrics import EvaluationInput, check_require, empty_metrics, evaluate
 from twin.judge.overlap import overlap_metrics
-from twin.judge.require import meets_limit, more_is_better, number_paths
-from twin.judge.swaths import leg_numbers, travel_direction
+from twin.judge.require import meets_limit, more_is_better, numbers_of
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
 PLANNED = {"overlap_along": 0.9, "overlap_across": 0.8, "along_median": 0.86, "across_median": 0.79}
@@ -254,9 +253,9 @@ def test_an_aborted_survey_has_every_key_and_no_nan():
     for n_frames, n_keyframes in [(0, 0), (1, 0), (1, 1), (2, 1), (9, 2), (8, 2)]:
         part = evaluate(aborted(n_frames, n_keyframes))
         json.dumps(part, allow_nan=False)
-        assert set(number_paths(part)) >= {p for p in number_paths(whole) if not p.startswith("timing.stages")}
+        assert set(numbers_of(part)) >= {p for p in numbers_of(whole) if not p.startswith("timing.stages")}
         assert part["map"]["rmse_m"] is None and part["require"]["map.le90_m"]["passed"] is False
-    assert set(number_paths(empty_metrics())) == {p for p in number_paths(whole) if not p.startswith("require.")}
+    assert set(numbers_of(empty_metrics())) == {p for p in numbers_of(whole) if not p.startswith("require.")}
 
 
 def aborted(n_frames: int, n_keyframes: int) -> EvaluationInput:

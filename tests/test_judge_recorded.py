@@ -11,7 +11,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from twin.core import geometry
 from twin.core.records import Trajectory
 from twin.judge.recorded import associate, recorded_errors, rigid_alignment, truth_warnings
-from twin.judge.trajectory import trajectory_metrics
+from twin.judge.trajectory_errors import trajectory_metrics
 
 RNG = np.random.default_rng(2)
 MOVED = geometry.exp(np.array([0.4, -1.1, 2.0, 5.0, -3.0, 1.0]))

@@ -12,8 +12,7 @@ from judge_synthetic import drifted, survey
 
 from twin.core import geometry
 from twin.core.records import Trajectory
-from twin.judge.alignment import track_metrics
-from twin.judge.trajectory import path_errors, trajectory_metrics
+from twin.judge.trajectory_errors import path_errors, track_metrics, trajectory_metrics
 
 RESULT, _, TRUTH, _ = survey()
 TRUE = TRUTH.trajectory

@@ -9,7 +9,7 @@ from judge_synthetic import write_folder
 from twin.core import geometry
 from twin.core.records import Trajectory
 from twin.judge.recorded import recorded_errors
-from twin.judge.trajectory import path_errors
+from twin.judge.trajectory_errors import path_errors
 from twin.report import comparison_figures, figures, recording, wording
 from twin.report.run_errors import run_errors
 from twin.report.run_folder import load_run

@@ -12,7 +12,7 @@ from judge_synthetic import SCENARIO, write_folder
 
 from twin.core.records import Trajectory
 from twin.errors import TwinError
-from twin.judge.budget import stage_times
+from twin.judge.processing_budget import stage_times
 from twin.report import figures, wording
 from twin.report.run_folder import load_run
 from twin.report.stage_table import stage_rows

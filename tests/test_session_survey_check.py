@@ -13,7 +13,8 @@ from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Traje
 from twin.errors import SurveyAborted
 from twin.estimate.alignment import _mean_chi2
 from twin.scenario.file import load_scenario
-from twin.session.conclusion import _identity, plugin_notes
+from twin.session.conclusion import status
+from twin.session.flown_survey import plugin_notes
 from twin.session.monitor import SurveyMonitor
 from twin.session.survey_check import calibration_notes, off_course_limit_m, survey_findings
 from twin.world.mission import prepare
@@ -133,9 +134,9 @@ def test_a_survey_without_vision_is_aborted_after_it_has_held_station():
 def test_findings_degrade_a_survey_and_an_abort_outranks_them():
     finding = Finding("points", 20.0, 60.0, "one stereo pair in ten has 20 matched points or fewer")
     expected = {("", ()): "complete", ("", (finding,)): "degraded", ("vision lost", (finding,)): "aborted"}
-    for (abort, findings), status in expected.items():
-        identity = _identity(mission(), abort, findings)
-        assert identity["status"] == status
+    for (abort, findings), name in expected.items():
+        identity = status(abort, findings)
+        assert identity["status"] == name
         assert identity["reason"] == (abort or "; ".join(f.sentence for f in findings))
 
 

@@ -17,7 +17,8 @@ from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
 from twin.session.assembly import make_navigator, open_world
-from twin.session.conclusion import FlownSurvey, conclude
+from twin.session.conclusion import Estimation, conclude
+from twin.session.flown_survey import FlownSurvey
 from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
 from twin.world.flight import Flight
@@ -49,9 +50,6 @@ def run(
         outputs: outputs to write in addition to metrics, trajectories and maps: "report", "recording", both or none of
             them. None: write the metrics only.
 
-    Returns:
-        Status, metrics and run folder of the survey.
-
     Raises:
         ScenarioError: the scenario cannot be flown; nothing was written.
         TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
@@ -69,15 +67,11 @@ def _run(
     outputs: Collection[str] | None,
 ) -> RunResult:
     """Runs a survey as `run` does, in a folder that this process has locked."""
-    scenario = mission.scenario
-    stopwatch, guard = Stopwatch(), StageGuard()
+    scenario, stopwatch, guard = mission.scenario, Stopwatch(), StageGuard()
+    images = scenario.imaging.fidelity == "rendered" and outputs is not None
     with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
-        if (share := mission.terrain.orthophoto_share) is not None and share < 1.0:
-            folder.log("orthophoto covers a part of the floor; the rest has the other texture", share=round(share, 4))
-        for warning in (*mission.terrain.hole_notes, *world.warnings):
-            folder.log("warning", text=warning)
+        _log_warnings(mission, world, folder)
         monitor = SurveyMonitor(mission, folder, progress, live)
-        images = scenario.imaging.fidelity == "rendered" and outputs is not None
         with make_navigator(mission, world, out, stopwatch) as navigator:
             try:
                 with guard.stage(), FrameRecorder(out, scenario.record if images else "none") as recorder:
@@ -89,10 +83,20 @@ def _run(
                     fly(mission, world, navigator, observe, monitor.actions)
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
                 guard.cause = str(error) or "interrupted"
-            result = conclude(FlownSurvey(mission, world, navigator, stopwatch, guard), folder, monitor)
+            flown = FlownSurvey(mission, world.truth(), world.warnings, monitor.actions.times)
+            estimation = Estimation(navigator, stopwatch, guard, folder, monitor.report_stage, monitor.start_s)
+            result, _ = conclude(estimation, flown)
     if scenario.record == "none" and images:
         remove_keyframe_images(out)
     return result
+
+
+def _log_warnings(mission: Mission, world: World, folder: RunFolder) -> None:
+    """Logs the limits of the floor and of the simulation."""
+    if (share := mission.terrain.orthophoto_share) is not None and share < 1.0:
+        folder.log("orthophoto covers a part of the floor; the rest has the other texture", share=round(share, 4))
+    for warning in (*mission.terrain.hole_notes, *world.warnings):
+        folder.log("warning", text=warning)
 
 
 def fly(

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 from twin.core.records import Array, ElevationMap, SurveyResult, Truth
 from twin.judge.map_error import normalised_error
 from twin.judge.summary_statistics import mean
-from twin.judge.trajectory import anchor
+from twin.judge.trajectory_errors import anchor
 
 
 def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
@@ -17,10 +17,9 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
     For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
     within two sigma is 0.954. The mean NEES of 99 % of the surveys with consistent covariances lies between
     `nees_position_low` and `nees_position_high`; they are None without a final alignment. `within_2sigma_position` is
-    the fraction over the three camera axes of the keyframes that `keyframe_errors` returns, `within_2sigma_map` the
-    fraction over the map cells that `normalised_error` returns.
+    the fraction over the three camera axes of the keyframes, `within_2sigma_map` that over the map cells with an error.
     """
-    error, cov = keyframe_errors(result, truth)
+    error, cov = _keyframe_errors(result, truth)
     low, high = nees_interval(result.quality.independent_errors) or (None, None)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
     cells = np.zeros(0) if elevation is None else normalised_error(elevation, truth)
@@ -33,14 +32,11 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
     }
 
 
-def keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
-    """Returns errors and estimated covariances of the final keyframe positions, both in camera axes.
+def _keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
+    """Returns errors (n, 3) [m] and estimated covariances (n, 3, 3) of the final keyframes, both in camera axes.
 
-    The first keyframe is left out because it is anchored at the truth. Keyframes without a positive definite
-    covariance are left out as well.
-
-    Returns:
-        (n, 3) errors [m]; (n, 3, 3) covariances [m2].
+    The first keyframe is left out because it is anchored at the truth, and so are keyframes without a positive definite
+    covariance.
     """
     n = min(len(result.keyframe_rows), len(result.node_cov))
     frames = result.keyframe_rows[1:n]
@@ -68,11 +64,7 @@ def nees_interval(independent_errors: float | None, share: float = 0.99) -> tupl
 
     The mean NEES is distributed as chi-square with 3 k degrees of freedom, divided by k (Bar-Shalom, Li & Kirubarajan
     2001, section 5.4.2), for k independent errors. A survey is equivalent to few of them, because its errors are
-    correlated along the path.
-
-    Args:
-        independent_errors: number k, not necessarily whole; None gives None.
-        share: probability that the mean NEES lies in the interval.
+    correlated along the path. The number k need not be whole; None gives None.
     """
     if independent_errors is None:
         return None

@@ -68,7 +68,7 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
 
 
 def _of_surface(name: str, size: Array) -> dict[str, float | None]:
-    """Returns median, LE90 and fraction of gross errors of the absolute errors (n,) over a kind of surface."""
+    """Returns the metrics of the absolute errors (n,) over a kind of surface."""
     return {
         f"{name}_median_m": percentile(size, 50),
         f"{name}_le90_m": percentile(size, 90),
@@ -77,10 +77,9 @@ def _of_surface(name: str, size: Array) -> dict[str, float | None]:
 
 
 def completeness_metric(metric: str) -> str | None:
-    """Returns the name of the completeness metric to report with a statistic of the height errors.
+    """Returns the completeness metric to report with a statistic of the height errors; None for other metrics.
 
-    It shows how many cells have no height: most of these statistics leave them out, so none is reported alone. Returns
-    None if the metric is not such a statistic.
+    It shows how many cells have no height: most of these statistics leave them out, so none is reported alone.
     """
     if not metric.startswith("map.") or metric.startswith("map.completeness") or metric == "map.cell_m":
         return None
@@ -95,8 +94,7 @@ def with_completeness(metrics: Iterable[str]) -> list[str]:
 def percentile_with_holes(size: Array, percent: float) -> float | None:
     """Returns a percentile (0 to 100) of absolute errors (n,), linearly interpolated; NaN counts as an infinite error.
 
-    Returns None if no value is finite, or if an infinite error enters the interpolation and makes the percentile
-    infinite.
+    Returns None if no value is finite or the percentile is infinite.
     """
     known = np.isfinite(size)
     if not known.any():

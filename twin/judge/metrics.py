@@ -11,109 +11,141 @@ import numpy as np
 from twin.core.quality import ActionTimes
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
-from twin.judge import orthomosaic
-from twin.judge.alignment import track_metrics
 from twin.judge.consistency import consistency_metrics
-from twin.judge.control import control_metrics
-from twin.judge.links import link_metrics
+from twin.judge.flown_path import control_metrics
 from twin.judge.map_error import map_metrics
+from twin.judge.network_errors import NETWORK_KEYS, link_metrics, network_residuals, stage_metrics
+from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.judge.overlap import overlap_metrics
+from twin.judge.recorded import RecordedTruth, associate, recorded_errors, truth_warnings
 from twin.judge.require import check_metric_names, judge_requirements
-from twin.judge.self_check import self_check_metrics
-from twin.judge.stages import stage_metrics
-from twin.judge.stereo_quality import stereo_quality
 from twin.judge.summary_statistics import finite_float, finite_tree
-from twin.judge.trajectory import path_errors, trajectory_metrics
+from twin.judge.survey_quality import self_check_metrics, stereo_quality
+from twin.judge.trajectory_errors import path_errors, track_metrics, trajectory_metrics
+from twin.judge.true_map import recorded_map_metrics, truth_without_flight
 from twin.judge.warnings import metric_warnings
 
 SCHEMA = "twin.metrics/2"
+#: `replay` of a replay that was not evaluated, besides the description of its data set.
+_NOT_COMPARED = {"alignment": None, "frames_with_truth": 0, "network": dict.fromkeys(NETWORK_KEYS)}
 _IDENTITY = ("name", "seed", "version", "scenario_hash", "status", "reason")
-
-_VERDICTS = ("warnings", "warning", "idealisations")  # keys whose values `_judged` sets; None before
 
 
 @dataclass(frozen=True)
 class EvaluationInput:
-    """Input of `evaluate`: a survey and its truth.
+    """Input of `evaluate`: a survey and its truth. A replay has a recorded truth and a description of its data set."""
 
-    Args:
-        result: output of the estimators.
-        elevation: elevation map; None if none was built.
-        truth: true trajectory and floor, and the reference path.
-        rig: calibration that the estimators use.
-        plan: pattern, requested and forecast overlaps of the plan: the argument `planned` of `overlap_metrics`.
-        timing: wall_s, simulated_s, peak_rss_mb, and stages as `Stopwatch.summary` returns them.
-        identity: name, seed, version, scenario_hash, status ("complete", "degraded" or "aborted"), and reason, the
-            reason for the status ("" if it is "complete").
-        require: limit of each required metric, e.g. {"map.le90_m": 0.05}.
-        warnings: sentences on limits of the simulation, such as a surrogate used outside the range of its fit.
-        idealisations: sentences on effects of a real survey that the scenario leaves out, such as calibration errors.
-        actions: durations for which the mission slowed and stopped the vehicle because visual measurements failed.
-        orthomosaic: errors of the orthomosaic (`OrthomosaicJudge.metrics`); None if none was made.
-    """
-
-    result: SurveyResult
-    elevation: ElevationMap | None
-    truth: Truth
-    rig: StereoRig
+    result: SurveyResult  #: output of the estimators
+    elevation: ElevationMap | None  #: elevation map; None if none was built
+    truth: Truth | RecordedTruth  #: true trajectory and floor, and the reference path of a simulated survey
+    rig: StereoRig  #: calibration that the estimators use
+    #: pattern, requested and forecast overlaps of the plan: the argument `planned` of `overlap_metrics`.
     plan: Mapping[str, Any] = field(default_factory=dict)
+    #: wall_s, simulated_s, peak_rss_mb, and stages as `Stopwatch.summary` returns them.
     timing: Mapping[str, Any] = field(default_factory=dict)
+    #: name, seed, version, scenario_hash, status ("complete", "degraded" or "aborted"), and reason, the reason for the
+    #: status ("" if it is "complete").
     identity: Mapping[str, Any] = field(default_factory=dict)
-    require: Mapping[str, float] = field(default_factory=dict)
-    warnings: Sequence[str] = ()
-    idealisations: Sequence[str] = ()
-    actions: ActionTimes = ActionTimes()
-    orthomosaic: Mapping[str, float | None] | None = None
+    require: Mapping[str, float] = field(default_factory=dict)  #: limits of metrics, e.g. {"map.le90_m": 0.05}
+    warnings: Sequence[str] = ()  #: sentences on limits of the simulation or the data set
+    idealisations: Sequence[str] = ()  #: sentences on effects of a real survey that the scenario leaves out
+    actions: ActionTimes = ActionTimes()  #: durations for which the mission slowed and stopped the vehicle
+    orthomosaic: Mapping[str, float | None] | None = None  #: `OrthomosaicJudge.metrics`; None if none was made
+    #: description of the data set of a replay (reader, number of skipped frames by reason, etc.); None for a survey.
+    source: Mapping[str, Any] | None = None
 
 
 def evaluate(survey: EvaluationInput) -> dict[str, Any]:
     """Returns the contents of metrics.json. A value that cannot be computed is None, never NaN.
 
+    The metrics of a replay that need more than its recorded truth has (links, control, etc.) are None, 0 or empty. Its
+    key `replay` holds the description of the data set, the alignment, the number of frames with a true pose, and the
+    consistency of the network (`network_residuals`).
+
     Raises:
         TwinError: `require` names a metric that does not exist.
     """
-    result, truth, elevation = _completed(survey.result, survey.truth), survey.truth, survey.elevation
-    paths = {"f2f": result.f2f, "online": result.online, "final": result.final}
-    grid = elevation.grid if elevation else None
-    metrics = {
-        "schema": SCHEMA,
-        **{key: survey.identity.get(key) for key in _IDENTITY},
-        **dict.fromkeys(_VERDICTS),
-        "trajectory": {k: trajectory_metrics(path_errors(p, truth.trajectory)) for k, p in paths.items()},
+    if isinstance(survey.truth, Truth):
+        return _contents(survey, _sections(survey, survey.truth))
+    path = survey.truth.trajectory
+    warnings = [] if path is None else truth_warnings(survey.result.final, path)
+    return _contents(survey, _replay_sections(survey, survey.truth), warnings)
+
+
+def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
+    """Returns the metrics of a survey that was not compared with the truth.
+
+    They hold schema, identity, timing, description of the data set, warnings, idealisations and requirements; all other
+    metrics are None, 0 or empty. A requirement on a metric that is None fails.
+
+    Raises:
+        TwinError: `require` names a metric that does not exist.
+    """
+    return _contents(survey, {})
+
+
+def _contents(survey: EvaluationInput, sections: dict[str, Any], warnings: Sequence[str] = ()) -> dict[str, Any]:
+    """Returns metrics.json with some evaluated sections; all others are None, 0 or empty.
+
+    The given warnings are added to those of the survey and to those that follow from the metrics.
+    """
+    known = {key: survey.identity.get(key) for key in _IDENTITY}
+    known["timing"] = _timing(survey.timing, len(survey.result.online), len(survey.result.keyframe_rows))
+    if survey.source is not None:
+        known["replay"] = dict(survey.source) | sections.pop("replay", _NOT_COMPARED)
+    metrics = empty_metrics() | finite_tree(known | sections)
+    found = [*survey.warnings, *warnings, *metric_warnings(metrics)]
+    return metrics | {
+        "warnings": found,
+        "warning": " ".join(found),
+        "idealisations": list(survey.idealisations),
+        "require": judge_requirements(survey.require, metrics),
+    }
+
+
+def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
+    """Returns the sections of metrics.json of a survey whose whole truth is known."""
+    result, elevation = _completed(survey.result, truth), survey.elevation
+    grid = None if elevation is None else elevation.grid
+    return {
+        "trajectory": {k: trajectory_metrics(path_errors(p, truth.trajectory)) for k, p in _paths(result).items()},
         "tracks": track_metrics(result, truth),
         "map": map_metrics(elevation, truth),
-        "orthomosaic": dict(survey.orthomosaic or dict.fromkeys(orthomosaic.KEYS)),
+        "orthomosaic": dict(survey.orthomosaic or OrthomosaicJudge(False).metrics()),
         "consistency": consistency_metrics(result, elevation, truth),
         "links": link_metrics(result, truth),
         "vision": stereo_quality(result),
         "self_check": self_check_metrics(result),
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth) | survey.actions._asdict(),
-        "overlap": overlap_metrics(result, truth, survey.rig, grid, dict(survey.plan)),
-        "timing": timing_metrics(survey.timing, len(result.online), len(result.keyframe_rows)),
+        "overlap": overlap_metrics(result, truth, survey.rig, grid, survey.plan),
     }
-    return _judged(finite_tree(metrics), survey)
 
 
-def _judged(metrics: dict[str, Any], survey: EvaluationInput) -> dict[str, Any]:
-    """Returns the metrics with `warnings`, `warning` (all warnings as one text), `idealisations` and `require`."""
-    warnings = [*survey.warnings, *metric_warnings(metrics)]
-    verdicts = {"warnings": warnings, "warning": " ".join(warnings), "idealisations": list(survey.idealisations)}
-    return metrics | verdicts | {"require": judge_requirements(survey.require, metrics)}
+def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str, Any]:
+    """Returns the sections of metrics.json that a replay has."""
+    result, elevation, empty, true = survey.result, survey.elevation, empty_metrics(), truth.trajectory
+    errors = {} if true is None else {k: recorded_errors(p, true, truth.alignment) for k, p in _paths(result).items()}
+    heights = {"cell_m": None if elevation is None else elevation.grid.cell_m}
+    if elevation is not None and truth.heights_m is not None:
+        heights = recorded_map_metrics(elevation, truth.heights_m)
+    return {
+        "trajectory": empty["trajectory"] | {name: trajectory_metrics(error) for name, error in errors.items()},
+        "map": empty["map"] | heights,
+        "links": empty["links"] | {"bridged": int((result.links.n_points == 0).sum())},
+        "vision": stereo_quality(result),
+        "self_check": self_check_metrics(result),
+        "replay": {
+            "alignment": None if true is None else truth.alignment,
+            "frames_with_truth": 0 if true is None else len(associate(result.final.times_s, true.times_s).truth),
+            "network": network_residuals(result),
+        },
+    }
 
 
-def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
-    """Returns the metrics of a survey that was not compared with the truth.
-
-    They hold schema, identity, timing, warnings, idealisations and requirements; all other metrics are None, 0 or
-    empty. A requirement on a metric that is None fails.
-
-    Raises:
-        TwinError: `require` names a metric that does not exist.
-    """
-    result, known = survey.result, {key: survey.identity.get(key) for key in _IDENTITY}
-    timing = timing_metrics(survey.timing, len(result.online), len(result.keyframe_rows))
-    return _judged(empty_metrics() | finite_tree(known | {"timing": timing}), survey)
+def _paths(result: SurveyResult) -> dict[str, Trajectory]:
+    """Returns the estimated trajectories, by key in metrics.json."""
+    return {"f2f": result.f2f, "online": result.online, "final": result.final}
 
 
 def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
@@ -124,7 +156,6 @@ def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
     """
     n_frames = min(len(result.online), len(result.final), len(truth.trajectory), len(truth.reference))
     n = int(np.searchsorted(result.keyframe_rows, n_frames))
-    observations = [observation for observation in result.stereo_observations if observation.row < n_frames]
     return replace(
         result,
         keyframe_rows=result.keyframe_rows[:n],
@@ -132,7 +163,7 @@ def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
         node_cov=result.node_cov[:n],
         keyframe_depth_m=result.keyframe_depth_m[:n],
         links=result.links.select(result.links.j < n),
-        stereo_observations=observations,
+        stereo_observations=[pair for pair in result.stereo_observations if pair.row < n_frames],
     )
 
 
@@ -148,22 +179,22 @@ def check_require(names: Mapping[str, float]) -> None:
 def empty_metrics() -> dict[str, Any]:
     """Returns the metrics of a survey without frames: all keys, with values None, 0 or empty, except the schema."""
     none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
-    no_keyframes = np.zeros(0, dtype=np.int64)
+    no_keyframes, no_cells = np.zeros(0, np.int64), np.zeros((0, 0), bool)
     result = SurveyResult(none, none, none, no_keyframes, no_keyframes, np.zeros((0, 6, 6)))
-    empty = np.zeros((0, 0))
-    cells = empty.astype(np.float32), empty.astype(bool), empty.astype(bool)
-    truth = Truth(none, np.zeros((0, 3)), np.zeros(0, bool), no_keyframes, *cells)
-    rig = StereoRig(1, 1, 1.0, 1.0, 1.0, np.eye(4))
-    return evaluate(EvaluationInput(result, None, truth, rig, timing={"stages": Stopwatch().summary()}))
+    truth = truth_without_flight(no_cells.astype(np.float32), no_cells, no_cells)
+    survey = EvaluationInput(result, None, truth, StereoRig(1, 1, 1.0, 1.0, 1.0))
+    return {
+        "schema": SCHEMA,
+        **dict.fromkeys(_IDENTITY),
+        **{"warnings": [], "warning": "", "idealisations": []},
+        **finite_tree(_sections(survey, truth)),
+        "timing": _timing({"stages": Stopwatch().summary()}, 0, 0),
+        "require": {},
+    }
 
 
-def timing_metrics(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
-    """Returns `timing` of metrics.json: times, real-time factor, numbers of frames and keyframes, memory, and stages.
-
-    Args:
-        timing: `EvaluationInput.timing`.
-        n_frames, n_keyframes: number of frames and of keyframes.
-    """
+def _timing(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
+    """Returns `timing` of metrics.json, from `EvaluationInput.timing` and the numbers of frames and keyframes."""
     wall, simulated = timing.get("wall_s"), timing.get("simulated_s")
     return {
         "wall_s": finite_float(wall),

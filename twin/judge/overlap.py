@@ -7,6 +7,7 @@ functions.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,22 +17,16 @@ from scipy.spatial import KDTree
 from twin.core.height_field import HeightField, height_field, map_height_field
 from twin.core.image_overlap import image_overlap
 from twin.core.records import Array, MapGrid, StereoRig, SurveyResult, Truth
+from twin.judge.flown_path import swath_numbers, travel_direction
 from twin.judge.summary_statistics import finite_float, percentile
-from twin.judge.swaths import swath_numbers, travel_direction
 
 
 class KeyframePoses(NamedTuple):
-    """Poses, directions of travel and swaths of n keyframes.
+    """Poses, directions of travel and swaths of n keyframes."""
 
-    Args:
-        world_from_camera: (n, 4, 4) poses of the left camera.
-        travel: (n, 2) horizontal unit vectors of the planned motion.
-        swath: (n,) number of the leg or loop, from 0; -1 for keyframes between legs and during turns.
-    """
-
-    world_from_camera: Array
-    travel: Array
-    swath: NDArray[np.int64]
+    world_from_camera: Array  #: (n, 4, 4) poses of the left camera
+    travel: Array  #: (n, 2) horizontal unit vectors of the planned motion
+    swath: NDArray[np.int64]  #: (n,) number of the leg or loop, from 0; -1 for keyframes between legs and during turns
 
     @property
     def position_m(self) -> Array:
@@ -40,14 +35,10 @@ class KeyframePoses(NamedTuple):
 
 
 class ImagePairs(NamedTuple):
-    """Pairs of images whose overlap is computed.
+    """Pairs of images whose overlap is computed."""
 
-    Args:
-        keyframe: (m,) index of the keyframe whose image is the first of the pair.
-        first, second: (m, 4, 4) world_from_camera of both images.
-    """
-
-    keyframe: NDArray[np.int64]
+    keyframe: NDArray[np.int64]  #: (m,) index of the keyframe whose image is the first of the pair
+    #: first, second: (m, 4, 4) world_from_camera of both images.
     first: Array
     second: Array
 
@@ -58,7 +49,7 @@ class ImagePairs(NamedTuple):
 
 
 def overlap_metrics(
-    result: SurveyResult, truth: Truth, rig: StereoRig, grid: MapGrid | None, planned: dict[str, Any]
+    result: SurveyResult, truth: Truth, rig: StereoRig, grid: MapGrid | None, planned: Mapping[str, Any]
 ) -> dict[str, float | None]:
     """Returns `overlap.*` of metrics.json.
 
@@ -71,34 +62,20 @@ def overlap_metrics(
             overlaps, 0 to 1; `along_median` and `across_median`: the medians forecast from the planned poses over the
             floor, 0 to 1.
     """
-    poses = keyframe_poses(truth.trajectory.world_from_camera, truth, result.keyframe_rows, planned)
-    field = _true_floor(truth, grid)
-    along, across = (_overlaps(field, pairs, rig) for pairs in (along_pairs(poses), across_pairs(poses)))
-    return {
-        "along_asked": finite_float(planned.get("overlap_along")),
-        "along_planned": finite_float(planned.get("along_median")),
-        "along_median": percentile(along, 50),
-        "along_p05": percentile(along, 5),
-        "across_asked": finite_float(planned.get("overlap_across")),
-        "across_planned": finite_float(planned.get("across_median")),
-        "across_median": percentile(across, 50),
-        "across_p05": percentile(across, 5),
-    }
-
-
-def keyframe_poses(
-    world_from_camera: Array, truth: Truth, rows: NDArray[np.int64], planned: dict[str, Any]
-) -> KeyframePoses:
-    """Returns the keyframe poses, with directions of travel and swaths from the reference path.
-
-    Args:
-        world_from_camera: (n_frames, 4, 4) poses of the left camera.
-        truth: source of the reference path.
-        rows: (n,) frame numbers of the keyframes.
-        planned: pattern of the plan.
-    """
-    travel, swath = travel_direction(truth.reference), swath_numbers(truth, planned.get("pattern", "lawnmower"))
-    return KeyframePoses(world_from_camera[rows], travel[rows], swath[rows])
+    rows, pattern = result.keyframe_rows, planned.get("pattern", "lawnmower")
+    travel, swath = travel_direction(truth.reference)[rows], swath_numbers(truth, pattern)[rows]
+    poses = KeyframePoses(truth.trajectory.world_from_camera[rows], travel, swath)
+    field, found = _true_floor(truth, grid), {}
+    for direction, pairs in (("along", along_pairs(poses)), ("across", across_pairs(poses))):
+        overlap = np.zeros(0) if field is None else image_overlap(field, pairs.first, pairs.second, rig)
+        overlap = overlap[np.isfinite(overlap)]  # not finite if the first image shows no floor
+        found |= {
+            f"{direction}_asked": finite_float(planned.get(f"overlap_{direction}")),
+            f"{direction}_planned": finite_float(planned.get(f"{direction}_median")),
+            f"{direction}_median": percentile(overlap, 50),
+            f"{direction}_p05": percentile(overlap, 5),
+        }
+    return found
 
 
 def along_pairs(poses: KeyframePoses) -> ImagePairs:
@@ -129,14 +106,6 @@ def _nearest_in_next(poses: KeyframePoses, swath: int) -> NDArray[np.int64]:
         return np.zeros((2, 0), dtype=np.int64)
     _, nearest = KDTree(poses.position_m[there, :2]).query(poses.position_m[here, :2])
     return np.stack([here, there[nearest]])
-
-
-def _overlaps(field: HeightField | None, pairs: ImagePairs, rig: StereoRig) -> Array:
-    """Returns the overlaps of the pairs whose first image shows floor; an empty array if `field` is None."""
-    if field is None:
-        return np.zeros(0)
-    overlap = image_overlap(field, pairs.first, pairs.second, rig)
-    return overlap[np.isfinite(overlap)]
 
 
 def _true_floor(truth: Truth, grid: MapGrid | None) -> HeightField | None:

@@ -14,16 +14,10 @@ Layer = NDArray[np.float32]
 
 
 class PatchShift(NamedTuple):
-    """Displacement of a patch.
-
-    Args:
-        right_px, down_px: position of the patch in the first image minus its position in the second image.
-        correlation: normalised cross-correlation at the displacement rounded to whole pixels.
-    """
+    """Position of a patch in the first image minus its position in the second image."""
 
     right_px: float
     down_px: float
-    correlation: float
 
 
 def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchShift | None:
@@ -52,14 +46,11 @@ def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchS
         return None
     down = row + _vertex(*score[row - 1 : row + 2, col]) - last / 2
     right = col + _vertex(*score[row, col - 1 : col + 2]) - last / 2
-    return PatchShift(-float(right), -float(down), float(peak))
+    return PatchShift(-float(right), -float(down))
 
 
 def _vertex(before: float, at: float, after: float) -> float:
-    """Returns the position of the vertex of the parabola through values at -1, 0 and 1, of which that at 0 is largest.
-
-    Returns 0 if the three values are equal.
-    """
+    """Returns the vertex of the parabola through values at -1, 0 and 1, of which that at 0 is largest."""
     curvature = before - 2 * at + after
     return 0.0 if curvature >= 0 else 0.5 * (before - after) / curvature
 

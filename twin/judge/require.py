@@ -43,7 +43,11 @@ def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) 
         TwinError: a name does not refer to a number in metrics.json.
     """
     check_metric_names(limits, metrics)
-    return {name: _verdict(name, _value(metrics, name), limit) for name, limit in limits.items()}
+    values = numbers_of(metrics)
+    return {
+        name: {"value": values[name], "limit": limit, "passed": meets_limit(name, values[name], limit)}
+        for name, limit in limits.items()
+    }
 
 
 def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None:
@@ -52,7 +56,7 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
     Raises:
         TwinError: a name is not such a path; the message suggests similar names.
     """
-    known = list(number_paths(metrics))
+    known = list(numbers_of(metrics))
     for name in names:
         if name not in known:
             completions = [k for k in known if k.startswith(name)]
@@ -61,31 +65,20 @@ def check_metric_names(names: Iterable[str], metrics: Mapping[str, Any]) -> None
             raise TwinError(f"require.{name}", f"no such metric{hint}", "a dotted name of metrics.json")
 
 
-def number_paths(metrics: Mapping[str, Any], prefix: str = "") -> Iterable[str]:
-    """Yields the dotted path of every number and every None in nested tables of `metrics`, but not at its top level."""
+def numbers_of(metrics: Mapping[str, Any], prefix: str = "") -> dict[str, float | None]:
+    """Returns each number and None in nested tables of `metrics` by its dotted path, but not those at its top level."""
+    found: dict[str, float | None] = {}
     for key, value in metrics.items():
         if isinstance(value, Mapping):
-            yield from number_paths(value, f"{prefix}{key}.")
+            found |= numbers_of(value, f"{prefix}{key}.")
         elif prefix and (value is None or isinstance(value, int | float)):
-            yield prefix + key
+            found[prefix + key] = value
+    return found
 
 
 def more_is_better(name: str) -> bool:
     """Returns whether larger values of a metric are better; its limit is then a lower bound."""
     return name.startswith(MORE_IS_BETTER)
-
-
-def _value(metrics: Mapping[str, Any], name: str) -> float | None:
-    """Returns the value of the metric with a dotted name, e.g. "map.le90_m"; None if it was not computed."""
-    value: Any = metrics
-    for key in name.split("."):
-        value = value[key]
-    return value
-
-
-def _verdict(name: str, value: float | None, limit: float) -> dict[str, Any]:
-    """Returns the value, the limit and whether the value meets the limit."""
-    return {"value": value, "limit": limit, "passed": meets_limit(name, value, limit)}
 
 
 def meets_limit(name: str, value: float | None, limit: float) -> bool:

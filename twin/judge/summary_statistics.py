@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,25 +14,25 @@ def finite_float(value: Any) -> float | None:
     return None if value is None or not np.isfinite(value) else float(value)
 
 
+def _statistic(values: ArrayLike, function: Callable[[Any], Any]) -> float | None:
+    """Returns a function of all values; None if there are none or if the result is not finite."""
+    array = np.asarray(values, dtype=float)
+    return finite_float(function(array)) if array.size else None
+
+
 def rms(values: ArrayLike) -> float | None:
     """Returns the root mean square of all values; None if there are none or if it is not finite."""
-    array = np.asarray(values, dtype=float)
-    return finite_float(np.sqrt(np.mean(array**2))) if array.size else None
+    return _statistic(values, lambda array: np.sqrt(np.mean(array**2)))
 
 
 def mean(values: ArrayLike) -> float | None:
     """Returns the mean of all values; None if there are none or if it is not finite."""
-    array = np.asarray(values, dtype=float)
-    return finite_float(array.mean()) if array.size else None
+    return _statistic(values, np.mean)
 
 
 def percentile(values: ArrayLike, percent: float) -> float | None:
-    """Returns the percentile `percent` (0 to 100) of all values, linearly interpolated.
-
-    None if there are no values or the percentile is not finite.
-    """
-    array = np.asarray(values, dtype=float)
-    return finite_float(np.percentile(array, percent)) if array.size else None
+    """Returns a percentile (0 to 100) of all values, linearly interpolated; None as for `mean`."""
+    return _statistic(values, lambda array: np.percentile(array, percent))
 
 
 def finite_tree(tree: Any) -> Any:

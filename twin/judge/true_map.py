@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 
 from twin.core import geometry
 from twin.core.records import Array, ElevationMap, MapGrid, Trajectory, Truth
-from twin.judge.map_error import KEYS, map_metrics
+from twin.judge.map_error import map_metrics
 
 _MOST_STEPS = 20
 _CONVERGED_M = 1e-5
@@ -24,31 +24,25 @@ _UNKNOWN = (
 
 
 class TrueMap(NamedTuple):
-    """True heights in the frame of the true trajectory.
+    """True heights in the frame of the true trajectory."""
 
-    Args:
-        grid: cells of the heights.
-        height_m: (rows, cols) heights at the centres of the cells [m]; NaN where unknown.
-    """
-
-    grid: MapGrid
-    height_m: Array
+    grid: MapGrid  #: cells of the heights
+    height_m: Array  #: (rows, cols) heights at the centres of the cells; NaN where unknown
 
 
 def true_heights(elevation: ElevationMap, true: TrueMap, true_from_world: Array) -> NDArray[np.float32] | None:
-    """Returns the true height at the centres of the cells of a map (rows, cols), along the axis of height of the map.
+    """Returns the true height at the centres of the cells of a map (rows, cols) [m], NaN where unknown.
 
-    The height h of a cell at (x, y) is found by iteration: the point (x, y, h), moved to the frame of the truth, is
-    compared with the true height there, interpolated bilinearly, and h is reduced by the difference. In a frame that is
-    level, one step is exact; with a tilt t it converges where the slope is below 1 / tan t.
+    The heights are along the axis of height of the map; None if those of map and truth are not within 45 degrees. The
+    height h of a cell at (x, y) is found by iteration, from the height of the map: the point (x, y, h), moved to the
+    frame of the truth, is compared with the true height there, interpolated bilinearly, and h is reduced by the
+    difference. In a frame that is level, one step is exact; with a tilt t it converges where the slope is below
+    1 / tan t.
 
     Args:
-        elevation: the map; its heights are the start of the iteration.
+        elevation: the map.
         true: true heights.
         true_from_world: (4, 4) transform from the world of the estimates to the frame of the truth (`recorded`).
-
-    Returns:
-        True heights [m], NaN where unknown; None if the axes of height of map and truth are not within 45 degrees.
     """
     true_from_map = true_from_world @ geometry.inverse(elevation.map_from_world)
     cosine = float(true_from_map[2, 2])
@@ -85,8 +79,11 @@ def recorded_map_metrics(elevation: ElevationMap, heights: NDArray[np.float32]) 
     Errors are those of all cells that have an estimated and a true height. The metrics that need more than heights,
     completeness among them, are None: which cells the cameras saw is not known.
     """
-    none, cells = Trajectory(np.zeros(0), np.zeros((0, 4, 4))), np.isfinite(heights)
-    flags, numbers = np.zeros(0, bool), np.zeros(0, np.int64)
-    truth = Truth(none, np.zeros((0, 3)), flags, numbers, heights, cells, np.zeros_like(cells))
-    found = map_metrics(elevation, truth)
-    return {key: None if key in _UNKNOWN else found[key] for key in KEYS}
+    cells = np.isfinite(heights)
+    return map_metrics(elevation, truth_without_flight(heights, cells, np.zeros_like(cells))) | dict.fromkeys(_UNKNOWN)
+
+
+def truth_without_flight(height_m: NDArray[np.float32], seen: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Truth:
+    """Returns a truth of the floor (rows, cols) without frames."""
+    none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    return Truth(none, np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0, np.int64), height_m, seen, asked)

@@ -16,7 +16,7 @@ from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from twin.judge.budget import stage_times
+from twin.judge.processing_budget import stage_times
 from twin.report.run_errors import run_errors
 from twin.report.run_folder import Raster, Run
 from twin.report.stage_table import stage_rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from twin.judge.recorded import ALIGNMENTS, AlignmentName, recorded_errors
-from twin.judge.trajectory import PathErrors, path_errors
+from twin.judge.trajectory_errors import PathErrors, path_errors
 from twin.report.run_folder import Run
 
 

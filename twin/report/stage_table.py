@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from twin.judge.stages import stage_errors
+from twin.judge.network_errors import stage_errors
 
 
 class StageRow(NamedTuple):

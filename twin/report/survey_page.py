@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.user_files import read_text
-from twin.judge.budget import stage_times
+from twin.judge.processing_budget import stage_times
 from twin.report import wording
 from twin.report.figures import draw_all
 from twin.report.html import render_page

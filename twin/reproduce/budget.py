@@ -15,7 +15,7 @@ import matplotlib
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Canvas
 
-from twin.judge.budget import KEYFRAME_STAGES
+from twin.judge.processing_budget import KEYFRAME_STAGES
 from twin.report.figures import log_axis
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, percent, write_exhibit

@@ -13,9 +13,8 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.records import Array
-from twin.judge.alignment import farthest_error_m, track_metrics
 from twin.judge.map_error import height_error
-from twin.judge.trajectory import PathErrors, path_errors
+from twin.judge.trajectory_errors import PathErrors, farthest_error_m, path_errors, track_metrics
 from twin.reproduce import paper_sheet
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
 from twin.reproduce.paper_flight import Flown, fly_aligned, fly_in_parallel, fly_without_alignment

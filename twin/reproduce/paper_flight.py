@@ -8,6 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -107,6 +108,9 @@ def _f2f_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stop
     return F2fNavigator(mission.rig, settings, mission.start, noise, vision, stopwatch=stopwatch)
 
 
+Make = Callable[[Mission, World, Path, Stopwatch], AbstractContextManager[Navigator]]
+
+
 class _ProgressLines:
     """Prints a line on stderr after each tenth of a flight that takes more than a minute."""
 
@@ -121,7 +125,7 @@ class _ProgressLines:
         self._tenths = tenths
 
 
-def _fly(mission: Mission, make: Callable[[Mission, World, Path, Stopwatch], Navigator], name: str = "") -> Flown:
+def _fly(mission: Mission, make: Make, name: str = "") -> Flown:
     """Flies a mission with the navigator that `make` returns, and builds the elevation map; name: see `fly_aligned`.
 
     Raises:

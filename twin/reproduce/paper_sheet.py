@@ -12,9 +12,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from twin.judge.alignment import keyframe_errors_m
 from twin.judge.map_error import height_error
-from twin.judge.trajectory import path_errors
+from twin.judge.trajectory_errors import keyframe_errors_m, path_errors
 from twin.report.figures import hillshade, log_axis
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.reproduce.paper_flight import Flown

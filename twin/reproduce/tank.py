@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.judge.map_error import height_error
-from twin.judge.trajectory import path_errors
+from twin.judge.trajectory_errors import path_errors
 from twin.reproduce import tank_sheet
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
 from twin.reproduce.tank_hidden import hidden_cells

@@ -16,7 +16,7 @@ from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, MapGrid, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.estimate.pipeline import Navigator
-from twin.judge.trajectory import anchor
+from twin.judge.trajectory_errors import anchor
 from twin.reproduce.conclusion import finished, required_map
 from twin.reproduce.tank_path import RigPath, lawnmower_path, two_loops_path
 from twin.reproduce.tank_scene import tank_floor

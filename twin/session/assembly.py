@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 
 from twin.core.timing import StageTimer
@@ -31,48 +33,42 @@ def open_world(mission: Mission, stopwatch: StageTimer) -> World:
     return SurrogateWorld(mission, stopwatch, error_model_file.load(mission.scenario.imaging.error_model))
 
 
-def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Navigator:
-    """Returns the estimators of a survey, or those of the plug-in that the scenario names.
+@contextmanager
+def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Generator[Navigator]:
+    """Opens the estimators of a survey, or those of the plug-in that the scenario names.
 
-    Their visual measurements come from rendered images or from the surrogate.
-
-    Args:
-        mission: the survey.
-        world: the flown world; in a surrogate survey it makes the visual measurements.
-        folder: run folder; keyframe images and mosaic tiles are stored in its subfolder "keyframes".
-        stopwatch: timer of the stages.
+    Their visual measurements come from rendered images or from the surrogate world. Keyframe images and mosaic tiles
+    are stored in the subfolder "keyframes" of the run folder.
 
     Raises:
         TwinError: the plug-in cannot be loaded.
     """
-    if mission.scenario.imaging.fidelity == "rendered":
-        vision = image_vision(mission, folder, stopwatch)
-        if (plugin := mission.scenario.estimate.plugin) is not None:
-            setup = EstimatorSetup(mission.rig, mission.start, mission.scenario.believed_noise())
-            return PluginNavigator(plugin, setup, mission.scenario.estimator_settings(), vision, stopwatch)
-        return navigator_with(mission, vision, stopwatch)
-    from twin.surrogate.surrogate_world import SurrogateWorld
+    if mission.scenario.imaging.fidelity == "surrogate":
+        from twin.surrogate.surrogate_world import SurrogateWorld
 
-    assert isinstance(world, SurrogateWorld)
-    return navigator_with(mission, world.vision, stopwatch)
+        assert isinstance(world, SurrogateWorld)
+        with navigator_with(mission, world.vision, stopwatch) as navigator:
+            yield navigator
+        return
+    plugin = mission.scenario.estimate.plugin
+    with image_vision(mission, folder, stopwatch) as vision:
+        if plugin is None:
+            made = navigator_with(mission, vision, stopwatch)
+        else:
+            setup = EstimatorSetup(mission.rig, mission.start, mission.scenario.believed_noise())
+            made = PluginNavigator(plugin, setup, mission.scenario.estimator_settings(), vision, stopwatch)
+        with made as navigator:
+            yield navigator
 
 
 def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> StereoVision:
     """Returns the source of visual measurements from images; it uses the believed calibration, not the true one."""
     cell_m = mission.scenario.plan.altitude_m / mission.rig.focal_px
-    settings = mission.scenario.estimator_settings()
-    noise = mission.scenario.believed_noise()
+    settings, noise = mission.scenario.estimator_settings(), mission.scenario.believed_noise()
     return StereoVision(mission.rig, settings, folder / "keyframes", cell_m, stopwatch, noise)
 
 
 def navigator_with(mission: Mission, vision: Vision, stopwatch: StageTimer) -> Navigator:
     """Returns the estimators; they receive the believed calibration and noise and the planned start, but no truth."""
-    scenario = mission.scenario
-    return Navigator(
-        mission.rig,
-        scenario.estimator_settings(),
-        start=mission.start,
-        readings_noise=scenario.believed_noise(),
-        vision=vision,
-        stopwatch=stopwatch,
-    )
+    settings, noise = mission.scenario.estimator_settings(), mission.scenario.believed_noise()
+    return Navigator(mission.rig, settings, mission.start, noise, vision, stopwatch=stopwatch)

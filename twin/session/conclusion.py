@@ -1,148 +1,104 @@
-"""Conclusion of a survey: final alignment, map, comparison with the truth, and the run folder."""
+"""Conclusion of a flown survey or a replay: final alignment, maps, comparison with the truth, and the run folder."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, Protocol
 
 from twin.core.interrupts import StageGuard
 from twin.core.quality import Finding
+from twin.core.records import ElevationMap, MapGrid, SurveyResult
 from twin.core.timing import Stopwatch, timing_summary
 from twin.estimate.pipeline import Navigator, finish_in_stage
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
-from twin.plugin.navigator import NOTE
 from twin.report.run_result import RunResult
-from twin.report.run_writer import PlannedTruth, RunFolder, SurveyRecord
-from twin.scenario.idealisations import idealisations
-from twin.scenario.model import Scenario
-from twin.session.monitor import SurveyMonitor
-from twin.session.orthomosaic import is_wanted, make_orthomosaic
-from twin.session.survey_check import calibration_notes, survey_findings
-from twin.world.floor_forecast import planned_overlap
-from twin.world.mission import Mission
-from twin.world.world import World
-
-T = TypeVar("T")
+from twin.report.run_writer import RunFolder, SurveyRecord
 
 
-class FlownSurvey(NamedTuple):
-    """A survey that has been flown.
+class Estimation(NamedTuple):
+    """Estimators that have processed all frames, and what the stages after them use."""
 
-    Args:
-        mission: the survey as planned.
-        world: the simulated world, with the ground truth.
-        navigator: the estimators, with their estimates.
-        stopwatch: durations of the stages.
-        guard: limits the effect of an interrupt to one stage; also holds the reason why the flight ended early, if any.
-    """
-
-    mission: Mission
-    world: World
     navigator: Navigator
-    stopwatch: Stopwatch
+    stopwatch: Stopwatch  #: durations of the stages
+    #: limits the effect of an interrupt to one stage; also holds the reason why the frames ended early, if any.
     guard: StageGuard
+    folder: RunFolder
+    progress: Callable[[str, float], None]  #: called with a stage ("map", "orthomosaic", "report") and its done share
+    start_s: float  #: value of `time.perf_counter` at the start of the run
+
+    def build_map(self, result: SurveyResult, grid: MapGrid | None) -> ElevationMap | None:
+        """Returns the elevation map; None if an interrupt ends the stage or there are no keyframes."""
+        report = partial(self.progress, "map")
+        return self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report))
 
 
-def conclude(flight: FlownSurvey, folder: RunFolder, monitor: SurveyMonitor) -> RunResult:
-    """Aligns all keyframes, builds the map and the orthomosaic, compares with the truth, and writes the run folder.
+class Maps(NamedTuple):
+    """Maps of a run."""
 
-    An interrupt ends only the current stage; the survey then has the status "aborted" with a reason that names the
-    stage.
+    elevation: ElevationMap | None
+    orthomosaic: dict[str, float | None] | None = None  #: `orthomosaic.*` of metrics.json; None if none was made
+    n_tiles: int = 0  #: number of tiles of a map in tiles
+
+
+class RunKind(Protocol):
+    """What is special about a flown survey or a replay."""
+
+    def maps(self, estimation: Estimation, result: SurveyResult) -> Maps:
+        """Builds and returns the maps."""
+        ...
+
+    def findings(self, result: SurveyResult, elevation: ElevationMap | None) -> list[Finding]:
+        """Returns the failed checks, each a reason not to trust the result."""
+        ...
+
+    def evaluation(self, result: SurveyResult, maps: Maps) -> EvaluationInput:
+        """Returns the input of the evaluation, with simulated_s as timing and name, seed and hash as identity."""
+        ...
+
+    def record(self, survey: EvaluationInput, written: SurveyRecord) -> SurveyRecord:
+        """Returns the contents of the run folder, with the truth and the plan."""
+        ...
+
+
+def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, EvaluationInput]:
+    """Aligns all keyframes, builds the maps, compares with the truth, and writes the run folder.
+
+    An interrupt ends only the current stage; the run then has the status "aborted" with a reason that names the stage.
 
     Raises:
         TwinError: metrics.json cannot be written.
     """
-    mission, world, navigator, stopwatch, guard = flight
+    navigator, stopwatch, guard, folder, progress, start_s = estimation
     result = finish_in_stage(navigator, guard)
     for link in navigator.network.history.dropped:
         folder.log("link dropped", i=link.i, j=link.j, overlap=link.overlap, points=link.n_points)
     for alignment in result.alignments:
         folder.log("aligned", **alignment._asdict())
-    with stopwatch("map"):
-        elevation = guard.attempt(
-            "map",
-            lambda: navigator.build_map(result, mission.grid, lambda share: monitor.report_stage("map", share)),
-        )
-    truth, scenario = world.truth(), mission.scenario
-    orthomosaic = None
-    if elevation is not None and is_wanted(mission, folder):
-        tools = stopwatch, partial(monitor.report_stage, "orthomosaic")
-        make = partial(make_orthomosaic, mission, navigator, result, elevation, truth, folder, tools)
-        orthomosaic = guard.attempt("orthomosaic", lambda: _without_file_errors(guard, make))
-        elevation = elevation if orthomosaic is None else orthomosaic.elevation
-    wall_s = monitor.wall_s
-    along, across = planned_overlap(mission)
-    plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
-    plan |= {"along_median": along, "across_median": across}
-    timing = timing_summary(len(result.online) / mission.rig.frame_rate_hz, wall_s, stopwatch)
-    findings = survey_findings(mission, result, elevation, truth.reference)
+    maps = run.maps(estimation, result)
+    findings = run.findings(result, maps.elevation)
     for finding in findings:
         folder.log("finding", **finding._asdict())
-    identity = _identity(mission, guard.reason, findings)
-    actions = monitor.actions.times
-    survey = EvaluationInput(
-        result, elevation, truth, mission.rig, plan, timing, identity, scenario.require,
-        [
-            *plugin_notes(scenario), *mission.terrain.hole_notes, *world.warnings,
-            *calibration_notes(result, mission.rig), *result.quality.repeat_notes,
-            *filter(None, [actions.sentence]),
-        ],
-        idealisations(scenario), actions, None if orthomosaic is None else orthomosaic.metrics,
-    )  # fmt: skip
+    survey = run.evaluation(result, maps)
+    timing = timing_summary(survey.timing["simulated_s"], time.perf_counter() - start_s, stopwatch)
+    identity = dict(survey.identity) | status(guard.reason, findings)
+    survey = replace(survey, timing=timing, identity=identity, orthomosaic=maps.orthomosaic)
     metrics = guard.attempt("evaluation", lambda: evaluate(survey)) or unevaluated(survey)
-    monitor.report_stage("report", 0.0)
-    n_frames_per_keyframe = mission.plan.n_frames_per_keyframe
-    metrics = folder.finish(
-        SurveyRecord(
-            result,
-            elevation,
-            PlannedTruth(truth, mission.grid, mission.start),
-            n_frames_per_keyframe,
-            stopwatch,
-            metrics,
-            mission.terrain.georeference,
-            orthomosaic is not None,
-        ),
-        guard,
-    )
-    return RunResult(metrics["status"], metrics, folder.path)
+    progress("report", 0.0)
+    record = run.record(survey, SurveyRecord(result, maps.elevation, None, None, stopwatch, metrics))
+    metrics = folder.finish(record, guard)
+    return RunResult(metrics["status"], metrics, folder.path), survey
 
 
-def plugin_notes(scenario: Scenario) -> list[str]:
-    """Returns one note on each plug-in of the survey."""
-    notes = (
-        (scenario.terrain.plugin, "The heights of the floor are those of the plug-in {}."),
-        (scenario.control.plugin, "The vehicle was steered by the plug-in {}."),
-        (scenario.estimate.plugin, NOTE),
-    )
-    return [note.format(name) for name, note in notes if name is not None]
-
-
-def _without_file_errors(guard: StageGuard, function: Callable[[], T]) -> T | None:
-    """Returns the result of a function; if a file cannot be read or written, returns None and records the cause."""
-    try:
-        return function()
-    except OSError as error:
-        guard.cause = guard.cause or str(error)
-        return None
-
-
-def _identity(mission: Mission, abort_reason: str, findings: Sequence[Finding]) -> dict[str, Any]:
-    """Returns name, seed, program version and scenario hash of the survey, its status, and the reason for the status.
+def status(abort_reason: str, findings: Sequence[Finding]) -> dict[str, str]:
+    """Returns the version of the program, the status of a run, and the reason for the status.
 
     The status is "aborted" if there is a reason for an abort, otherwise "degraded" if there are findings, otherwise
     "complete".
     """
-    scenario = mission.scenario
-    reasons = [abort_reason] if abort_reason else [finding.sentence for finding in findings]
-    status = "aborted" if abort_reason else "degraded" if findings else "complete"
-    return {
-        "name": scenario.name,
-        "seed": scenario.seed,
-        "version": version("seabed-twin"),
-        "scenario_hash": scenario.fingerprint(),
-        "status": status,
-        "reason": "; ".join(reasons),
-    }
+    reason = abort_reason or "; ".join(finding.sentence for finding in findings)
+    name = "aborted" if abort_reason else "degraded" if findings else "complete"
+    return {"version": version("seabed-twin"), "status": name, "reason": reason}

@@ -10,8 +10,8 @@ from twin.core.geometry import Array
 from twin.core.height_field import HeightField, height_field
 from twin.core.image_overlap import image_overlap
 from twin.core.records import StereoRig
+from twin.judge.flown_path import is_turning, leg_numbers, travel_direction
 from twin.judge.overlap import ImagePairs, KeyframePoses, across_pairs, along_pairs
-from twin.judge.swaths import is_turning, leg_numbers, travel_direction
 from twin.terrains import Terrain
 
 

@@ -1,4 +1,4 @@
-"""Direction of travel and swaths (legs or loops) of the reference path."""
+"""The flown path against the reference path: direction of travel, swaths (legs or loops), control errors."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import Array, Truth
+from twin.judge.summary_statistics import rms
 
 #: A frame belongs to a leg if |cos| of the angle between its direction of travel and the axis of the legs exceeds
 #: this value (angle below 26 deg).
@@ -37,9 +38,7 @@ def travel_direction(reference: Array) -> Array:
 def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
     """Returns the number (n,) of the leg or loop of each frame, from 0; -1 for frames between legs and during turns.
 
-    Args:
-        truth: source of the reference path, its heading and the track numbers.
-        pattern: "loops", where each frame belongs to the loop of its track; otherwise the path consists of legs.
+    With the pattern "loops", each frame belongs to the loop of its track; otherwise the path consists of legs.
     """
     if pattern == "loops":
         return truth.track - 1
@@ -69,3 +68,21 @@ def leg_numbers(reference: Array) -> NDArray[np.int64]:
     on_leg = np.where(np.abs(cosine) > ON_LEG_COSINE, np.sign(cosine), 0.0)
     starts = (on_leg != 0) & (np.diff(on_leg, prepend=0.0) != 0)
     return np.where(on_leg != 0, np.cumsum(starts) - 1, -1).astype(np.int64)
+
+
+def control_metrics(truth: Truth) -> dict[str, float | None]:
+    """Returns `control.*` of metrics.json, without slowed_s and held_s, the durations of the mission's actions [s].
+
+    The cross-track error (horizontal, across the direction of travel) is computed over the frames in which the vehicle
+    travels, the altitude error over all frames, and the station-keeping error (3-D distance) over the frames in which
+    the vehicle keeps station.
+    """
+    n = min(len(truth.trajectory), len(truth.reference))
+    offset = truth.trajectory.positions[:n] - truth.reference[:n]
+    holding, direction = truth.holding[:n], travel_direction(truth.reference[:n])
+    across = direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0]
+    return {
+        "cross_track_rmse_m": rms(across[~holding]),
+        "altitude_rmse_m": rms(offset[:, 2]),
+        "station_keeping_rmse_m": rms(np.linalg.norm(offset[holding], axis=1)),
+    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import islice
 from typing import NamedTuple
@@ -30,55 +30,30 @@ _EXACT_RAD2 = 1e-12  # variance of its heading, if it defines that of the world 
 
 
 class Start(NamedTuple):
-    """Pose at the first frame, as far as readings determine it.
+    """Pose at the first frame, as far as readings determine it."""
 
-    Args:
-        world_from_camera: (4, 4) pose of the rectified left camera in a world whose z axis points up.
-        cov: (6, 6) covariance of this pose [rotation, translation] in camera axes (rad, m); None: the pose is exact.
-        prior_cov: (6, 6) covariance with which the alignments hold the first node: large in the directions in which the
-            readings of all nodes determine its pose; None: the pose is exact.
-    """
-
-    world_from_camera: Array
+    world_from_camera: Array  #: (4, 4) pose of the rectified left camera in a world whose z axis points up
+    #: (6, 6) covariance of this pose [rotation, translation] in camera axes (rad, m); None: the pose is exact.
     cov: Array | None = None
+    #: (6, 6) covariance with which the alignments hold the first node: large in the directions in which the readings of
+    #: all nodes determine its pose; None: the pose is exact.
     prior_cov: Array | None = None
 
 
-class Opening(NamedTuple):
-    """First frames of a replay, from which its start is found.
-
-    Args:
-        frames: the frames, from the first one on.
-        rig: calibration of the frames.
-        settings: settings of the estimators.
-        plane_from_camera: (4, 4) pose of the left camera above the floor plane of the first stereo pair; a start from
-            readings has its height above this plane.
-    """
-
-    frames: Iterable[Frame]
-    rig: StereoRig
-    settings: EstimatorSettings
-    plane_from_camera: Array
-
-
 class _FirstReadings(NamedTuple):
-    """Readings of the first frames, referred to the first frame by the visual motion since then.
+    """Readings of the first frames, referred to the first frame by the visual motion since then."""
 
-    Args:
-        rotations: world_from_camera (3, 3) of the first frame by each attitude.
-        verticals: direction (3,) of the vertical in camera axes at the first frame by each reading.
-        heights: each recorded height [m] with the motion (3,) since the first frame in its camera axes [m].
-    """
-
-    rotations: list[Array]
-    verticals: list[Array]
-    heights: list[tuple[float, Array]]
+    rotations: list[Array]  #: world_from_camera (3, 3) of the first frame by each attitude
+    verticals: list[Array]  #: direction (3,) of the vertical in camera axes at the first frame by each reading
+    heights: list[tuple[float, Array]]  #: recorded heights, with the motion (3,) since the first frame in its axes
 
 
 class Aiding:
     """Readings that a replay uses.
 
-    Heights need the direction of gravity, so they are used only with an attitude or a vertical.
+    Heights need the direction of gravity, so they are used only with an attitude or a vertical. Velocities are
+    interpolated to frames, so with fewer velocities than frames the errors of consecutive frames are correlated; their
+    standard deviation is increased by the root of the number of frames per reading.
 
     Args:
         readings: recorded readings.
@@ -88,53 +63,56 @@ class Aiding:
 
     Attributes:
         body_from_camera: (4, 4) pose of the rectified left camera in the body.
-        noise: noise of the readings, for the estimators. The noise of the velocity is that of a frame: readings are
-            interpolated, so with fewer readings than frames the errors of consecutive frames are correlated, and the
-            standard deviation is increased by the root of the number of frames per reading.
+        noise: noise of the readings, for the estimators; that of sensors that are not used is the default.
         notes: sentences on readings that are not used, and on assumptions about their times.
     """
 
     def __init__(self, readings: RecordedReadings, left_from_rectified: Array, start_s: float, frame_rate_hz: float):
         self.body_from_camera = readings.body_from_left @ left_from_rectified
         self.notes = readings.notes
-        self._attitude, self._velocity = (_moved(series, start_s) for series in (readings.attitude, readings.velocity))
-        self._vertical = _moved(readings.vertical, start_s) if self._attitude is None else None
-        self._height = _moved(readings.height, start_s) if self.is_level else None
-        if readings.height is not None and not self.is_level:
+        height, vertical = readings.height, readings.vertical if readings.attitude is None else None
+        if height is not None and readings.attitude is None and vertical is None:
             self.notes += ("The heights from pressure are not used: no attitude states the direction of gravity.",)
+            height = None
+        given = {"pressure": height, "attitude": readings.attitude, "vertical": vertical, "dvl": readings.velocity}
+        self._series = {
+            name: series._replace(times_s=series.times_s - start_s)
+            for name, series in given.items()
+            if series is not None
+        }
         self._limit_s = min(_MOST_S, _SHARE / frame_rate_hz)
-        self.noise = self._noise(frame_rate_hz)
+        self.noise = _noise(self._series, frame_rate_hz)
         self._height_m = 0.0  # added to the recorded heights
 
     @property
     def used(self) -> list[str]:
         """Returns the names of the sensors that are used: "pressure", "attitude", "vertical", "dvl"."""
-        series = {
-            "pressure": self._height, "attitude": self._attitude, "vertical": self._vertical, "dvl": self._velocity
-        }  # fmt: skip
-        return [name for name, one in series.items() if one is not None]
-
-    @property
-    def is_level(self) -> bool:
-        """Returns whether readings state the direction of gravity."""
-        return self._attitude is not None or self._vertical is not None
+        return list(self._series)
 
     def at(self, time_s: float) -> Readings:
         """Returns the readings of the frame at a time [s] since the first frame.
 
-        Height and attitude are the readings nearest in time, the velocity is interpolated; None where a sensor is not
+        Height and attitude are the readings nearest in time, the others are interpolated; None where a sensor is not
         used or has no reading near this time.
         """
-        height, attitude = (_nearest(series, time_s, self._limit_s) for series in (self._height, self._attitude))
-        up = _interpolated(self._vertical, time_s)
+        series, limit_s = self._series.get, self._limit_s
+        height, attitude = (_nearest(series(name), time_s, limit_s) for name in ("pressure", "attitude"))
+        up, velocity = (_interpolated(series(name), time_s) for name in ("vertical", "dvl"))
         return Readings(
             pressure_z_m=None if height is None else float(height[0]) + self._height_m,
             ahrs_rpy_rad=attitude,
-            dvl_mps=_interpolated(self._velocity, time_s),
+            dvl_mps=velocity,
             up=None if up is None else up / np.linalg.norm(up),
         )
 
-    def start(self, opening: Opening, known: Array | None = None) -> Start | None:
+    def start(
+        self,
+        frames: Iterable[Frame],
+        rig: StereoRig,
+        settings: EstimatorSettings,
+        over_plane: Array,
+        known: Array | None = None,
+    ) -> Start | None:
         """Returns the start that fits the first readings of gravity and height; None without attitude and vertical.
 
         The motion over the first frames is estimated from the images alone. With it, each reading of the attitude gives
@@ -148,22 +126,27 @@ class Aiding:
         cases, a sentence on this is added to `notes`.
 
         Args:
-            opening: the first frames.
+            frames: the frames, from the first one on.
+            rig: calibration of the frames.
+            settings: settings of the estimators.
+            over_plane: (4, 4) pose of the left camera above the floor plane of the first stereo pair; a start from
+                readings has its height above this plane.
             known: (4, 4) exact pose at the first frame, which becomes the start; None: it is found from the readings.
         """
-        if not self.is_level:
+        gravity = next((name for name in ("attitude", "vertical") if name in self._series), None)
+        if gravity is None:
             return None
-        found = self._first_readings(opening)
-        known_rotation = self._first_rotation(found, opening.plane_from_camera[:3, :3]) if known is None else known
-        if not found.heights or known_rotation is None:
-            self._leave_out_height()
-        if known_rotation is None:
-            name = "attitude" if self._attitude is not None else "vertical"
-            self._attitude = self._vertical = None
-            self.notes += (f"The {name} is not used: none of the first {_START_FRAMES} frames has one.",)
+        found = self._first_readings(self._first_motions(frames, rig, settings))
+        rotation = self._first_rotation(found, over_plane[:3, :3]) if known is None else known[:3, :3]
+        first = f"the first {_START_FRAMES} frames"
+        if not found.heights or rotation is None:
+            self._leave_out(
+                "pressure", f"The heights from pressure are not used: {first} do not relate them to the start."
+            )
+        if rotation is None:
+            self._leave_out(gravity, f"The {gravity} is not used: none of {first} has one.")
             return None
-        rotation = known_rotation[:3, :3]
-        height_m = float((opening.plane_from_camera if known is None else known)[2, 3])
+        height_m = float((over_plane if known is None else known)[2, 3])
         offsets = [height_m + rotation[2] @ moved - height for height, moved in found.heights]
         self._height_m = float(np.mean(offsets)) if offsets else 0.0
         if known is not None:
@@ -171,14 +154,17 @@ class Aiding:
         cov = np.diag([0.0, 0.0, 0.0, 1e-8, 1e-8, 1e-8])
         cov[:3, :3] = self._start_cov(rotation, len(found.rotations))
         pose = geometry.pose(rotation, np.array([0.0, 0.0, height_m]))
-        return Start(pose, cov, _prior_cov(rotation, bool(found.heights), self._attitude is not None))
+        return Start(pose, cov, _prior_cov(rotation, bool(found.heights), gravity == "attitude"))
+
+    def _leave_out(self, name: str, note: str) -> None:
+        """Ends the use of the readings of a sensor, if there are any, and adds a note."""
+        if self._series.pop(name, None) is not None:
+            self.notes += (note,)
 
     def _first_rotation(self, found: _FirstReadings, over_plane: Array) -> Array | None:
         """Returns the rotation (3, 3) of the first frame from its readings; None without any.
 
-        Args:
-            found: readings of the first frames.
-            over_plane: (3, 3) rotation of the first frame over the plane of the floor, for the heading.
+        The heading of verticals is that of the rotation (3, 3) over the plane of the floor.
         """
         if found.rotations:
             return geometry.nearest_rigid(geometry.pose(np.mean(found.rotations, axis=0), np.zeros(3)))[:3, :3]
@@ -195,26 +181,17 @@ class Aiding:
 
         The heading is exact if it defines the world.
         """
-        if self._attitude is None:
+        if "attitude" not in self._series:
             return rotation.T @ np.diag([self.noise.up_rad**2, self.noise.up_rad**2, _EXACT_RAD2]) @ rotation
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
         variances = np.diag(self.noise.attitude_sigmas_rad**2)
         return np.diag(np.diag(camera_from_body @ variances @ camera_from_body.T)) / n_attitudes
 
-    def _leave_out_height(self) -> None:
-        """Ends the use of the recorded heights, because their offset is unknown, and adds a note."""
-        if self._height is not None:
-            self._height = None
-            self.notes += (
-                f"The heights from pressure are not used: the first {_START_FRAMES} frames do not relate them to the "
-                "start.",
-            )
-
-    def _first_readings(self, opening: Opening) -> _FirstReadings:
+    def _first_readings(self, motions: Iterable[tuple[Array, Readings]]) -> _FirstReadings:
         """Returns what the readings of the first frames say on the first frame, by the motion since then."""
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
         found = _FirstReadings([], [], [])
-        for moved, readings in self._first_motions(opening):
+        for moved, readings in motions:
             if readings.ahrs_rpy_rad is not None:
                 world_from_camera = geometry.rotation_from_rpy(*readings.ahrs_rpy_rad) @ camera_from_body.T
                 found.rotations.append(world_from_camera @ moved[:3, :3].T)
@@ -224,34 +201,20 @@ class Aiding:
                 found.heights.append((readings.pressure_z_m, moved[:3, 3]))
         return found
 
-    def _first_motions(self, opening: Opening) -> list[tuple[Array, Readings]]:
+    def _first_motions(
+        self, frames: Iterable[Frame], rig: StereoRig, settings: EstimatorSettings
+    ) -> list[tuple[Array, Readings]]:
         """Returns poses (4, 4) in the axes of the camera at the first frame, and the readings at these poses.
 
         They are those of the first frame and of the frames, among the first `_START_FRAMES`, whose motion was measured.
         """
         found = []
-        settings = replace(opening.settings, use_ga=False, use_f2m=False)
-        with Navigator(opening.rig, settings, np.eye(4)) as navigator:
-            for frame in islice(opening.frames, _START_FRAMES):
+        with Navigator(rig, replace(settings, use_ga=False, use_f2m=False), np.eye(4)) as navigator:
+            for frame in islice(frames, _START_FRAMES):
                 estimate = navigator.update(frame)
                 if estimate.status == "ok" or not found:
                     found.append((estimate.world_from_camera, self.at(frame.time_s)))
         return found
-
-    def _noise(self, frame_rate_hz: float) -> SensorNoise:
-        """Returns the noise of the readings; sensors that are not used have the default noise."""
-        noise = SensorNoise()
-        if self._height is not None:
-            noise = replace(noise, pressure_m=float(self._height.sigmas[0]))
-        if self._attitude is not None:
-            roll, pitch, yaw = (float(sigma) for sigma in self._attitude.sigmas)
-            noise = replace(noise, attitude_rad=max(roll, pitch), heading_rad=yaw)
-        if self._vertical is not None:
-            noise = replace(noise, up_rad=float(self._vertical.sigmas[0]))
-        if self._velocity is not None:
-            frames_per_reading = max(1.0, _interval_s(self._velocity) * frame_rate_hz)
-            noise = replace(noise, dvl_mps=float(self._velocity.sigmas.max() * frames_per_reading**0.5))
-        return noise
 
     def residuals(self, path: Trajectory) -> dict[str, float]:
         """Returns the RMS of (path - reading) / sigma at the frames of a path: "pressure", "attitude", "vertical".
@@ -262,7 +225,7 @@ class Aiding:
             path: poses of the rectified left camera in the world of the replay.
         """
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
-        parts: dict[str, list[Array]] = {"pressure": [], "attitude": [], "vertical": []}
+        parts = {name: list[Array]() for name in ("pressure", "attitude", "vertical")}
         for time_s, pose in zip(path.times_s, path.world_from_camera, strict=True):
             found = self.at(float(time_s))
             if found.pressure_z_m is not None:
@@ -276,23 +239,29 @@ class Aiding:
         return {name: float(np.sqrt(np.mean(np.square(rows)))) for name, rows in parts.items() if rows}
 
 
-def _prior_cov(rotation: Array, has_height: bool, has_heading: bool) -> Array:
-    """Returns `Start.prior_cov`: large for tilt and, if they are used, for height and heading; otherwise small.
+def _noise(series: Mapping[str, SensorSeries], frame_rate_hz: float) -> SensorNoise:
+    """Returns the noise of the readings; sensors that are not used have the default noise."""
+    noise, sigmas = SensorNoise(), {name: one.sigmas for name, one in series.items()}
+    if "pressure" in series:
+        noise = replace(noise, pressure_m=float(sigmas["pressure"][0]))
+    if "attitude" in series:
+        roll, pitch, yaw = sigmas["attitude"].tolist()
+        noise = replace(noise, attitude_rad=max(roll, pitch), heading_rad=yaw)
+    if "vertical" in series:
+        noise = replace(noise, up_rad=float(sigmas["vertical"][0]))
+    if "dvl" in series:
+        frames_per_reading = max(1.0, _interval_s(series["dvl"]) * frame_rate_hz)
+        noise = replace(noise, dvl_mps=float(sigmas["dvl"].max() * frames_per_reading**0.5))
+    return noise
 
-    Args:
-        rotation: (3, 3) rotation world_from_camera of the start.
-        has_height, has_heading: whether recorded heights and headings are used.
-    """
+
+def _prior_cov(rotation: Array, has_height: bool, has_heading: bool) -> Array:
+    """Returns `Start.prior_cov`: large for tilt and, if recorded, for height and heading; otherwise small."""
     axes = np.diag([_LOOSE_RAD**2, _LOOSE_RAD**2, _LOOSE_RAD**2 if has_heading else _EXACT_RAD2])
     world = np.diag([_EXACT, _EXACT, _LOOSE_M**2 if has_height else _EXACT])
     cov = np.zeros((6, 6))
     cov[:3, :3], cov[3:, 3:] = rotation.T @ axes @ rotation, rotation.T @ world @ rotation
     return (cov + cov.T) / 2
-
-
-def _moved(series: SensorSeries | None, start_s: float) -> SensorSeries | None:
-    """Returns the readings with times relative to `start_s`; None if there are none."""
-    return None if series is None else series._replace(times_s=series.times_s - start_s)
 
 
 def _interval_s(series: SensorSeries) -> float:

@@ -1,4 +1,4 @@
-"""Section `self_check` of metrics.json: checks that the estimators compute without the truth."""
+"""Quality of a survey as its estimators measure it, without the truth: image quality and self checks."""
 
 from __future__ import annotations
 
@@ -8,6 +8,30 @@ import numpy as np
 
 from twin.core.records import SurveyResult
 from twin.judge.summary_statistics import percentile
+
+
+def _over_pairs(result: SurveyResult, name: str, percent: float = 50) -> float | None:
+    """Returns a percentile of an attribute over the stereo observations that have it; None if none has it."""
+    values = [getattr(pair, name) for pair in result.stereo_observations]
+    return percentile([value for value in values if value is not None], percent)
+
+
+def stereo_quality(result: SurveyResult) -> dict[str, Any]:
+    """Returns `vision` of metrics.json, over all stereo observations, including those that gave no keyframe.
+
+    points_median and points_p10 are the median and the 10th percentile of the number of matched points.
+    contrast_median and saturated_median are the medians of the contrast and of the saturated fraction of the pixel
+    values; both are None without images. blind_looks is the number of frames that have a stereo observation but
+    did not become keyframes, because they had too few matched points.
+    """
+    observed = {pair.row for pair in result.stereo_observations}
+    return {
+        "points_median": _over_pairs(result, "n_points"),
+        "points_p10": _over_pairs(result, "n_points", 10),
+        "contrast_median": _over_pairs(result, "contrast"),
+        "saturated_median": _over_pairs(result, "saturated"),
+        "blind_looks": len(observed - {int(row) for row in result.keyframe_rows}),
+    }
 
 
 def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
@@ -29,11 +53,7 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     divided by those of DVL, USBL and pressure; None where these do not determine them. readings_rejected and
     readings_disputed are numbers of readings of each navigation sensor.
     """
-    quality, pairs = result.quality, result.stereo_observations
-    offsets = [pair.row_offset_px for pair in pairs if pair.row_offset_px is not None]
-    ratios = [pair.row_spread_ratio for pair in pairs if pair.row_spread_ratio is not None]
-    repeated = [pair.repetition for pair in pairs if pair.repetition is not None]
-    epipolar = quality.epipolar
+    quality, epipolar = result.quality, result.quality.epipolar
     pitch, yaw, roll = (None,) * 3 if epipolar is None else np.rad2deg(epipolar.estimate[:3]).tolist()
     across, along = quality.length_scale, quality.depth_scale
     variances = np.trace(result.node_cov[:, 3:, 3:], axis1=1, axis2=2)
@@ -44,9 +64,9 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
         "links_failed": quality.links_failed / quality.links_tried if quality.links_tried else None,
         "link_residual": quality.link_residual,
         "link_chi2": quality.link_chi2,
-        "row_offset_px": percentile(offsets, 50),
-        "row_spread_ratio": percentile(ratios, 50),
-        "repetition": percentile(repeated, 50),
+        "row_offset_px": _over_pairs(result, "row_offset_px"),
+        "row_spread_ratio": _over_pairs(result, "row_spread_ratio"),
+        "repetition": _over_pairs(result, "repetition"),
         "pitch_deg": pitch,
         "yaw_deg": yaw,
         "roll_deg": roll,
@@ -55,10 +75,10 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
         "disparity_offset": None if quality.disparity_offset is None else quality.disparity_offset.estimate,
         "sigma_max_m": float(np.sqrt(variances.max())) if len(variances) else None,
         "frame_sigma_m": quality.frame_sigma_m,
-        "length_scale": None if across is None else across.estimate,
-        "length_scale_sigma": None if across is None else across.sigma,
-        "depth_scale": None if along is None else along.estimate,
-        "depth_scale_sigma": None if along is None else along.sigma,
+        "length_scale": across and across.estimate,
+        "length_scale_sigma": across and across.sigma,
+        "depth_scale": along and along.estimate,
+        "depth_scale_sigma": along and along.sigma,
         "readings_rejected": dict(quality.readings_rejected),
         "readings_disputed": dict(quality.readings_disputed),
     }

@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from functools import partial
 
 import numpy as np
 
 from twin.core.ortho_tiles import mean_colours, window
 from twin.core.records import ElevationMap, SurveyResult, Truth
-from twin.core.timing import StageTimer
 from twin.estimate.mapping.orthomosaic import Restore
-from twin.estimate.pipeline import Navigator
-from twin.judge.orthomosaic import OrthomosaicJudge
+from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.report.run_writer import RunFolder
+from twin.session.conclusion import Estimation, Maps
 from twin.world.mission import Mission
-
-
-class Orthomosaic(NamedTuple):
-    """An orthomosaic that has been made and compared with the truth.
-
-    Args:
-        elevation: the elevation map, with the mean colours of the orthomosaic in its cells.
-        metrics: `orthomosaic.*` of metrics.json.
-    """
-
-    elevation: ElevationMap
-    metrics: dict[str, float | None]
 
 
 def is_wanted(mission: Mission, folder: RunFolder) -> bool:
@@ -42,28 +28,12 @@ def is_wanted(mission: Mission, folder: RunFolder) -> bool:
 
 
 def make_orthomosaic(
-    mission: Mission,
-    navigator: Navigator,
-    result: SurveyResult,
-    elevation: ElevationMap,
-    truth: Truth,
-    folder: RunFolder,
-    tools: tuple[StageTimer, Callable[[float], None]],
-) -> Orthomosaic | None:
+    mission: Mission, truth: Truth, estimation: Estimation, result: SurveyResult, elevation: ElevationMap
+) -> Maps | None:
     """Makes the orthomosaic of a survey, writes it if the run folder keeps maps, and compares it with the truth.
 
     The orthomosaic is made from the images, the estimated poses and map, and, for the restoration of colours, from the
     lamps and the water of the scenario. The true albedo is used for the comparison only.
-
-    Args:
-        mission: the survey as planned.
-        navigator: the estimators, with the images of the keyframes.
-        result: output of the estimators.
-        elevation: elevation map.
-        truth: source of the true albedo and of the asked area.
-        folder: run folder.
-        tools: timer of the stages, which excludes the comparison from the stage "orthomosaic"; and function called
-            with the completed fraction.
 
     Returns:
         The elevation map with the orthomosaic averaged to its cells, and the errors of the orthomosaic; None without
@@ -72,19 +42,19 @@ def make_orthomosaic(
     Raises:
         OSError: the file could not be written, or an image could not be read.
     """
-    stopwatch, progress = tools
+    stopwatch, folder, restored = estimation.stopwatch, estimation.folder, mission.scenario.map.restore
     if not np.isfinite(elevation.height_m).any():
         return None
     with stopwatch("orthomosaic"):
-        restore = _restoration(mission, elevation) if mission.scenario.map.restore else None
-        tiles = navigator.orthomosaic(result, elevation, restore, progress)
-        first = None if tiles is None else next(tiles, None)
-    if tiles is None or first is None:
+        restore = _restoration(mission, elevation) if restored else None
+        report = partial(estimation.progress, "orthomosaic")
+        tiles = estimation.navigator.orthomosaic(result, elevation, restore, report) or iter(())
+        first = tile = next(tiles, None)
+    if first is None:
         return None
-    judge, mosaic = OrthomosaicJudge(mission.scenario.map.restore), np.zeros_like(elevation.mosaic)
+    judge, mosaic = OrthomosaicJudge(restored), np.zeros_like(elevation.mosaic)
     n = round(elevation.grid.cell_m / first.grid.cell_m)
     with folder.orthomosaic_file(first.grid, mission.terrain.georeference) as file:
-        tile = first
         while tile is not None:
             colours, row, col = mean_colours(tile, n), tile.row // n, tile.col // n
             mosaic[row : row + len(colours), col : col + colours.shape[1]] = colours
@@ -95,7 +65,7 @@ def make_orthomosaic(
                 if file is not None:
                     file.write(tile)
                 tile = next(tiles, None)
-    return Orthomosaic(replace(elevation, mosaic=mosaic), judge.metrics())
+    return Maps(replace(elevation, mosaic=mosaic), judge.metrics())
 
 
 def _restoration(mission: Mission, elevation: ElevationMap) -> Restore:

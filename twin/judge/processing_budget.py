@@ -17,23 +17,14 @@ KEYFRAME_WORK = "keyframe"
 
 
 class StageTime(NamedTuple):
-    """Computing time of one stage.
+    """Computing time of one stage; a time is None if it is not known."""
 
-    Args:
-        stage: key of the stage in metrics.json, or `KEYFRAME_WORK`.
-        n_calls: number of calls; for `KEYFRAME_WORK` the number of keyframes.
-        mean_ms: mean duration of a call, for `KEYFRAME_WORK` of the work on a keyframe [ms]; None without calls.
-        p95_ms: 95th percentile of the duration of a call [ms]; None without calls and for `KEYFRAME_WORK`.
-        total_s: total duration of all calls [s].
-        budget_ms: largest allowed mean duration [ms]; None if the stage has no budget.
-    """
-
-    stage: str
-    n_calls: int
-    mean_ms: float | None
-    p95_ms: float | None
-    total_s: float | None
-    budget_ms: float | None
+    stage: str  #: key of the stage in metrics.json, or `KEYFRAME_WORK`
+    n_calls: int  #: number of calls; for `KEYFRAME_WORK` the number of keyframes
+    mean_ms: float | None  #: mean duration of a call, for `KEYFRAME_WORK` of the work on a keyframe
+    p95_ms: float | None  #: 95th percentile of the duration of a call; None for `KEYFRAME_WORK`
+    total_s: float | None  #: total duration of all calls
+    budget_ms: float | None  #: largest allowed mean duration; None without a budget
 
     @property
     def within_budget(self) -> bool | None:
@@ -56,18 +47,12 @@ def stage_times(
     rate_hz = scenario.get("rig", {}).get("frame_rate_hz")
     hold_s = scenario.get("control", {}).get("hold_s")
     budgets_ms = {"f2f": 1e3 / rate_hz if rate_hz else None, "ga": 1e3 * hold_s if hold_s else None}
-    rows = [_stage_time(name, row, budgets_ms.get(name)) for name, row in stages.items()]
     keyframe_ms = 1e3 * n_frames_per_keyframe / rate_hz if n_frames_per_keyframe and rate_hz else None
-    return [*rows, _keyframe_work(stages, timing.get("keyframes") or 0, keyframe_ms)]
-
-
-def _stage_time(stage: str, row: Mapping[str, Any], budget_ms: float | None) -> StageTime:
-    """Returns the computing time of a stage from its row of `timing.stages` in metrics.json."""
-    return StageTime(stage, row["count"], row["mean_ms"], row["p95_ms"], row["total_s"], budget_ms)
-
-
-def _keyframe_work(stages: Mapping[str, Any], n_keyframes: int, budget_ms: float | None) -> StageTime:
-    """Returns the total time of all `KEYFRAME_STAGES` and its mean per keyframe."""
-    total_s = sum(stages.get(name, {}).get("total_s") or 0.0 for name in KEYFRAME_STAGES)
-    mean_ms = 1e3 * total_s / n_keyframes if n_keyframes else None
-    return StageTime(KEYFRAME_WORK, n_keyframes, mean_ms, None, total_s, budget_ms)
+    rows = [
+        StageTime(name, row["count"], row["mean_ms"], row["p95_ms"], row["total_s"], budgets_ms.get(name))
+        for name, row in stages.items()
+    ]
+    work_s = sum(stages.get(name, {}).get("total_s") or 0.0 for name in KEYFRAME_STAGES)
+    n_keyframes = timing.get("keyframes") or 0
+    mean_ms = 1e3 * work_s / n_keyframes if n_keyframes else None
+    return [*rows, StageTime(KEYFRAME_WORK, n_keyframes, mean_ms, None, work_s, keyframe_ms)]

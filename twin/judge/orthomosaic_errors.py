@@ -11,11 +11,6 @@ from twin.judge.colour_difference import XYZ_FROM_RGB, ciede2000, lab_of
 from twin.judge.patch_shift import patch_shift, transfer
 from twin.judge.summary_statistics import finite_float, percentile
 
-KEYS = (
-    "pixel_m", "coverage_area", "ce90_m", "ce90_px", "bias_east_m", "bias_north_m", "matched",
-    "colour_difference_median", "colour_difference_p90", "edge_width_m",
-)  # fmt: skip
-
 PATCH_PX, SEARCH_PX = 32, 8  # side of the patches that are matched, and largest displacement
 #: Unrelated patches reach a correlation of about 0.2 at the best displacement: the correlation of patches with about
 #: 300 independent pixels has a standard deviation of 0.06.
@@ -67,10 +62,7 @@ class OrthomosaicJudge:
     def _compare_colours(self, rgb: NDArray[np.uint8], albedo: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
         """Adds the colour differences of known pixels, every `_COLOUR_STEP_PX`-th per row and column, to the histogram.
 
-        Args:
-            rgb: (rows, cols, 3) colours of the orthomosaic.
-            albedo: (rows, cols, 3) true albedo, 255 = white.
-            known: (rows, cols) bool, whether a pixel has a colour and a true albedo.
+        Arguments: colours and true albedo (rows, cols, 3), and whether a pixel has both.
         """
         some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
         colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (rgb, albedo))
@@ -79,12 +71,8 @@ class OrthomosaicJudge:
     def _match(self, shown: NDArray[np.float32], true: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
         """Counts the patches that can be compared, and adds the displacement and the spectra of those that are found.
 
-        A patch can be compared if all pixels within the search range around it have a colour and a true albedo.
-
-        Args:
-            shown: (rows, cols) luminance of the orthomosaic.
-            true: (rows, cols) luminance of the true albedo.
-            known: (rows, cols) bool, whether a pixel has both.
+        A patch can be compared if all pixels within the search range around it are known. Arguments: luminance of the
+        orthomosaic and of the true albedo (rows, cols), and whether a pixel has both.
         """
         n, m = PATCH_PX, SEARCH_PX
         for row in range(m, len(shown) - n - m + 1, n):
@@ -114,23 +102,25 @@ class OrthomosaicJudge:
         an edge of albedo rises from 10 % to 90 %, for the Gaussian blur that best fits the modulation transfer function
         between the true orthomosaic and this one.
         """
-        pixel_m = self._pixel_m
-        if pixel_m is None:
-            return dict.fromkeys(KEYS)
-        shift = np.array(self._shifts).reshape(-1, 2)
+        pixel_m, shift = self._pixel_m, np.array(self._shifts).reshape(-1, 2)
         ce90_px = percentile(np.hypot(*shift.T), 90)
-        east, north = (percentile(column, 50) for column in shift.T)
-        edge_px = edge_width_px(*self._spectra)
-        values = (
-            pixel_m, self._n_known / self._n_asked if self._n_asked else None, _times(ce90_px, pixel_m), ce90_px,
-            _times(east, pixel_m), _times(north, pixel_m), len(shift) / self._n_patches if self._n_patches else None,
-            _percentile_of_counts(self._colours, 50), _percentile_of_counts(self._colours, 90),
-            _times(edge_px, pixel_m),
-        )  # fmt: skip
-        return dict(zip(KEYS, map(finite_float, values), strict=True))
+        east_px, north_px = (percentile(column, 50) for column in shift.T)
+        values = {
+            "pixel_m": pixel_m,
+            "coverage_area": self._n_known / self._n_asked if self._n_asked else None,
+            "ce90_m": _times(ce90_px, pixel_m),
+            "ce90_px": ce90_px,
+            "bias_east_m": _times(east_px, pixel_m),
+            "bias_north_m": _times(north_px, pixel_m),
+            "matched": len(shift) / self._n_patches if self._n_patches else None,
+            "colour_difference_median": _percentile_of_counts(self._colours, 50),
+            "colour_difference_p90": _percentile_of_counts(self._colours, 90),
+            "edge_width_m": _times(_edge_width_px(*self._spectra), pixel_m),
+        }
+        return {name: finite_float(value) for name, value in values.items()}
 
 
-def edge_width_px(cross: Array, power: Array) -> float | None:
+def _edge_width_px(cross: Array, power: Array) -> float | None:
     """Returns the 10 % to 90 % edge width [px] of the Gaussian blur that best fits a modulation transfer function.
 
     The measured transfer function of the frequency f [1/px] is `cross` / `power`, each summed over all directions. The
@@ -159,17 +149,12 @@ def edge_width_px(cross: Array, power: Array) -> float | None:
 
 
 def _percentile_of_counts(counts: NDArray[np.int64], percent: float) -> float | None:
-    """Returns the upper edge of the bin of `_BINS` that contains a percentile (0 to 100); None without values.
-
-    Args:
-        counts: number of values in each bin.
-        percent: the percentile.
-    """
+    """Returns the upper edge of the bin of `_BINS` that contains a percentile (0 to 100); None without values."""
     if not counts.any():
         return None
     return float(_BINS[1 + np.searchsorted(np.cumsum(counts), percent / 100 * counts.sum())])
 
 
-def _times(value: float | None, factor: float) -> float | None:
-    """Returns the value times the factor; None if the value is None."""
-    return None if value is None else value * factor
+def _times(value: float | None, factor: float | None) -> float | None:
+    """Returns the product; None if a factor is None."""
+    return None if value is None or factor is None else value * factor

@@ -1,0 +1,180 @@
+"""A data set that is ready to be replayed: its calibration, truth, readings and first stereo pair, all checked."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.core.records import Trajectory
+from twin.core.settings import EstimatorSettings
+from twin.core.user_files import is_file, resolved
+from twin.datasets.bag import is_bag
+from twin.datasets.bag_reader import BagTopics
+from twin.datasets.calibration_files import read_calibration
+from twin.datasets.calibration_values import READ
+from twin.datasets.dataset import Dataset
+from twin.datasets.image_files import Bayer
+from twin.datasets.readers import read_dataset
+from twin.datasets.truth_files import read_true_map, read_truth
+from twin.errors import TwinError
+from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
+from twin.judge.recorded import AlignmentName, associate
+from twin.judge.true_map import TrueMap
+from twin.recordings.frames import RecordedFrames
+from twin.recordings.recorded_aiding import Aiding
+from twin.report.run_writer import OPTIONAL_OUTPUTS
+
+_FARTHEST_M = 1e8  # largest coordinate of a true position; in UTM and ECEF they are up to 1e7 m
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ReplayOptions:
+    """Options of a replay.
+
+    Args:
+        calibration: calibration file; None: that of the data set.
+        truth: file of true poses, or for a ROS 2 bag the topic of true poses; None: that of the data set.
+        alignment: how the estimates are moved to the truth before the comparison.
+        bayer: pattern of raw images; None: grey or colour images.
+        settings: settings of the estimators, of which `window_tracks` and `wide_search` are replaced; None: the
+            defaults.
+        start: (4, 4) pose world_from_camera of the rectified left camera at the first frame; None: z is up by the
+            recorded attitude or, without one, the plane z = 0 of the world is the floor plane of the first pair
+            (`floor_plane`).
+        outputs: outputs in addition to metrics, trajectories and maps: "report", "recording".
+        topics: image topics (left, right) of a ROS 2 bag; None: the only stereo pair in it.
+        estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
+            whose poses the map is built; None: the estimators of `twin.estimate`.
+        aiding: whether recorded readings of pressure, attitude, DVL and IMU are used.
+        true_map: GeoTIFF of the true heights [m] in the frame of the true poses; None: that of the data set.
+    """
+
+    calibration: Path | None = None
+    truth: Path | None = None
+    alignment: AlignmentName = "first"
+    bayer: Bayer | None = None
+    settings: EstimatorSettings | None = None
+    start: Array | None = None
+    outputs: Collection[str] = OPTIONAL_OUTPUTS
+    topics: tuple[str, str] | None = None
+    estimator: str | None = None
+    aiding: bool = True
+    true_map: Path | None = None
+
+
+class OpenedDataset(NamedTuple):
+    """A data set that is ready to be replayed."""
+
+    name: str  #: name of its folder or file
+    reader: str  #: name of the reader of its layout
+    dataset: Dataset
+    frames: RecordedFrames  #: its rectified frames
+    truth: Trajectory | None  #: true poses of the rectified left camera, at times relative to the first frame
+    pair: PairInspection  #: the first stereo pair
+    plane: FloorPlane  #: floor plane of the first pair, in the axes of the left camera
+    aiding: Aiding | None  #: readings of the navigation sensors; None if none were recorded or they are not wanted
+    true_map: TrueMap | None = None  #: true heights in the frame of `truth`; None if they are not known
+
+    @property
+    def used_readings(self) -> list[str]:
+        """Returns the names of the sensors whose readings are used."""
+        return [] if self.aiding is None else self.aiding.used
+
+    @property
+    def plane_text(self) -> str:
+        """Returns a phrase that states how the plane of the map was chosen; a start in the options is ignored."""
+        if "attitude" in self.used_readings:
+            return "plane of the map horizontal by the recorded attitude"
+        if "vertical" in self.used_readings:
+            return "plane of the map horizontal by the recorded specific forces"
+        return f"plane of the map {'fitted to the floor' if self.plane.fitted else 'perpendicular to the first view'}"
+
+
+def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
+    """Returns a data set with its calibration, truth and readings, after checks of these and of its first stereo pair.
+
+    Raises:
+        TwinError: the folder has no known layout, there is no calibration or no usable pair, fewer than 30 points of
+            the first pair are matched, the cameras are swapped, the calibration or the truth does not fit the images, a
+            file is damaged, or topics are named for a data set that is not a bag.
+    """
+    in_bag = options.truth is not None and is_bag(folder) and not is_file(options.truth)
+    left, right = options.topics or (None, None)
+    dataset, reader = read_dataset(folder, BagTopics(left, right, str(options.truth) if in_bag else None))
+    if options.topics is not None and not is_bag(folder):
+        raise TwinError("--topics", f"{folder} is not a ROS 2 bag", "no topics for other data sets")
+    calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
+    if calibration is None:
+        raise TwinError(str(folder), "has no calibration", f"--calibration FILE: {READ}")
+    frames = RecordedFrames(dataset, _sound(calibration), options.bayer)
+    truth = _truth(dataset, frames, None if in_bag else options.truth)
+    pair = inspect_pair(frames.first_pair(), frames.rectification.rig, options.settings)
+    if pair.swapped:
+        problem = "the left and the right images are swapped, or both upside down: the disparities are negative"
+        raise TwinError(str(folder), problem, "left images of the camera on the left")
+    plane = floor_plane(pair.points)
+    if plane is None:
+        problem = f"only {len(pair.points.xyz)} points of the first pair are matched"
+        raise TwinError(str(folder), problem, "a rectified pair that fits the calibration; see `--preview`")
+    readings = _sound(dataset.readings) if options.aiding else None
+    aiding, rectified = None, frames.rectification
+    if readings is not None:
+        aiding = Aiding(readings, rectified.left_from_rectified, frames.start_s, rectified.rig.frame_rate_hz)
+    true_map = _true_map(dataset, truth, options)
+    return OpenedDataset(resolved(folder).name, reader, dataset, frames, truth, pair, plane, aiding, true_map)
+
+
+def _sound(value: T | TwinError) -> T:
+    """Returns what was read from a data set; raises the error if it is damaged."""
+    if isinstance(value, TwinError):
+        raise value
+    return value
+
+
+def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:
+    """Returns the true heights: those of the option, or those of the data set if the true poses are its own, too.
+
+    Raises:
+        TwinError: the file is not a height grid, or there are no true poses, in whose frame the heights are.
+    """
+    if options.true_map is None:
+        own = dataset.true_map if options.truth is None and truth is not None else None
+        return None if own is None else read_true_map(own)
+    if truth is None:
+        raise TwinError("--true-map", "the data set has no true poses, in whose frame the heights are", "--truth")
+    return read_true_map(options.true_map)
+
+
+def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Trajectory | None:
+    """Returns the true poses of the rectified left camera, in the order of time, at times relative to the first frame.
+
+    Of several poses at the same time, only the first one is kept. Returns None without a truth.
+
+    Raises:
+        TwinError: the truth is damaged or has no poses, a true position is impossible, or there are several frames and
+            none of them has a true pose at its time (`associate`).
+    """
+    truth, source = _sound(dataset.truth if file is None else read_truth(file, dataset)), str(file or dataset.folder)
+    if truth is None:
+        return None
+    if not len(truth):
+        raise TwinError(source, "the truth has no poses", "true poses at the times of the frames")
+    largest_m = float(np.abs(truth.positions).max())
+    if not largest_m <= _FARTHEST_M:
+        raise TwinError(source, f"a coordinate of a true position is {largest_m:g} m", f"up to {_FARTHEST_M:g} m")
+    recorded_s, first = np.unique(truth.times_s, return_index=True)
+    poses = truth.world_from_camera[first] @ frames.rectification.left_from_rectified
+    moved = Trajectory(recorded_s - frames.start_s, poses)
+    times_s = np.array([frame.time_s for frame in dataset.images]) - frames.start_s
+    if len(times_s) > 1 and len(associate(times_s, moved.times_s).estimate) == 0:
+        span = f"{recorded_s.min():.3f} to {recorded_s.max():.3f} s"
+        given = f"{frames.start_s:.3f} to {frames.start_s + times_s.max():.3f} s"
+        raise TwinError(source, f"the truth is of another clock: {span}", f"the times of the frames, {given}")
+    return moved
