@@ -6,8 +6,8 @@ import numpy as np
 from recorded_datasets import RIG
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from twin.exchange.ros2_messages import MessageFactory
-from twin.exchange.run_contents import CameraIntrinsics
+from twin.datasets.calibration import RecordedCamera
+from twin.datasets.ros2.messages import MessageFactory
 
 ROS = MessageFactory()
 START_NS = 1_700_000_000_000_000_000
@@ -46,7 +46,7 @@ def image(pixels, encoding, time_ns=START_NS, padding=0, big_endian=False, frame
 
 def info(side, time_ns=START_NS, rig=RIG, **changed):
     """Returns sensor_msgs/CameraInfo of a rectified camera; `changed` replaces fields."""
-    camera = CameraIntrinsics((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
+    camera = RecordedCamera((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
     frame, baseline_m = (LEFT, 0.0) if side == "left" else (RIGHT, rig.baseline_m)
     message = ROS.camera_info(time_ns, frame, camera, baseline_m)
     for key, value in changed.items():

@@ -109,9 +109,9 @@ MUTANTS = [
         ("twin/judge/colour_difference.py", "hue = np.where(coloured, (h1 + h2) / 2 + across, h1 + h2)", "hue = np.where(coloured, (h1 + h2) / 2, h1 + h2)", "judge_metrics orthomosaic"),
         ("twin/judge/require.py", "value >= limit if more_is_better(name) else value <= limit", "value > limit if more_is_better(name) else value < limit", "judge_metrics"),
         # exchange
-        ("twin/exchange/ros2.py", "return air_pa + PASCAL_PER_METRE * (surface_m - height_m)", "return air_pa + PASCAL_PER_METRE * (height_m - surface_m)", "exchange_ros2"),
+        ("twin/datasets/ros2/bag_writer.py", "return air_pa + PASCAL_PER_METRE * (surface_m - height_m)", "return air_pa + PASCAL_PER_METRE * (height_m - surface_m)", "exchange_ros2"),
         ("twin/exchange/geotiff.py", "cell = grid.cell_m / origin.metres_per_unit", "cell = grid.cell_m * origin.metres_per_unit", "exchange_map terrains_georeference"),
-        ("twin/exchange/attitude.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_datasets"),
+        ("twin/exports/attitude.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_datasets"),
         # plug-ins, world, surrogate, sessions
         ("twin/plugin/guard.py", "max(error, turned) > _ROTATION_TOLERANCE", "error > _ROTATION_TOLERANCE", "plugin_guard"),
         ("twin/plugin/guard.py", "function(*copy.deepcopy(arguments))", "function(*arguments)", "plugin_guard"),
@@ -128,7 +128,7 @@ MUTANTS = [
         ("twin/report/verdict.py", "'at least' if more_is_better(name) else 'at most'", "'at most' if more_is_better(name) else 'at least'", "report_verdict"),
         # data sets, surrogate's fit, studies, app, reproduction
         ("twin/recordings/recorded_aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),
-        ("twin/datasets/readings.py", "times_s, values = table.values[:, 0] * 1e-9,", "times_s, values = table.values[:, 0] * 1e-6,", "datasets_readings"),
+        ("twin/datasets/sensor_folders.py", "times_s, values = table.values[:, 0] * 1e-9,", "times_s, values = table.values[:, 0] * 1e-6,", "datasets_readings"),
         ("twin/studies/statistics.py", "centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)", "centre = (p + z**2 / n) / (1 + z**2 / n)", "study_statistics"),
         ("twin/studies/surveys.py", "0 if plan.paired else sample.point * plan.seeds", "sample.point * plan.seeds if plan.paired else 0", "study_sampling study_runner"),
         ("twin/studies/agreement.py", "within = 1 / (1 + MEDIAN_LIMIT) <= self.ratio.value", "within = 1 - MEDIAN_LIMIT <= self.ratio.value", "study_agreement"),

@@ -22,11 +22,11 @@ from twin.datasets import image_files
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
+from twin.datasets.euroc import EurocWriter
 from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.readers import read_dataset
 from twin.datasets.truth_files import read_truth
 from twin.errors import TwinError
-from twin.exchange.euroc import EurocWriter
 from twin.plugin import loading
 from twin.recordings import replay
 from twin.recordings.frames import RecordedFrames, increasing

@@ -13,11 +13,12 @@ from recorded_datasets import RIG
 import twin
 from twin.core import geometry
 from twin.core.records import ImuReadings, Readings
-from twin.datasets.bag_reader import BagReader
-from twin.datasets.readings import read_folder
+from twin.datasets import euroc
+from twin.datasets.ros2 import bag_writer
+from twin.datasets.ros2.bag_reader import BagReader
+from twin.datasets.run_contents import ImuNoise, RecordedImu
+from twin.datasets.sensor_folders import read_folder
 from twin.errors import TwinError
-from twin.exchange import euroc, ros2
-from twin.exchange.run_contents import ImuNoise, RecordedImu
 from twin.recordings.replay import ReplayOptions, open_dataset
 
 pytestmark = pytest.mark.long
@@ -85,7 +86,7 @@ def test_attitude_and_pressure_make_the_world_level(folder, tmp_path):
 
 
 def test_a_bag_has_the_same_readings(contents, folder, tmp_path):
-    ros2.export(contents, tmp_path)
+    bag_writer.export(contents, tmp_path)
     bag = replayed(tmp_path / "ros2_bag", tmp_path / "bag").result
     assert np.abs(bag.final.positions - replayed(folder, tmp_path / "euroc").result.final.positions).max() < 1e-6
 
@@ -166,7 +167,7 @@ def level_errors_m(result):
 def test_an_imu_without_orientation_makes_the_world_level(tmp_path, writer):
     """A bias of 0.02 m/s2 is a tilt of 0.12 degrees; the first view of the hills is tilted by more than 0.4 degrees."""
     contents = exported_run.flown(tmp_path / "run", N, scenario=SCENARIO, imu=inertial(np.array([0.02, 0, 0])))
-    (euroc if writer == "euroc" else ros2).export(contents, tmp_path / "set")
+    (euroc if writer == "euroc" else bag_writer).export(contents, tmp_path / "set")
     folder = tmp_path / "set" if writer == "euroc" else tmp_path / "set" / "ros2_bag"
     found = replayed(folder, tmp_path / "aided")
     assert found.metrics["replay"]["aiding"] == "vertical" and not found.metrics["warnings"]

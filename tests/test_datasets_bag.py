@@ -16,13 +16,13 @@ from recorded_datasets import RIG
 from rosbags.rosbag2 import StoragePlugin, storage_mcap
 
 from twin.core import geometry
-from twin.datasets import bag as bag_module
-from twin.datasets.bag import Bag
-from twin.datasets.bag_calibration import stereo_calibration
-from twin.datasets.bag_images import raw_pixels
-from twin.datasets.bag_reader import BagReader, BagTopics
-from twin.datasets.bag_topics import image_topics, stereo_topics
 from twin.datasets.image_files import UnreadableImage
+from twin.datasets.ros2 import bag as bag_module
+from twin.datasets.ros2.bag import Bag
+from twin.datasets.ros2.bag_images import raw_pixels
+from twin.datasets.ros2.bag_reader import BagReader, BagTopics
+from twin.datasets.ros2.bag_topics import image_topics, stereo_topics
+from twin.datasets.ros2.camera_info import stereo_calibration
 from twin.errors import TwinError
 from twin.recordings.frames import RecordedFrames
 from twin.recordings.replay import ReplayOptions, open_dataset

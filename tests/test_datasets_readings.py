@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from twin.datasets import text_files
-from twin.datasets.bag import Bag
-from twin.datasets.bag_readings import read_bag
-from twin.datasets.readings import read_folder
+from twin.datasets.ros2.bag import Bag
+from twin.datasets.ros2.bag_readings import read_bag
+from twin.datasets.sensor_folders import read_folder
 from twin.errors import TwinError
 
 N, NS = 5, 100_000_000

@@ -19,9 +19,9 @@ import twin
 from twin.core import geometry
 from twin.core.records import MapGrid, Trajectory
 from twin.datasets import readers
+from twin.datasets.euroc import EurocWriter
 from twin.errors import TwinError
 from twin.estimate.first_pair import floor_plane, inspect_pair
-from twin.exchange.euroc import EurocWriter
 from twin.exchange.geotiff import write_elevations
 from twin.plugin import loading
 from twin.recordings import preview, replay

@@ -16,14 +16,16 @@ from scipy.spatial.transform import Rotation
 from twin.core import geometry
 from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, ImuReadings, MapGrid, Readings, StereoRig, Trajectory
+from twin.datasets import calibration_files, colmap, euroc, kitti, tum
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.readers import read_dataset
+from twin.datasets.run_contents import ImuNoise, RecordedFrame, RecordedImu, RunContents
 from twin.errors import TwinError
-from twin.exchange import camera_files, colmap, euroc, geotiff, ifdo, kitti, metashape, nerfstudio, tum
-from twin.exchange.attitude import yaw_pitch_roll_deg
-from twin.exchange.formats import FORMATS, check_needs, chosen_formats
-from twin.exchange.run_contents import ImuNoise, RecordedFrame, RecordedImu, RunContents, project
+from twin.exchange import geotiff
+from twin.exports import ifdo, metashape, nerfstudio
+from twin.exports.attitude import yaw_pitch_roll_deg
 from twin.exports.camera_models import believed_calibration, true_calibration
+from twin.exports.formats import FORMATS, check_needs, chosen_formats
 from twin.scenario.model import Scenario
 
 N = 5
@@ -65,9 +67,8 @@ def contents(tmp_path):
     shifted = Trajectory(path.times_s, geometry.pose(np.eye(3), np.array([0.01, 0, 0])) @ poses())
     believed = believed_calibration(RIG)
     pose = geometry.pose(geometry.so3_exp(np.array([0.01, 0.02, -0.01])), np.array([0.121, 0, 0]))
-    true = believed._replace(
-        left=believed.left._replace(distortion=np.array([0.05, -0.02, 0.001, -0.002, 0.003])), left_from_right=pose
-    )
+    left = replace(believed.left, distortion=np.array([0.05, -0.02, 0.001, -0.002, 0.003]))
+    true = replace(believed, left=left, right_from_left=geometry.inverse(pose))
     return RunContents(
         tmp_path, "run", {"name": "run"}, RIG, believed, true, {"truth": path, "final": shifted},
         np.array([0, 2, 4]), tuple(frames), elevation,
@@ -156,7 +157,7 @@ def test_readings_are_written_with_their_times(contents, tmp_path):
 
 @pytest.mark.parametrize("name", ["opencv.yaml", "kalibr.yaml", "cameras.txt"])
 def test_calibration_files_are_read_back(contents, name, tmp_path):
-    camera_files.export(contents, tmp_path)
+    calibration_files.export(contents, tmp_path)
     for kind, rig in (("believed", contents.believed), ("true", contents.true)):
         read = read_calibration(tmp_path / kind / name)
         np.testing.assert_allclose(read.left.matrix, rig.left.matrix)
@@ -331,8 +332,8 @@ def test_the_model_of_the_fit_is_that_of_opencv():
     points = rng.uniform([-1, -1, 1], [1, 1, 3], (20, 3))
     distortion, matrix = np.array([0.1, -0.05, 0.01, -0.02, 0.03]), RIG.matrix
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
-    camera = believed_calibration(RIG).left._replace(distortion=distortion)
-    np.testing.assert_allclose(project(points, camera), expected, atol=1e-9)
+    camera = replace(believed_calibration(RIG).left, distortion=distortion)
+    np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
 
 
 NOISE = ImuNoise(1.5e-4, 2e-5, 3e-3, 4e-3)
@@ -395,7 +396,7 @@ def test_the_noise_of_the_imu_is_written_with_the_keys_of_kalibr(contents, tmp_p
     sensor = yaml.safe_load((tmp_path / "mav0" / "imu0" / "sensor.yaml").read_text())
     assert sensor["sensor_type"] == "imu" and sensor["rate_hz"] == 120.0
     assert sensor["T_BS"] == {"rows": 4, "cols": 4, "data": np.eye(4).ravel().tolist()}
-    believed, true = camera_files.export(replace(contents, imu=imu), tmp_path)
+    believed, true = calibration_files.export(replace(contents, imu=imu), tmp_path)
     kalibr = yaml.safe_load((believed / "imu.yaml").read_text())
     assert kalibr == yaml.safe_load((true / "imu.yaml").read_text())
     assert kalibr.pop("rostopic") == "/imu/data_raw" and kalibr.pop("update_rate") == 120.0
@@ -411,6 +412,6 @@ def test_the_noise_of_the_imu_is_written_with_the_keys_of_kalibr(contents, tmp_p
 
 def test_without_an_imu_nothing_is_written_for_one(contents, tmp_path):
     euroc.export(contents, tmp_path)
-    (believed, _) = camera_files.export(contents, tmp_path)
+    (believed, _) = calibration_files.export(contents, tmp_path)
     assert not (tmp_path / "mav0" / "imu0").exists() and not (believed / "imu.yaml").exists()
     assert "imu" not in (believed / "kalibr.yaml").read_text()

@@ -13,8 +13,8 @@ from exported_run import GRID
 from twin.core.georeference import Georeference
 from twin.core.ortho_tiles import OrthoTile
 from twin.core.records import MapGrid
-from twin.exchange import geotiff, textured_mesh
-from twin.exchange.formats import FORMATS
+from twin.exchange import geotiff
+from twin.exports.formats import FORMATS
 from twin.report.run_folder import read_raster
 
 UTM = geotiff.georeference_in("EPSG:32633", (412345.25, 4512345.75, -31.5))
@@ -148,12 +148,11 @@ def test_trimesh_reads_the_mesh_with_its_texture(run, name, texture, tmp_path):
 
 
 @pytest.mark.parametrize(("rows", "cols", "shape"), [(3, 100, (1, 20, 3)), (100, 3, (20, 1, 3))])
-def test_the_texture_of_a_very_long_orthomosaic_has_one_pixel_across(rows, cols, shape, tmp_path, monkeypatch):
+def test_the_texture_of_a_very_long_orthomosaic_has_one_pixel_across(rows, cols, shape, tmp_path):
     grid = MapGrid(0.0, 0.0, 0.1, rows, cols)
     with geotiff.OrthomosaicFile(tmp_path / "mosaic.tif", grid) as file:
         file.write(OrthoTile(grid, 0, 0, np.full((rows, cols, 4), [90, 60, 30, 255], np.uint8)))
-    monkeypatch.setattr(textured_mesh, "_MOST_TEXTURE_PX", 20)
-    texture, reduced = textured_mesh._texture(tmp_path / "mosaic.tif")
+    reduced, texture = geotiff.read_mosaic(tmp_path / "mosaic.tif", most_side_px=20)
     assert texture.shape == shape and (texture == [90, 60, 30]).all()
     assert (reduced.rows, reduced.cols, reduced.cell_m) == (*shape[:2], pytest.approx(0.5))
 

@@ -13,11 +13,12 @@ from rosbags.highlevel import AnyReader
 import twin
 from twin.core import geometry
 from twin.core.records import ImuReadings, Readings
-from twin.datasets.bag_reader import BagReader, BagTopics
-from twin.exchange import euroc, ros2
-from twin.exchange.euroc import timestamp_ns
-from twin.exchange.formats import FORMATS
-from twin.exchange.run_contents import ImuNoise, RecordedImu
+from twin.datasets import euroc
+from twin.datasets.ros2 import bag_writer
+from twin.datasets.ros2.bag_reader import BagReader, BagTopics
+from twin.datasets.run_contents import ImuNoise, RecordedImu
+from twin.datasets.sensor_folders import timestamp_ns
+from twin.exports.formats import FORMATS
 from twin.recordings.frames import RecordedFrames
 from twin.recordings.replay import ReplayOptions
 
@@ -102,7 +103,7 @@ def test_images_are_the_recorded_files(bag, run):
 
 
 def test_images_are_jpeg_if_a_quality_is_given(run, tmp_path):
-    (path,) = ros2.export(replace(run, jpeg_quality=90), tmp_path)
+    (path,) = bag_writer.export(replace(run, jpeg_quality=90), tmp_path)
     with AnyReader([path]) as reader:
         connection = next(one for one in reader.connections if one.topic == "/left/image_rect/compressed")
         message = reader.deserialize(next(reader.messages([connection]))[2], connection.msgtype)
@@ -184,11 +185,11 @@ def geometry_zero():
 
 
 def test_without_a_surface_the_pressure_is_relative_to_the_reference_plane():
-    assert ros2.pressure_pa(2.0, 0.0) == pytest.approx(-2 * 1025 * 9.81)
+    assert bag_writer.pressure_pa(2.0, 0.0) == pytest.approx(-2 * 1025 * 9.81)
 
 
 def test_our_reader_reads_the_exported_bag_back(run, tmp_path):
-    (path,) = ros2.export(run, tmp_path)
+    (path,) = bag_writer.export(run, tmp_path)
     dataset = BagReader(BagTopics(truth="/ground_truth/odometry")).read(path)
     frames = RecordedFrames(dataset, dataset.calibration)
     for given, read in zip(run.frames, frames, strict=True):
@@ -204,7 +205,7 @@ def test_our_reader_reads_the_exported_bag_back(run, tmp_path):
 @pytest.mark.slow
 def test_a_replay_of_the_bag_equals_the_replay_of_the_same_run_as_a_euroc_folder(tmp_path):
     run = made.flown(tmp_path / "run", 8)
-    (bag,) = ros2.export(run, tmp_path)
+    (bag,) = bag_writer.export(run, tmp_path)
     euroc.export(run, tmp_path / "euroc")
     truths = (Path("/ground_truth/odometry"), None)
     first, second = (

@@ -292,7 +292,7 @@ def test_an_interrupted_file_is_removed(tmp_path, plane):
 def test_a_large_orthomosaic_is_read_reduced(tmp_path, plane, monkeypatch):
     with OrthomosaicFile(tmp_path / "mosaic.tif", plane.grid) as file:
         file.write(plane)
-    monkeypatch.setattr("twin.report.run_folder.MAX_MOSAIC_PX", 5000)
+    monkeypatch.setattr("twin.exchange.geotiff.MAX_MOSAIC_PX", 5000)
     raster = read_mosaic(tmp_path / "mosaic.tif")
     assert raster.values.size <= 3 * 5000 and raster.grid.cell_m == pytest.approx(3 * plane.grid.cell_m)
 

@@ -19,7 +19,7 @@ from matplotlib.backends.backend_agg import RendererAgg
 from study_surveys import STUDY, fly, study_of
 
 import twin
-from twin.exchange.euroc import EurocWriter
+from twin.datasets.euroc import EurocWriter
 from twin.recordings.replay import ReplayOptions
 from twin.report import comparison, survey_page
 from twin.reproduce import catalogue

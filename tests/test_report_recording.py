@@ -136,7 +136,7 @@ def test_a_reduced_orthomosaic_colours_the_map_where_the_whole_one_does(tmp_path
     x, y = np.meshgrid(*pixels.centres())
     ramp = np.stack([200 * (x + 0.6) / 2.1, 200 * (0.5 - y) / 1.4, 0 * x + 50], axis=-1)
     geotiff.write_mosaic(tmp_path / "mosaic.tif", np.round(ramp).astype(np.uint8), pixels)
-    monkeypatch.setattr("twin.report.run_folder.MAX_MOSAIC_PX", most_px)
+    monkeypatch.setattr("twin.exchange.geotiff.MAX_MOSAIC_PX", most_px)
     mosaic = read_mosaic(tmp_path / "mosaic.tif")
     surface = recording_surfaces.map_surface(Raster(cells, np.zeros((20, 30))), mosaic)
     at = np.stack([200 * (surface.points[:, 0] + 0.6) / 2.1, 200 * (0.5 - surface.points[:, 1]) / 1.4], axis=-1)

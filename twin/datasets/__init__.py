@@ -1,1 +1,1 @@
-"""Replay of recorded stereo data sets: readers, calibration files, rectification, frames, preview, run folder."""
+"""Data sets of stereo images: their formats, read and written, and what all formats have in common."""

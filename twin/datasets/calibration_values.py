@@ -24,11 +24,6 @@ def refuse_unknown(keys: Iterable[Any], file: Path) -> None:
         raise TwinError(str(file), f"has unknown or repeated keys, which could change its meaning: {names}", READ)
 
 
-def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
-    """Returns the camera matrix (3, 3)."""
-    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
-
-
 def table_of(value: Any, file: Path) -> Mapping[str, Any]:
     """Returns the value if it is a table (keys and values); raises TwinError otherwise."""
     if not isinstance(value, Mapping):

@@ -9,6 +9,7 @@ from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
+from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Trajectory
 from twin.core.series import nearest_index
@@ -21,61 +22,46 @@ from twin.errors import TwinError
 #: absolute [s].
 _PAIR_SHARE, _PAIR_MOST_S = 0.25, 0.01
 _LATEST_S, _SHORTEST_S = 1e11, 1e-5  # latest time, and shortest median interval of the frames of a data set [s]
+_UNIT_QUATERNION = 0.01  # largest deviation of the norm of a quaternion from 1
 T = TypeVar("T")
 
 
 class ImageTime(NamedTuple):
-    """Time of an exposure [s], in the clock of the data set, and its image (`file`)."""
+    """Time of an exposure [s], in the clock of the data set, and its image."""
 
     time_s: float
     file: ImageSource
 
 
 class StereoImages(NamedTuple):
-    """Images of one frame; `right` is None if no right image belongs to the left one.
-
-    Args:
-        time_s: time of the left image [s], in the clock of the data set.
-        left, right: image files, or images that are stored in another way.
-    """
+    """Images of one frame, at the time of the left one in the clock of the data set."""
 
     time_s: float
     left: ImageSource
-    right: ImageSource | None
+    right: ImageSource | None  #: None if no right image belongs to the left one
 
 
 @dataclass(frozen=True)
 class Dataset:
     """A recorded stereo data set.
 
-    Args:
-        folder: folder or file of the data set; all images lie in it.
-        images: frames in the order of the data set.
-        calibration: calibration of the cameras; None if the data set has none; a TwinError if it has one that cannot be
-            used, which is raised unless the user gives another calibration.
-        truth: recorded poses of the left camera (before rectification), in the clock of the data set; None if the data
-            set has none; a TwinError if it cannot be read, which is raised unless the user gives another truth. The
-            truth is never given to the estimators.
-        n_right_only: number of right images that belong to no left image.
-        notes: sentences on the assumptions that the reader made.
-        frame_times_s: (n,) times of all frames, with or without a left image [s], in the clock of the data set; None:
-            the times of `images`.
-        body_from_left: (4, 4) pose of the left camera in the body that recorded poses refer to; None if unknown.
-        readings: recorded readings of navigation sensors; None if the data set has none; a TwinError if they cannot be
-            read, which is raised unless the user replays without them.
-        true_map: GeoTIFF of the true heights in the frame of the recorded poses; None if the data set has none.
+    Where a TwinError stands in place of the calibration, the truth or the readings, the data set has one that cannot be
+    used; it is raised unless the user gives another one, or replays without the readings.
     """
 
-    folder: Path
-    images: Sequence[StereoImages]
+    folder: Path  #: folder or file of the data set; all images lie in it
+    images: Sequence[StereoImages]  #: frames in the order of the data set
     calibration: StereoCalibration | TwinError | None
+    #: poses of the left camera (before rectification), in the clock of the data set; never given to the estimators.
     truth: Trajectory | TwinError | None = None
-    n_right_only: int = 0
-    notes: tuple[str, ...] = ()
+    n_right_only: int = 0  #: number of right images that belong to no left image
+    notes: tuple[str, ...] = ()  #: sentences on the assumptions that the reader made
+    #: (n,) times of all frames, with or without a left image [s]; None: the times of `images`.
     frame_times_s: Array | None = None
+    #: (4, 4) pose of the left camera in the body that recorded poses refer to; None if unknown.
     body_from_left: Array | None = None
-    readings: RecordedReadings | TwinError | None = None
-    true_map: Path | None = None
+    readings: RecordedReadings | TwinError | None = None  #: recorded readings of navigation sensors
+    true_map: Path | None = None  #: GeoTIFF of the true heights in the frame of the recorded poses
 
 
 class Reader(Protocol):
@@ -96,8 +82,7 @@ class Reader(Protocol):
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a folder or file; images are not decoded.
 
-        An error in the calibration, the truth or the readings is returned in `Dataset`, not raised: the user may
-        replace the first two and replay without the readings.
+        An error in the calibration, the truth or the readings is returned in `Dataset`, not raised.
 
         Raises:
             TwinError: another file of the data set is missing or damaged.
@@ -129,6 +114,20 @@ def value_or_error(read: Callable[[], T]) -> T | TwinError:
         return read()
     except TwinError as error:
         return error
+
+
+def are_rotations(quaternions: Array) -> bool:
+    """Returns whether quaternions (..., 4) are of unit length, up to rounding; false if one is not finite."""
+    return bool((np.abs(np.linalg.norm(quaternions, axis=-1) - 1) < _UNIT_QUATERNION).all())
+
+
+def trajectory_of(times_s: Array, positions: Array, quaternions_wxyz: Array) -> Trajectory | None:
+    """Returns the trajectory of positions (n, 3) and quaternions (n, 4); None without any, or if one is no rotation."""
+    if not len(times_s) or not are_rotations(quaternions_wxyz):
+        return None
+    poses = np.tile(np.eye(4), (len(times_s), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = geometry.rotation_from_wxyz(quaternions_wxyz), positions
+    return Trajectory(times_s, poses)
 
 
 def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple[list[StereoImages], int]:

@@ -33,15 +33,11 @@ class UnreadableImage(Exception):  # noqa: N818 (the frame is skipped)
 
 
 class ImageFormat(NamedTuple):
-    """Format of the values of images, for the conversion to 8-bit RGB.
+    """Format of the values of images, for the conversion to 8-bit RGB."""
 
-    Args:
-        bits: number of bits in use in 16-bit images; 8 for 8-bit images.
-        bayer: pattern of raw images: the colours of the first two pixels of the first row, then of the second row;
-            None: grey or colour images.
-    """
-
-    bits: int = 8
+    bits: int = 8  #: number of bits in use in 16-bit images; 8 for 8-bit images
+    #: pattern of raw images: the colours of the first two pixels of the first row, then of the second row; None: no raw
+    #: images.
     bayer: Bayer | None = None
 
 
@@ -54,21 +50,14 @@ class StoredImage(Protocol):
         ...
 
     def size_px(self) -> tuple[int, int]:
-        """Returns (width, height) [px].
-
-        Raises:
-            UnreadableImage: the image is damaged or of an unknown encoding.
-        """
+        """Returns (width, height) [px]; raises UnreadableImage if the image is damaged or of an unknown encoding."""
         ...
 
     def pixels(self, size_px: tuple[int, int]) -> NDArray[Any]:
         """Returns the values of the image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
 
-        Args:
-            size_px: (width, height) that the image must have.
-
         Raises:
-            UnreadableImage: the image is damaged, of an unknown encoding or of another size.
+            UnreadableImage: the image is damaged, of an unknown encoding, or (width, height) is not `size_px`.
         """
         ...
 
@@ -90,21 +79,14 @@ def image_size(image: ImageSource) -> tuple[int, int]:
 
 
 def encoded_size(data: bytes) -> tuple[int, int]:
-    """Returns (width, height) [px] of the contents of a PNG, JPEG or TIFF file, from its header.
-
-    Raises:
-        UnreadableImage: the data are not a PNG, JPEG or TIFF image, or the image is too large.
-    """
+    """Returns (width, height) [px] of the contents of an image file; raises UnreadableImage if they are no image."""
     return _header(data)[:2]
 
 
 def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) -> Image:
-    """Returns an image as 8-bit RGB (H, W, 3).
+    """Returns an image of (width, height) `size_px` as 8-bit RGB (H, W, 3).
 
-    Args:
-        image: PNG, JPEG or TIFF file, or an image that is stored in another way.
-        size_px: (width, height) that the image must have.
-        form: number of bits and Bayer pattern. The pattern is ignored for an image that has colours already.
+    The Bayer pattern of `form` is ignored for an image that has colours already.
 
     Raises:
         UnreadableImage: the image is missing, damaged, too large, not in a supported format, or has another size.
@@ -123,12 +105,7 @@ def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer:
 
     Cameras with 10, 12 or 14 bits store 16-bit images in which only the lower bits are used. The number of bits in use
     is the smallest one, at least 8, that holds the largest value in the 16-bit images of the sample. It is the same for
-    all images of both cameras, so that grey levels stay comparable.
-
-    Args:
-        images: all images of the data set.
-        size_px: (width, height) of the images; images of another size are left out.
-        bayer: pattern of raw images, which is copied to the result.
+    all images of both cameras, so that grey levels stay comparable. Images that cannot be read are left out.
 
     Raises:
         TwinError: a Bayer pattern is given, but an image of the sample has colours already.
@@ -157,11 +134,7 @@ def _contents(file: Path) -> bytes:
 
 
 def _header(data: bytes) -> tuple[int, int, str]:
-    """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it.
-
-    Raises:
-        UnreadableImage: the data are not a PNG, JPEG or TIFF image, or the image is too large.
-    """
+    """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on damaged metadata, which are not used
@@ -174,11 +147,7 @@ def _header(data: bytes) -> tuple[int, int, str]:
 
 
 def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of an image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
-
-    Raises:
-        UnreadableImage: the image cannot be used, or its size is not `size_px`.
-    """
+    """Returns the values of an image (`StoredImage.pixels`)."""
     pixels = decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
     if pixels.shape[1::-1] != size_px:
         raise UnreadableImage("another size")
@@ -186,14 +155,7 @@ def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
 
 
 def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of the contents of a PNG, JPEG or TIFF file.
-
-    Args:
-        data: contents of the file.
-        size_px: (width, height) that the image must have.
-
-    Returns:
-        (H, W) or (H, W, channels) in the order BGR or BGRA, uint8 or uint16.
+    """Returns the values of the contents of a PNG, JPEG or TIFF file (`StoredImage.pixels`).
 
     Raises:
         UnreadableImage: the data are damaged, not a PNG, JPEG or TIFF image, or not grey or RGB with 8 or 16 bits, or

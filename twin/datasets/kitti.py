@@ -1,4 +1,4 @@
-"""Reader of KITTI odometry folders (Geiger et al. 2012): rectified images, calib.txt, times.txt, poses."""
+"""KITTI odometry folders (Geiger et al. 2012), read and written: rectified images, calib.txt, times.txt, true poses."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Trajectory
+from twin.core.records import StereoRig, Trajectory
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.dataset import Dataset, StereoImages, value_or_error
+from twin.datasets.image_copy import copy_image
 from twin.datasets.plain_folder import image_files
+from twin.datasets.run_contents import RunContents
 from twin.datasets.text_files import read_table, text_rows
 from twin.errors import TwinError
+
+_SEQUENCE = "00"  # of an exported run
 
 
 class KittiReader:
@@ -42,9 +46,7 @@ class KittiReader:
         if not all(name.isdecimal() and int(name) < len(times_s) for name in names):
             problem = f"has {len(times_s)} times, but an image is called {names[-1][:40]}"
             raise TwinError(str(folder / "times.txt"), problem, "images that are numbered from 000000, one time each")
-        frames = [
-            StereoImages(float(times_s[int(name)]), left[name], right.get(name)) for name in names if name in left
-        ]
+        frames = [StereoImages(float(times_s[int(name)]), left[name], right.get(name)) for name in sorted(left)]
         file = folder.parent.parent / "poses" / f"{folder.name}.txt"
         truth, notes = None, ()
         if file.is_file() and body_from_left is not None:
@@ -80,10 +82,7 @@ def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Tr
 def _calibration(file: Path, number: int) -> tuple[StereoCalibration, Array]:
     """Returns the calibration of the cameras `number` and `number` + 1, and the pose (4, 4) of the first in camera 0.
 
-    Both follow from the projection matrices (3, 4) of the cameras.
-
-    Raises:
-        TwinError: the file cannot be read or has no such matrices, or their values are impossible.
+    Both follow from the projection matrices (3, 4) of the cameras; raises TwinError if these are missing or impossible.
     """
     projections = {parts[0].rstrip(":"): parts[1:13] for _, parts in text_rows(file) if len(parts) >= 13}
     try:
@@ -98,3 +97,41 @@ def _calibration(file: Path, number: int) -> tuple[StereoCalibration, Array]:
     right_from_left = geometry.pose(np.eye(3), in_right - in_left)
     calibration = checked(StereoCalibration(left_camera, right_camera, right_from_left, file))
     return calibration, geometry.pose(np.eye(3), -in_left)
+
+
+def export(contents: RunContents, folder: Path) -> list[Path]:
+    """Writes the stereo pairs as `sequences/00` and, if the truth is known, its true poses as `poses/00.txt`.
+
+    Images are in `image_2` (left) and `image_3` (right), numbered from 000000, the times [s] in `times.txt`. As in the
+    benchmark, poses of the left camera are relative to the first one, in its axes (x right, y down, z forward).
+
+    Returns:
+        The folder of the sequence and, if written, the file of the poses.
+    """
+    sequence = folder / "sequences" / _SEQUENCE
+    pairs = contents.pairs
+    for name in ("image_2", "image_3"):
+        (sequence / name).mkdir(parents=True, exist_ok=True)
+    for k, frame in enumerate(pairs):
+        assert frame.right is not None
+        copy_image(frame.left, sequence / "image_2" / f"{k:06d}", contents.jpeg_quality)
+        copy_image(frame.right, sequence / "image_3" / f"{k:06d}", contents.jpeg_quality)
+        contents.progress((k + 1) / len(pairs))
+    (sequence / "times.txt").write_text("".join(f"{frame.time_s:.9f}\n" for frame in pairs), encoding="utf-8")
+    (sequence / "calib.txt").write_text(_calibration_text(contents.rig), encoding="utf-8")
+    if "truth" not in contents.trajectories:
+        return [sequence]
+    poses = contents.trajectories["truth"].world_from_camera[[frame.index for frame in pairs]]
+    file = folder / "poses" / f"{_SEQUENCE}.txt"
+    file.parent.mkdir(parents=True, exist_ok=True)
+    relative = geometry.inverse(poses[0]) @ poses
+    np.savetxt(file, relative[:, :3].reshape(-1, 12), fmt="%.12e")
+    return [sequence, file]
+
+
+def _calibration_text(rig: StereoRig) -> str:
+    """Returns the text of calib.txt: P0 and P2 are the projection matrix of the left camera, P1 and P3 of the right."""
+    left = np.column_stack([rig.matrix, np.zeros(3)])
+    right = np.column_stack([rig.matrix, [-rig.fx_px * rig.baseline_m, 0.0, 0.0]])
+    rows = [left, right, left, right]
+    return "".join(f"P{k}: " + " ".join(f"{value:.12e}" for value in p.ravel()) + "\n" for k, p in enumerate(rows))

@@ -19,10 +19,7 @@ _ASSUMED_HZ = 1.0
 
 
 class PlainFolderReader:
-    """Reads left/ and right/ with images of equal names.
-
-    Times are those in times.txt or in the names of the images; without both, 1 frame per second is assumed.
-    """
+    """Reads left/ and right/ with images of equal names."""
 
     name = "folder"
     layout = "left/ and right/ with images of equal names, and a calibration (OpenCV, Kalibr, ROS, ORB-SLAM3, COLMAP)"
@@ -53,11 +50,6 @@ class PlainFolderReader:
 
 
 def _calibration(folder: Path) -> StereoCalibration | None:
-    """Returns the calibration in a folder; None if the folder has no calibration file.
-
-    Raises:
-        TwinError: the calibration file is damaged, or there are several (`find_calibration`).
-    """
     file = find_calibration(folder)
     return None if file is None else read_calibration(file)
 
@@ -92,20 +84,13 @@ def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
 
     The times are those in times.txt, otherwise those in the names: seconds with a decimal point, or an integer number
     of milliseconds, microseconds or nanoseconds since 1970 (`_UNITS`). Without both, 1 frame per second is assumed.
-
-    Args:
-        file: times.txt, one time [s] per line, in the order of `names`.
-        names: names of the images without suffix.
-
-    Raises:
-        TwinError: times.txt is damaged or does not have one time per image.
     """
     if file.exists():
         times_s = read_table(file, 1)[:, 0].tolist()
         if len(times_s) != len(names):
             raise TwinError(str(file), f"has {len(times_s)} times", f"{len(names)}, one per image")
         return times_s, ()
-    if all(re.fullmatch(r"\d{9,10}\.\d+|\d+\.\d+", name) for name in names):
+    if all(re.fullmatch(r"\d+\.\d+", name) for name in names):
         return [float(name) for name in names], ()
     lengths = {len(name) for name in names if name.isdecimal()}
     if len(lengths) == 1 and all(name.isdecimal() for name in names) and (unit := _UNITS.get(*lengths)):

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from twin.core.user_files import path_problem
-from twin.datasets.bag_reader import BagReader, BagTopics
 from twin.datasets.dataset import Dataset, Reader, check_times
 from twin.datasets.euroc import EurocReader
 from twin.datasets.kitti import KittiReader
 from twin.datasets.plain_folder import PlainFolderReader
+from twin.datasets.ros2.bag_reader import BagReader, BagTopics
 from twin.errors import TwinError
 from twin.plugin import loading
 
@@ -19,21 +19,14 @@ from twin.plugin import loading
 def all_readers(topics: BagTopics | None = None) -> list[Reader]:
     """Returns the readers that other packages register, then those of this package.
 
-    Args:
-        topics: topics of a ROS 2 bag that the user names.
-
     Raises:
         TwinError: a registered reader cannot be imported or created, or lacks a member of `Reader`.
     """
-    return [*_registered(), BagReader(topics), EurocReader(), KittiReader(), PlainFolderReader()]
+    registered = [_registered(plugin) for plugin in loading.registered(loading.READERS)]
+    return [*registered, BagReader(topics), EurocReader(), KittiReader(), PlainFolderReader()]
 
 
-def _registered() -> list[Reader]:
-    """Returns the readers that other packages register; raises TwinError if one cannot be imported or created."""
-    return [_created(plugin) for plugin in loading.registered(loading.READERS)]
-
-
-def _created(plugin: loading.Registered) -> Reader:
+def _registered(plugin: loading.Registered) -> Reader:
     """Returns a reader of another package; raises TwinError if its class fails or it lacks a member of `Reader`."""
     return loading.attempt(
         f"{loading.READERS} {plugin.name}", plugin.target, lambda: _ForeignReader(plugin.create(), plugin.target)
@@ -41,15 +34,7 @@ def _created(plugin: loading.Registered) -> Reader:
 
 
 class _ForeignReader:
-    """Reader of another package; every exception that it raises becomes a TwinError that names the reader.
-
-    Args:
-        reader: the reader.
-        value: module and class of the reader ("module:Class"), for messages.
-
-    Raises:
-        AttributeError: the reader has no name, layout, recognises or read.
-    """
+    """Reader of another package; every exception that it raises becomes a TwinError that names it by `value`."""
 
     def __init__(self, reader: Reader, value: str):
         self.name, self.layout, self._value = str(reader.name), str(reader.layout), value
@@ -68,7 +53,6 @@ class _ForeignReader:
         return found
 
     def _call(self, function: Callable[[Path], Any], folder: Path) -> Any:
-        """Returns the result of a function of the reader; any exception in the function becomes a TwinError."""
         try:
             return function(folder)
         except TwinError:
@@ -79,11 +63,7 @@ class _ForeignReader:
 
 
 def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset, str]:
-    """Returns the data set in a folder or file, and the name of its reader.
-
-    Args:
-        folder: folder of the data set, or its file (a bag).
-        topics: topics of a ROS 2 bag that the user names.
+    """Returns the data set in a folder or file (a bag), and the name of its reader.
 
     Raises:
         TwinError: the folder does not exist, is empty, or has no known layout or no images of the left camera; a file

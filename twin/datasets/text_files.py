@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,7 +27,6 @@ class _CalibrationLoader(yaml.SafeLoader):
     """Loader of YAML without code, which also reads the matrices that OpenCV writes."""
 
     def construct_document(self, node: yaml.Node) -> Any:
-        """Returns the contents of a document; raises YAMLError if its aliases expand to too many values."""
         if _n_values(node, {}) > _MOST_VALUES:
             raise yaml.YAMLError(f"it has more than {_MOST_VALUES} values, or a value that contains itself")
         return super().construct_document(node)
@@ -37,9 +35,7 @@ class _CalibrationLoader(yaml.SafeLoader):
 def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
     """Returns the number of values in a node, aliases expanded; infinite for a node that contains itself.
 
-    Args:
-        node: the node.
-        known: number of values in each node that was counted before, by `id` of the node; new counts are added.
+    `known` has the number of values in each node that was counted before, by `id` of the node.
     """
     if id(node) not in known:
         known[id(node)] = math.inf  # while its children are counted
@@ -50,32 +46,28 @@ def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
 
 
 def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows.
-
-    Raises:
-        YAMLError: the matrix is empty or has more than 64 values, or their number is not rows times columns.
-    """
-    if not isinstance(node, yaml.MappingNode):
-        raise yaml.YAMLError("a matrix without rows, cols and data")
-    matrix = loader.construct_mapping(node, deep=True)
-    data, rows, cols = matrix["data"], int(matrix["rows"]), int(matrix["cols"])
-    if not 0 < rows * cols <= _MOST_ELEMENTS or len(data) != rows * cols:
+    """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows."""
+    data, matrix = _opencv_data(loader, node)
+    rows, cols = int(matrix["rows"]), int(matrix["cols"])
+    if len(data) != rows * cols:
         raise yaml.YAMLError(f"a matrix of {rows} rows and {cols} columns has {len(data)} numbers")
     return [data[k * cols : (k + 1) * cols] for k in range(rows)]
 
 
 def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list.
+    """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list."""
+    return _opencv_data(loader, node)[0]
 
-    Raises:
-        YAMLError: the array is empty or has more than 64 values.
-    """
+
+def _opencv_data(loader: yaml.SafeLoader, node: yaml.Node) -> tuple[list[Any], dict[Any, Any]]:
+    """Returns the numbers of a matrix or an array, and all its values."""
     if not isinstance(node, yaml.MappingNode):
-        raise yaml.YAMLError("an array without sizes and data")
-    array = loader.construct_mapping(node, deep=True)
-    if not 0 < len(array["data"]) <= _MOST_ELEMENTS:
-        raise yaml.YAMLError(f"an array has {len(array['data'])} numbers")
-    return list(array["data"])
+        raise yaml.YAMLError("a matrix without data")
+    values = loader.construct_mapping(node, deep=True)
+    data = list(values["data"])
+    if not 0 < len(data) <= _MOST_ELEMENTS:
+        raise yaml.YAMLError(f"a matrix has {len(data)} numbers")
+    return data, values
 
 
 for _tag in ("tag:yaml.org,2002:opencv-", "!opencv-"):
@@ -84,11 +76,7 @@ for _tag in ("tag:yaml.org,2002:opencv-", "!opencv-"):
 
 
 def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
-    """Returns the contents of a text file.
-
-    Raises:
-        TwinError: the file is missing, is larger than `most_bytes`, or is not text.
-    """
+    """Returns the contents of a text file; raises TwinError if it is missing, too large or not text."""
     return user_files.read_text(file, "", "a text file", most_bytes)
 
 
@@ -108,53 +96,31 @@ def read_yaml(file: Path) -> dict[str, Any]:
     return tree
 
 
-def read_table(file: Path, columns: int, convert: Callable[[list[str]], list[float]] | None = None) -> Array:
-    """Returns the numbers (n, columns) of a text file; columns are separated by commas or white space.
-
-    Lines that are empty or begin with # are ignored; further columns are ignored as well.
-
-    Args:
-        file: the file.
-        columns: number of columns to read.
-        convert: function that converts the texts of one line to `columns` numbers; by default, float.
-
-    Raises:
-        TwinError: the file cannot be read, or a line has too few columns or a value that is not a finite number.
-    """
-    return read_numbered_table(file, columns, columns, convert).values
-
-
 class NumberedTable(NamedTuple):
-    """Numbers of a text file with their line numbers.
-
-    Args:
-        lines: (n,) line number of each row of `values`, from 1.
-        values: (n, columns) numbers.
-    """
+    """Numbers (n, columns) of a text file, with the line (n,), from 1, of each row."""
 
     lines: NDArray[np.int64]
     values: Array
 
 
-def read_numbered_table(
-    file: Path, columns: int, n_finite: int, convert: Callable[[list[str]], list[float]] | None = None
-) -> NumberedTable:
-    """Returns the numbers of a text file with their line numbers; the format of the file is that of `read_table`.
+def read_table(file: Path, columns: int) -> Array:
+    """Returns the finite numbers (n, columns) of a text file (`read_numbered_table`)."""
+    return read_numbered_table(file, columns, columns).values
 
-    Args:
-        file: the file.
-        columns: number of columns to read.
-        n_finite: number of columns, from the first one on, whose values must be finite.
-        convert: function that converts the texts of one line to `columns` numbers; by default, float.
+
+def read_numbered_table(file: Path, columns: int, n_finite: int) -> NumberedTable:
+    """Returns the first columns of a text file as numbers; a text that is empty is NaN.
+
+    Lines that are empty or begin with # are ignored.
 
     Raises:
-        TwinError: the file cannot be read, a line has too few columns, or one of its values is not a number or, in the
-            first `n_finite` columns, not finite.
+        TwinError: the file cannot be read, a line has too few columns, or a value is not a number or, in the first
+            `n_finite` columns, not finite.
     """
     lines, rows = [], []
     for number, parts in text_rows(file):
         try:
-            values = [float(part) for part in parts[:columns]] if convert is None else convert(parts)
+            values = [float(part) if part.strip() else np.nan for part in parts[:columns]]
         except ValueError:
             values = []
         if len(values) != columns or not np.isfinite(values[:n_finite]).all():
@@ -165,7 +131,7 @@ def read_numbered_table(
 
 
 def text_rows(file: Path) -> list[tuple[int, list[str]]]:
-    """Returns the line number and the columns of each line of a text file, without blank lines and comments (#).
+    """Returns line number and columns of each line of a text file, without blank lines and comments (#).
 
     Columns are separated by commas or white space.
 
@@ -184,15 +150,11 @@ def text_rows(file: Path) -> list[tuple[int, list[str]]]:
 
 
 def inside(folder: Path, name: str, source: Path) -> Path:
-    """Returns the path of a file in `folder`, given its name in a data set; the file need not exist.
-
-    Args:
-        folder: the folder; a symbolic link that leads out of it is rejected as well.
-        name: name of the file relative to `folder`.
-        source: file or folder that contains the name, for the message.
+    """Returns the path of a file in a folder, given its name in a data set; the file need not exist.
 
     Raises:
-        TwinError: the path leads out of the folder, or the name contains a null byte.
+        TwinError: the path leads out of the folder, also by a link, or the name contains a null byte; the message names
+            `source`, the file or folder that contains the name.
     """
     base = resolved(folder)
     if "\0" not in name and name == Path(name).name != ".." and not (base / name).is_symlink():

@@ -1,4 +1,4 @@
-"""Files of the truth: poses as EuRoC/ASL (body), KITTI (camera 0) or TUM (left camera), heights as GeoTIFF."""
+"""Files of the truth that a user names: poses as EuRoC/ASL (body), KITTI (camera 0) or TUM (left camera), heights."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.core import geometry
 from twin.core.raster_files import open_raster
 from twin.core.records import Trajectory
+from twin.datasets import tum
 from twin.datasets.dataset import Dataset
 from twin.datasets.euroc import camera_truth
 from twin.datasets.kitti import camera_poses
-from twin.datasets.text_files import read_table, text_rows
+from twin.datasets.text_files import text_rows
 from twin.errors import TwinError
+from twin.exchange.geotiff import MOST_CELLS, read_raster
 from twin.judge.true_map import TrueMap
-from twin.report.run_folder import MOST_CELLS, read_raster
 
 _ALLOWED = "TUM (8 columns), KITTI (12 columns) or EuRoC (timestamp in ns and 7 or more columns, by commas)"
 _HEIGHT_GRID = "a GeoTIFF of one band with heights [m], north up, in the frame of the true poses"
@@ -41,12 +41,9 @@ def read_true_map(file: Path) -> TrueMap:
 def read_truth(file: Path, dataset: Dataset) -> Trajectory:
     """Returns the true poses of the left camera, in the clock of the data set.
 
-    Args:
-        file: EuRoC/ASL data.csv (poses of the body), KITTI poses (of camera 0, one line per frame), or TUM (poses of
-            the left camera: time x y z qx qy qz qw).
-        dataset: data set, for the times of a KITTI file (those of all frames, with or without a left image) and for the
-            pose of the left camera in the body or in camera 0. If this pose is unknown, the left camera is assumed to
-            coincide with the body or with camera 0.
+    The file is EuRoC/ASL data.csv (poses of the body), KITTI poses (of camera 0, one line per frame, with or without a
+    left image), or TUM (poses of the left camera). If the pose of the left camera in the body or in camera 0 is
+    unknown, both are assumed to coincide.
 
     Raises:
         TwinError: the file cannot be read, is damaged, or is of none of these kinds.
@@ -63,19 +60,5 @@ def read_truth(file: Path, dataset: Dataset) -> Trajectory:
     if columns >= 8 and first.isdecimal() and len(first) >= 16:
         return camera_truth(file, np.eye(4) if dataset.body_from_left is None else dataset.body_from_left)
     if columns == 8:
-        return _tum(file)
+        return tum.read_trajectory(file)
     raise TwinError(str(file), f"has {columns} columns", _ALLOWED)
-
-
-def _tum(file: Path) -> Trajectory:
-    """Returns the poses in a TUM trajectory file.
-
-    Raises:
-        TwinError: the file cannot be read, or a quaternion is not of unit length.
-    """
-    values = read_table(file, 8)
-    if not (np.abs(np.linalg.norm(values[:, 4:], axis=1) - 1) < 0.01).all():
-        raise TwinError(str(file), "has quaternions that are not of unit length", "time x y z qx qy qz qw")
-    poses = np.tile(np.eye(4), (len(values), 1, 1))
-    poses[:, :3, :3], poses[:, :3, 3] = geometry.rotation_from_wxyz(values[:, [7, 4, 5, 6]]), values[:, 1:4]
-    return Trajectory(values[:, 0], poses)

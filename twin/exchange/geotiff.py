@@ -8,13 +8,13 @@ positive upwards. Tags then hold the scene origin, from which `scene_placement` 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
 from rasterio.crs import CRS
-from rasterio.enums import ColorInterp
+from rasterio.enums import ColorInterp, Resampling
 from rasterio.transform import Affine
 from rasterio.warp import transform
 
@@ -30,14 +30,24 @@ Layer = NDArray[np.float32]
 LOCAL_METRES = CRS.from_wkt(
     'LOCAL_CS["local metres",UNIT["metre",1,AUTHORITY["EPSG","9001"]],AXIS["Easting",EAST],AXIS["Northing",NORTH]]'
 )
-
+MOST_CELLS = 100_000_000  #: of a map that is read as a whole
+MAX_MOSAIC_PX = 16_000_000  #: of an orthomosaic that is read reduced
 
 _ORIGIN_TAGS = ("SCENE_ORIGIN_EASTING", "SCENE_ORIGIN_NORTHING", "SCENE_ORIGIN_ELEVATION_M")
 _UNIT_TAG = "SCENE_METRES_PER_UNIT"
+_DATUM_TAG = "VERTICAL_DATUM"
 _UNKNOWN_DATUM = "same as the source DEM"  # tag of a vertical datum that the source does not name
 _ELEVATION_TAG = {"QUANTITY": "elevation"}  # tag of bands whose values include the elevation of the scene origin
 _LARGEST_COORDINATE = 1e8  # largest coordinate of the origin of a scene, in the unit of its CRS
 _DECIMALS = 6  # decimals of scene coordinates [m]; CRS coordinates have up to seven digits before the decimal point
+_LEAST_CELLS = 10_000_000  # of a map that may be larger than its file
+
+
+class Raster(NamedTuple):
+    """A raster in scene coordinates: its cells, and values (rows, cols) with NaN for no data or (rows, cols, 3) RGB."""
+
+    grid: MapGrid
+    values: NDArray[Any]
 
 
 def write_map(
@@ -54,36 +64,33 @@ def write_map(
 def write_elevations(
     path: Path, height_m: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
-    """Writes the heights (rows, cols) [m] of map cells, as float32 without a georeference.
+    """Writes heights (rows, cols) [m] above z = 0, NaN where unknown: as float32, or as elevations in the datum.
 
-    With a georeference, elevations in its vertical datum are written as float64, because float32 would round the
-    elevations of a site deeper than about 1 km to steps of 0.1 mm or more.
-
-    Args:
-        path: file to write.
-        height_m: heights above the plane z = 0; NaN where unknown.
-        grid: cells of the map.
-        description: description of the band.
-        georeference: position of the scene in the CRS; None: scene coordinates.
+    Elevations are float64, because float32 would round those of a site deeper than about 1 km to steps of 0.1 mm.
     """
     if georeference is None:
         return write_layer(path, height_m, grid, description)
     elevations = height_m.astype(np.float64) + georeference.elevation_m
-    with rasterio.open(path, "w", **profile(grid, 1, "float64", georeference), nodata=np.nan, predictor=3) as file:
-        file.write(elevations, 1)
-        file.set_band_description(1, description)
-        file.update_tags(**placement_tags(georeference))
-        file.update_tags(1, **_ELEVATION_TAG)
+    _write_band(path, elevations, grid, description, georeference, **_ELEVATION_TAG)
 
 
 def write_layer(
     path: Path, values: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
     """Writes one layer (rows, cols) as float32; the nodata value is NaN."""
-    with rasterio.open(path, "w", **profile(grid, 1, "float32", georeference), nodata=np.nan, predictor=3) as file:
-        file.write(values.astype(np.float32), 1)
+    _write_band(path, values.astype(np.float32), grid, description, georeference)
+
+
+def _write_band(
+    path: Path, values: NDArray[Any], grid: MapGrid, description: str, georeference: Georeference | None, **tags: str
+) -> None:
+    layout = profile(grid, 1, str(values.dtype), georeference)
+    with rasterio.open(path, "w", **layout, nodata=np.nan, predictor=3) as file:
+        file.write(values, 1)
         file.set_band_description(1, description)
         file.update_tags(**placement_tags(georeference))
+        if tags:
+            file.update_tags(1, **tags)
 
 
 def write_masks(
@@ -108,12 +115,7 @@ def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georefe
 class OrthomosaicFile:
     """GeoTIFF of an orthomosaic, written tile by tile: R, G, B and alpha, in the CRS of the map files.
 
-    Use as a context manager. If an exception leaves the context, the incomplete file is removed.
-
-    Args:
-        path: path of the file.
-        grid: pixels of the orthomosaic.
-        georeference: position of the scene in the CRS; None: scene coordinates.
+    A context manager; if an exception leaves it, the incomplete file is removed.
     """
 
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
@@ -147,17 +149,27 @@ def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
     Raises:
         ValueError: the raster is rotated, its cells are not square, or its tags are damaged.
     """
-    t, tags = source.transform, source.tags()
+    t = source.transform
     if t.b or t.d or t.a <= 0 or not np.isclose(t.a, -t.e, rtol=1e-6):
         raise ValueError("the raster is rotated or its cells are not square")
-    if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
+    origin = _origin(source)
+    if origin is None:
         return MapGrid(t.c, t.f, t.a, source.height, source.width), 0.0
-    easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
-    origin = Georeference(easting, northing, elevation_m, metres_per_unit=float(tags[_UNIT_TAG]))
     west, north = (round(float(value), _DECIMALS) for value in origin.to_scene(t.c, t.f))
     cell_m = round(t.a * origin.metres_per_unit, 2 * _DECIMALS)
     elevations = _ELEVATION_TAG.items() <= source.tags(1).items()
     return MapGrid(west, north, cell_m, source.height, source.width), origin.elevation_m if elevations else 0.0
+
+
+def _origin(source: rasterio.DatasetReader) -> Georeference | None:
+    """Returns the position of the scene by the tags of an open raster; None without them."""
+    tags, crs = source.tags(), source.crs
+    if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
+        return None
+    easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
+    unit_m, datum = float(tags[_UNIT_TAG]), tags.get(_DATUM_TAG, _UNKNOWN_DATUM)
+    datum = "" if datum == _UNKNOWN_DATUM else datum
+    return Georeference(easting, northing, elevation_m, None if crs is None else crs.to_wkt(), unit_m, datum)
 
 
 def read_georeference(path: Path) -> Georeference | None:
@@ -167,21 +179,54 @@ def read_georeference(path: Path) -> Georeference | None:
         TwinError: the file cannot be read, or its tags are damaged.
     """
     with open_raster(path, "", "a map file, written by `twin run`") as source:
-        tags, crs = source.tags(), source.crs
-        if any(name not in tags for name in (*_ORIGIN_TAGS, _UNIT_TAG)):
-            return None
-        easting, northing, elevation_m = (float(tags[name]) for name in _ORIGIN_TAGS)
-        unit_m, datum = float(tags[_UNIT_TAG]), tags.get("VERTICAL_DATUM", _UNKNOWN_DATUM)
-    datum = "" if datum == _UNKNOWN_DATUM else datum
-    return Georeference(easting, northing, elevation_m, None if crs is None else crs.to_wkt(), unit_m, datum)
+        return _origin(source)
+
+
+def read_raster(file: Path) -> Raster:
+    """Reads a GeoTIFF as a raster in scene coordinates; row 0 is the northernmost.
+
+    In a raster with one band, cells without data become NaN, and elevations in a vertical datum become heights in the
+    scene.
+
+    Raises:
+        TwinError: the file is not a readable GeoTIFF or has more than MOST_CELLS cells, the raster is rotated, its
+            cells are not square, or its tags are damaged.
+    """
+    with open_raster(file) as source:
+        n_cells, n_bytes = source.width * source.height, file.stat().st_size
+        if n_cells > min(MOST_CELLS, _LEAST_CELLS + 1000 * n_bytes):  # DEFLATE compresses to a thousandth at most
+            raise ValueError(f"{source.width} x {source.height} cells in {n_bytes} bytes, at most {MOST_CELLS}")
+        grid, elevation_m = scene_placement(source)
+        bands = source.read(masked=source.count == 1)
+    if len(bands) == 1:
+        return Raster(grid, bands[0].astype(float).filled(np.nan) - elevation_m)
+    return Raster(grid, np.moveaxis(bands[:3], 0, 2))
+
+
+def read_mosaic(file: Path, most_side_px: int | None = None) -> Raster:
+    """Reads the RGB values of an orthomosaic, averaged to at most `MAX_MOSAIC_PX` pixels, or `most_side_px` per side.
+
+    Rows and columns at the south and east edges that do not fill a reduced pixel are left out.
+
+    Raises:
+        TwinError: see `read_raster`.
+    """
+    with open_raster(file) as source:
+        grid, _ = scene_placement(source)
+        width, height = source.width, source.height
+        excess = max(width, height) / most_side_px if most_side_px else np.sqrt(width * height / MAX_MOSAIC_PX)
+        step = int(np.ceil(excess))
+        rows, cols = max(1, height // step), max(1, width // step)
+        whole = (0, min(rows * step, height)), (0, min(cols * step, width))
+        bands = source.read((1, 2, 3), window=whole, out_shape=(3, rows, cols), resampling=Resampling.average)
+    cells = MapGrid(grid.west_m, grid.north_m, grid.cell_m * step, rows, cols)
+    return Raster(cells, np.moveaxis(bands, 0, 2))
 
 
 def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeference:
-    """Returns the georeference of a scene, given the coordinates of its origin in a projected CRS.
+    """Returns the georeference of a scene whose origin is at (easting, northing, elevation [m]) in a projected CRS.
 
-    Args:
-        crs: projected CRS as `EPSG:CODE`, WKT or PROJ text; its unit may be the metre or another unit of length.
-        origin: easting and northing of the scene origin in the unit of the CRS, and its elevation [m].
+    `crs` is `EPSG:CODE`, WKT or PROJ text; its unit may be the metre or another unit of length.
 
     Raises:
         TwinError: the CRS is unknown or not projected, or the origin is outside the area in which it is defined.
@@ -213,10 +258,7 @@ def crs_of(georeference: Georeference | None) -> CRS:
 
 
 def profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
-    """Returns the rasterio profile of a GeoTIFF file with `bands` bands of type `dtype` on a grid.
-
-    Without a georeference, the file is in scene coordinates (`LOCAL_METRES`).
-    """
+    """Returns the rasterio profile of a GeoTIFF file on a grid."""
     origin = georeference or Georeference(0.0, 0.0)
     west, north = (float(value) for value in origin.from_scene(grid.west_m, grid.north_m))
     cell = grid.cell_m / origin.metres_per_unit
@@ -239,4 +281,4 @@ def placement_tags(georeference: Georeference | None) -> dict[str, str]:
     origin = (georeference.easting, georeference.northing, georeference.elevation_m)
     tags = {name: repr(value) for name, value in zip(_ORIGIN_TAGS, origin, strict=True)}
     datum = georeference.vertical_datum or _UNKNOWN_DATUM
-    return tags | {_UNIT_TAG: repr(georeference.metres_per_unit), "VERTICAL_DATUM": datum}
+    return tags | {_UNIT_TAG: repr(georeference.metres_per_unit), _DATUM_TAG: datum}

@@ -1,13 +1,16 @@
-"""The elevation map as a coloured triangle mesh in GLB (binary glTF)."""
+"""The elevation map as a triangle mesh, with the colours of its cells as GLB (binary glTF)."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 from trimesh.exchange.gltf import export_glb
 
+from twin.core.geometry import Array
 from twin.core.height_field import raster_triangles
 from twin.core.records import ElevationMap
 
@@ -17,19 +20,16 @@ GLB_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 MAX_VERTICES = 400_000
 
 
-def write_glb(path: Path, elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> None:
-    """Writes the mesh of a map (`map_mesh`) as GLB; a mesh without triangles is written as an empty scene."""
-    mesh = map_mesh(elevation_map, max_vertices)
-    scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
-    path.write_bytes(export_glb(scene))
+class MapSurface(NamedTuple):
+    """Triangles that connect the centres of mapped cells; those of no triangle are left out."""
+
+    points: Array  #: (n, 3) vertices in the frame of the map [m]
+    faces: NDArray[np.int64]  #: (m, 3) vertices of the triangles, which face up in the frame of the map
+    colours: NDArray[np.uint8]  #: (n, 3) RGB of the cells
 
 
-def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
-    """Returns the triangle mesh of a map with its colours, in scene coordinates in glTF axes (`GLB_FROM_WORLD`).
-
-    Vertices are the centres of the mapped cells, subsampled to about `max_vertices`. Triangles connect neighbouring
-    vertices and face up in the frame of the map; cells that belong to no triangle are omitted.
-    """
+def surface(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> MapSurface:
+    """Returns the surface of a map, subsampled to about `max_vertices` cells."""
     stride = max(1, int(np.ceil(np.sqrt(elevation_map.height_m.size / max_vertices))))
     x, y = elevation_map.grid.centres()
     height = elevation_map.height_m[::stride, ::stride]
@@ -37,9 +37,23 @@ def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> t
     points = np.stack([east, north, height], axis=-1).reshape(-1, 3).astype(np.float64)
     colours = elevation_map.mosaic[::stride, ::stride].reshape(-1, 3)
     used, faces = np.unique(raster_triangles(np.isfinite(height)), return_inverse=True)
-    return trimesh.Trimesh(
-        elevation_map.to_world(points[used]) @ GLB_FROM_WORLD.T,
-        faces.reshape(-1, 3),
-        vertex_colors=colours[used],
-        process=False,
-    )
+    return MapSurface(points[used], faces.reshape(-1, 3), colours[used])
+
+
+def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:
+    """Returns the mesh of a map with its colours, in scene coordinates in glTF axes (`GLB_FROM_WORLD`)."""
+    points, faces, colours = surface(elevation_map, max_vertices)
+    vertices = elevation_map.to_world(points) @ GLB_FROM_WORLD.T
+    return trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+
+
+def write_glb(path: Path, elevation_map: ElevationMap) -> None:
+    """Writes the mesh of a map (`map_mesh`) as GLB."""
+    path.write_bytes(glb(map_mesh(elevation_map)))
+
+
+def glb(mesh: trimesh.Trimesh, **extras: str) -> bytes:
+    """Returns a mesh as GLB with extras of its scene; a mesh without triangles is an empty scene."""
+    scene = trimesh.Scene([mesh] if len(mesh.faces) else [])
+    scene.metadata.update(extras)
+    return export_glb(scene)

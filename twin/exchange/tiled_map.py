@@ -26,23 +26,14 @@ class _Written(NamedTuple):
 class TiledMapFolder:
     """Writer of a map in tiles, in local metres: `dem_ROW_COL.tif` etc. for each tile, and `dem.vrt` etc. for all.
 
-    Args:
-        folder: folder to write; created with the first tile.
+    The folder is created with the first tile.
     """
 
     def __init__(self, folder: Path):
         self.folder, self._tiles = folder, list[_Written]()
 
     def add(self, row: int, col: int, elevation: ElevationMap) -> None:
-        """Writes a tile, if it has a height.
-
-        Args:
-            row, col: numbers of the tile.
-            elevation: its map.
-
-        Raises:
-            OSError: a file cannot be written.
-        """
+        """Writes the map of the tile with these numbers, if it has a height; raises OSError if it cannot."""
         if not np.isfinite(elevation.height_m).any():
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -58,11 +49,7 @@ class TiledMapFolder:
         return len(self._tiles)
 
     def finish(self) -> None:
-        """Writes the virtual rasters of all tiles; without tiles, writes nothing.
-
-        Raises:
-            OSError: a file cannot be written.
-        """
+        """Writes the virtual rasters of all tiles; raises OSError if it cannot. Without tiles, writes nothing."""
         for layer, bands in LAYERS.items():
             if self._tiles:
                 (self.folder / f"{layer}.vrt").write_text(_virtual_raster(layer, bands, self._tiles), encoding="utf-8")

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
-from twin.exchange.run_contents import CameraIntrinsics, RigCalibration, project
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix
 from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
@@ -16,13 +16,13 @@ _N_COLUMNS = 13  # columns, and rows, of the grid of pixels for the fit
 _RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as multiples of the planned altitude
 
 
-def believed_calibration(rig: StereoRig) -> RigCalibration:
+def believed_calibration(rig: StereoRig) -> StereoCalibration:
     """Returns the believed calibration of rectified images: two equal pinhole cameras without distortion."""
-    camera = CameraIntrinsics((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
-    return RigCalibration(camera, camera, rig.left_from_right, rig.body_from_camera)
+    camera = RecordedCamera((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
+    return StereoCalibration(camera, camera, geometry.inverse(rig.left_from_right))
 
 
-def true_calibration(scenario: Scenario) -> RigCalibration:
+def true_calibration(scenario: Scenario) -> StereoCalibration:
     """Returns the true calibration of the delivered images, which are rectified with the believed calibration.
 
     The true pixel of a point is computed by `TrueCameras.project`, which models port, lens and rectification. Camera
@@ -36,16 +36,16 @@ def true_calibration(scenario: Scenario) -> RigCalibration:
     """
     cameras = make_true_cameras(scenario)
     rig = scenario.believed_rig()
-    left_from_right = cameras.rendered_rig.left_from_right
+    rendered_from_left = geometry.inverse(cameras.rendered_rig.left_from_right)
     if cameras.sampling is None:
-        exact = believed_calibration(rig)
-        return exact._replace(left_from_right=left_from_right)
+        camera = believed_calibration(rig).left
+        return StereoCalibration(camera, camera, rendered_from_left)
     points_m = _points(rig, scenario.plan.altitude_m)
     left, _, left_px = _fitted(cameras, 0, points_m, rig)
-    right, rotation, right_px = _fitted(cameras, 1, points_m, rig)
+    right, right_from_rendered, right_px = _fitted(cameras, 1, points_m, rig)
     residual_px = float(np.sqrt(np.mean(np.concatenate([left_px, right_px]) ** 2) * 2))
-    pose = left_from_right @ geometry.inverse(geometry.pose(rotation, np.zeros(3)))
-    return RigCalibration(left, right, pose, rig.body_from_camera, residual_px)
+    right_from_left = geometry.pose(right_from_rendered, np.zeros(3)) @ rendered_from_left
+    return StereoCalibration(left, right, right_from_left, residual_px=residual_px)
 
 
 def _points(rig: StereoRig, altitude_m: float) -> Array:
@@ -57,31 +57,28 @@ def _points(rig: StereoRig, altitude_m: float) -> Array:
     return np.concatenate([directions * (share * altitude_m) for share in _RANGES])
 
 
-def _fitted(
-    cameras: TrueCameras, camera: int, points_m: Array, rig: StereoRig
-) -> tuple[CameraIntrinsics, Array, Array]:
+def _fitted(cameras: TrueCameras, side: int, points_m: Array, rig: StereoRig) -> tuple[RecordedCamera, Array, Array]:
     """Returns the model fitted to one camera, its rotation (3, 3) camera_from_rendered, and the residuals (2 n,) [px].
 
     The rotation of the left camera is the identity: its axes are those of the true poses.
 
     Args:
-        cameras: the true cameras.
-        camera: 0 left, 1 right.
+        side: 0 left, 1 right.
         points_m: (n, 3) points in the axes of the rendered camera [m]; those without an image are left out.
         rig: believed calibration; it has the image size and is the start of the fit.
     """
-    seen = cameras.project(points_m, camera)
+    seen = cameras.project(points_m, side)
     known = np.isfinite(seen).all(axis=1)
     points_m, seen = points_m[known], seen[known]
 
-    def residuals(p: Array) -> Array:
-        matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
-        rotation = geometry.so3_exp(p[9:]) if camera else np.eye(3)
-        camera_model = CameraIntrinsics((rig.width_px, rig.height_px), matrix, p[4:9])
-        return (project(points_m @ rotation.T, camera_model) - seen).ravel()
+    def model(p: Array) -> tuple[RecordedCamera, Array]:
+        rotation = geometry.so3_exp(p[9:]) if side else np.eye(3)
+        return RecordedCamera((rig.width_px, rig.height_px), camera_matrix(*p[:4]), p[4:9]), rotation
 
-    start = np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, *np.zeros(5 + 3 * camera)])
-    p = least_squares(residuals, start, x_scale=np.r_[np.full(4, 1.0), np.full(5 + 3 * camera, 1e-3)]).x
-    matrix = np.array([[p[0], 0, p[2]], [0, p[1], p[3]], [0, 0, 1.0]])
-    rotation = geometry.so3_exp(p[9:]) if camera else np.eye(3)
-    return CameraIntrinsics((rig.width_px, rig.height_px), matrix, p[4:9]), rotation, residuals(p)
+    def residuals(p: Array) -> Array:
+        camera, rotation = model(p)
+        return (camera.project(points_m @ rotation.T) - seen).ravel()
+
+    start = np.array([rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, *np.zeros(5 + 3 * side)])
+    p = least_squares(residuals, start, x_scale=np.r_[np.full(4, 1.0), np.full(5 + 3 * side, 1e-3)]).x
+    return *model(p), residuals(p)

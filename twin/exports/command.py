@@ -18,32 +18,26 @@ from twin.app.outputs import new_folder
 from twin.core.georeference import Georeference
 from twin.core.output_folder import sole_writer
 from twin.core.records import ElevationMap, Image
+from twin.datasets.run_contents import POSES, RecordedFrame, RunContents, TrueLayers
 from twin.errors import TwinError
 from twin.exchange import geotiff
-from twin.exchange.formats import FORMATS, check_needs, chosen_formats
-from twin.exchange.run_contents import POSES, RecordedFrame, RunContents, TrueLayers
+from twin.exchange.geotiff import Raster
 from twin.exports.camera_models import believed_calibration, true_calibration
+from twin.exports.formats import FORMATS, check_needs, chosen_formats
 from twin.exports.recorded_frames import missing_files, recorded_frames, recorded_imu
 from twin.report.replay_description import replayed_rig
-from twin.report.run_folder import SCENARIO_FILE, Raster, Run, load_run
+from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 
 
 class ExportOptions(NamedTuple):
-    """Options of an export.
+    """Options of an export."""
 
-    Args:
-        crs: CRS of the exported coordinates, such as EPSG:32633; None: that of the run.
-        origin: easting, northing and elevation of the scene origin as text, E,N or E,N,H; None: that of the run.
-        jpeg_quality: quality of exported images as JPEG, 1 to 100; None: PNG.
-        allow_plugins: run plug-ins that the scenario of the run names as module:Class, for the true layers.
-    """
-
-    crs: str | None = None
-    origin: str | None = None
-    jpeg_quality: int | None = None
-    allow_plugins: bool = False
+    crs: str | None = None  #: CRS of the exported coordinates, such as EPSG:32633; None: that of the run
+    origin: str | None = None  #: scene origin as text, E,N or E,N,H in the CRS; None: that of the run
+    jpeg_quality: int | None = None  #: quality of exported images as JPEG, 1 to 100; None: PNG
+    allow_plugins: bool = False  #: run plug-ins that the scenario of the run names as module:Class, for the true layers
 
 
 def export(
@@ -62,8 +56,6 @@ def export(
     Args:
         folder: the run folder.
         names: names of formats (`formats.chosen_formats`).
-        out: folder of the exported files.
-        options: CRS, origin and compression.
         progress: called with the name of a format and the completed fraction of it, 0 to 1.
         warn: called with each sentence on a file that is missing in the run folder (`RunContents.notes`).
 
@@ -97,14 +89,7 @@ def export(
 def _completed(folder: Path) -> Iterator[Path]:
     """Yields a hidden folder next to `folder`, which is renamed to `folder` at the end, or removed after an exception.
 
-    A hidden folder that a killed export has left is removed first.
-
-    Args:
-        folder: new or empty folder.
-
-    Raises:
-        TwinError: a file has the name of the hidden folder.
-        OSError: a folder cannot be created, removed or renamed.
+    A hidden folder that a killed export has left is removed first; raises TwinError if a file has its name.
     """
     unfinished = folder.with_name(f".{folder.name}.partial")
     if unfinished.is_symlink() or unfinished.is_file():
@@ -133,6 +118,8 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
     Raises:
         TwinError: the folder is not that of a run, a file of it is damaged, or an option is not valid.
     """
+    if options.jpeg_quality is not None and not 1 <= options.jpeg_quality <= 100:
+        raise TwinError("--jpeg", f"{options.jpeg_quality} is not a quality", "1 to 100")
     run = load_run(folder)
     rig = replayed_rig(run.scenario)
     scenario = None if rig is not None else load_scenario(folder / SCENARIO_FILE, allow_plugins=True)
@@ -159,7 +146,7 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
         georeference=_georeference(folder, options),
         true_layers=_true_layers(folder, scenario, frames, options.allow_plugins),
-        jpeg_quality=_quality(options.jpeg_quality),
+        jpeg_quality=options.jpeg_quality,
         notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
     )
 
@@ -180,10 +167,7 @@ def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
 def _true_layers(
     folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...], allow_plugins: bool
 ) -> Callable[[], TrueLayers] | None:
-    """Returns the function that renders the true layers; None without a rendered world or recorded true poses.
-
-    The function prepares the survey, which runs the plug-ins of the scenario.
-    """
+    """Returns the function that renders the true layers; None without a rendered world or recorded true poses."""
     if scenario is None or scenario.imaging.fidelity != "rendered" or not (folder / "frames" / "truth.npz").is_file():
         return None
     from twin.exports import true_layers
@@ -195,19 +179,8 @@ def _true_layers(
     return layers
 
 
-def _quality(quality: int | None) -> int | None:
-    """Returns the JPEG quality; raises TwinError unless it is None or from 1 to 100."""
-    if quality is not None and not 1 <= quality <= 100:
-        raise TwinError("--jpeg", f"{quality} is not a quality", "1 to 100")
-    return quality
-
-
 def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
-    """Returns the georeference given by the options, otherwise that of dem.tif; None if there is neither.
-
-    Raises:
-        TwinError: only one of the options --origin and --crs is given, one of them is not valid, or dem.tif is damaged.
-    """
+    """Returns the georeference given by the options, otherwise that of dem.tif; None if there is neither."""
     if options.origin is None and options.crs is None:
         file = folder / "dem.tif"
         return geotiff.read_georeference(file) if file.is_file() else None

@@ -12,8 +12,8 @@ import numpy as np
 
 from twin.core.records import Array, Exposure, ImuReadings, Readings
 from twin.core.user_files import read_text, reading
+from twin.datasets.run_contents import ImuNoise, RecordedFrame, RecordedImu
 from twin.errors import TwinError
-from twin.exchange.run_contents import ImuNoise, RecordedFrame, RecordedImu
 from twin.report.frame_recorder import EXPOSURE_COLUMNS, IMU_COLUMNS, READING_COLUMNS
 from twin.report.run_folder import SCENARIO_FILE, Run
 from twin.scenario.model import Scenario
@@ -73,41 +73,31 @@ def _check_order(name: str, values: Sequence[float]) -> None:
 
 
 def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
-    """Returns index, time, exposure and readings of a line of frames.csv.
-
-    Raises:
-        ValueError: a column is missing, the line has too few or too many cells, a cell is not a number, or an exposure
-            or a reading is not finite.
-    """
+    """Returns index, time, exposure and readings of a line of frames.csv; raises ValueError if it is damaged."""
     missing = [name for name in ("index", "time_s", *EXPOSURE_COLUMNS, *READING_COLUMNS) if name not in row]
     if missing:
         raise ValueError(f"the column {missing[0]} is missing")
     if None in row or None in row.values():
         raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
-    return int(row["index"]), float(row["time_s"]), _exposure(row), _readings(row)
+    cells = [row[name] for name in READING_COLUMNS]  # neither beacons nor readings of the IMU
+    height, attitude, velocity, position = (_finite(cells[k:n]) for k, n in ((0, 1), (1, 4), (4, 7), (7, 10)))
+    exposure = _finite([row[name] for name in EXPOSURE_COLUMNS])
+    return (
+        int(row["index"]),
+        float(row["time_s"]),
+        None if exposure is None else (float(exposure[0]), float(exposure[1]), float(exposure[2])),
+        Readings(None if height is None else float(height[0]), attitude, velocity, position),
+    )
 
 
-def _exposure(row: dict[str, str]) -> Exposure | None:
-    """Returns the exposure in a line of frames.csv; None if its first cell is empty."""
-    red, green, blue = (row[name] for name in EXPOSURE_COLUMNS)
-    return (_finite(red), _finite(green), _finite(blue)) if red else None
-
-
-def _readings(row: dict[str, str]) -> Readings:
-    """Returns the readings in a line of frames.csv, which contains neither beacons nor readings of the IMU."""
-    cells = [row[name] for name in READING_COLUMNS]
-
-    def vector(first: int) -> Array | None:
-        return np.array([_finite(cell) for cell in cells[first : first + 3]]) if cells[first] else None
-
-    return Readings(_finite(cells[0]) if cells[0] else None, vector(1), vector(4), vector(7))
-
-
-def _finite(cell: str) -> float:
-    """Returns the number in a cell; raises ValueError if the cell is not a finite number."""
-    if not math.isfinite(number := float(cell)):
-        raise ValueError(f"{cell} is not a finite number")
-    return number
+def _finite(cells: list[str]) -> Array | None:
+    """Returns the numbers in cells, None if the first one is empty; raises ValueError if one is not finite."""
+    if not cells[0]:
+        return None
+    for cell in cells:
+        if not math.isfinite(float(cell)):
+            raise ValueError(f"{cell} is not a finite number")
+    return np.array(cells, np.float64)
 
 
 def missing_files(run: Run, scenario: Scenario, frames: Sequence[RecordedFrame]) -> list[str]:
@@ -138,30 +128,19 @@ def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
     if not file.is_file():
         return None
     if scenario.imu is None:
-        raise TwinError(
-            str(file), f"belongs to no sensor: {SCENARIO_FILE} has no section [imu]", "the files of one run"
-        )
+        problem = f"belongs to no sensor: {SCENARIO_FILE} has no section [imu]"
+        raise TwinError(str(file), problem, "the files of one run")
     settings = scenario.imu
-    try:
+    with reading(file, "", "an undamaged file, written by `twin run`"):
         values = _imu_table(file)
-    except (OSError, ValueError) as error:
-        raise TwinError(str(file), f"cannot be read: {error}", "an undamaged file, written by `twin run`") from None
-    noise = ImuNoise(
-        settings.gyroscope_noise_density, settings.gyroscope_random_walk,
-        settings.accelerometer_noise_density, settings.accelerometer_random_walk,
-    )  # fmt: skip
+    noise = ImuNoise(*(getattr(settings, name) for name in ImuNoise._fields))
     readings = ImuReadings(values[:, 0], values[:, 1:4], values[:, 4:])
     rate_hz = settings.rate_hz or motion_rate_hz(scenario)
     return RecordedImu(readings, rate_hz, noise, settings.accelerometer_bias_sigma_mps2)
 
 
 def _imu_table(file: Path) -> Array:
-    """Returns the numbers (n, 7) in imu.csv, in the order of `IMU_COLUMNS`.
-
-    Raises:
-        ValueError: the header is not that of imu.csv, a line has too few or too many cells, a cell is not a finite
-            number, or the times do not increase.
-    """
+    """Returns the numbers (n, 7) in imu.csv, in the order of `IMU_COLUMNS`; raises ValueError if it is damaged."""
     header, *lines = read_text(file).splitlines() or [""]
     if header != ",".join(IMU_COLUMNS):
         raise ValueError(f"its first line is {header[:60]!r}")

@@ -14,8 +14,8 @@ from twin.core import geometry
 from twin.core.records import Array, Image, StereoRig
 from twin.core.timing import Stopwatch
 from twin.core.user_files import MOST_TEXT_BYTES, reading
+from twin.datasets.run_contents import FrameTruth, RecordedFrame, TrueLayers
 from twin.errors import TwinError
-from twin.exchange.run_contents import FrameTruth, RecordedFrame, TrueLayers
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.scene.facets import Heights
 from twin.imaging.stereo_camera import DecomposedImage, StereoCamera
@@ -30,12 +30,7 @@ _LIGHT = {"lamp": "floor_lx", "direct": "direct", "forward": "forward", "veil": 
 
 
 def true_layers(folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, ...]) -> TrueLayers:
-    """Returns the true layers of recorded frames.
-
-    Args:
-        folder: the run folder, with the true poses in frames/truth.npz.
-        scenario: the scenario of the run.
-        frames: the recorded frames.
+    """Returns the true layers of the recorded frames of a run folder, which has the true poses in frames/truth.npz.
 
     Raises:
         TwinError: the file of the true poses is damaged, or the scenario can no longer be prepared. The iterator
@@ -52,10 +47,8 @@ def true_layers(folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, .
 def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
     """Returns the true poses (n, 4, 4) of the left camera and velocities (n, 6) of the body, at frames 0 to n - 1.
 
-    The velocities are [angular, linear] in body axes [rad/s, m/s].
-
-    Raises:
-        TwinError: the file is damaged or lacks the frame with the number `last`.
+    The velocities are [angular, linear] in body axes [rad/s, m/s]. Raises TwinError if the file is damaged or lacks the
+    frame with the number `last`.
     """
     with reading(file, "", "an undamaged file, written by `twin run`"):
         if not is_zipfile(file):
@@ -73,18 +66,9 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
 
 
 def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, twists: Array) -> Iterator[FrameTruth]:
-    """Yields the true layers of the frames in their order.
+    """Yields the true layers of the frames in their order, given poses and velocities at all frames (`_true_motion`).
 
     The layers of a frame are yielded after the next frame has been rendered, because the optical flow needs both.
-
-    Args:
-        mission: the survey as planned.
-        frames: the recorded frames.
-        poses: (n, 4, 4) true poses of the left camera at frames 0 to n - 1.
-        twists: (n, 6) true velocities of the body at these frames [rad/s, m/s].
-
-    Raises:
-        TwinError: a recorded image cannot be read or has the wrong size.
     """
     sways = np.array([False, *(item.model.sways for item in mission.objects)])
     with RenderedWorld(mission, Stopwatch()) as world:
@@ -92,10 +76,7 @@ def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, t
         earlier = None
         for number, frame in enumerate(frames):
             pose, twist = poses[frame.index], twists[frame.index]
-            recorded = _read(frame.left)
-            if recorded.shape[1::-1] != (mission.rig.width_px, mission.rig.height_px):
-                size = f"{mission.rig.width_px} x {mission.rig.height_px} px, the size of the images of the run"
-                raise TwinError(str(frame.left), f"is {recorded.shape[1]} x {recorded.shape[0]} px", size)
+            recorded = _read(frame.left, mission.rig)
             identical = None
             if frame.index == number < _N_COMPARED:  # the noise of later frames depends on all frames before
                 again = world.camera.capture(pose, frame.right is not None, twist).left
@@ -123,12 +104,7 @@ def _truth(
 ) -> FrameTruth:
     """Returns the layers of one frame; the caller replaces `flow_px` and `clean`, which are not computed here.
 
-    Args:
-        mission: the survey as planned.
-        frame: the recorded frame.
-        view: the left image, rendered again, with intermediate results.
-        world_from_camera: (4, 4) true pose of the left camera.
-        compared: recorded left image, and `FrameTruth.identical`.
+    `view` is the left image, rendered again; `compared` the recorded left image, and `FrameTruth.identical`.
     """
     recorded, identical = compared
     normals = floor_normals(mission.rendered_terrain, view.depth, world_from_camera, mission.rig)
@@ -136,9 +112,8 @@ def _truth(
     if view.objects is not None:
         labels = view.objects.label
         normals = np.where(labels[..., None] > 0, view.objects.normal, normals)
-        labels = np.where(
-            labels > len(mission.objects), np.uint16(0), labels
-        )  # the tiles of a mesh floor are the floor
+        floor_tiles = labels > len(mission.objects)  # of a mesh floor
+        labels = np.where(floor_tiles, np.uint16(0), labels)
     light = {name: getattr(view.components, key) for name, key in _LIGHT.items()}
     return FrameTruth(
         frame, view.depth, normals, view.albedo, view.albedo,
@@ -150,9 +125,8 @@ def _truth(
 def _difference(recorded: Image, noise_free: Image) -> float:
     """Returns the RMS of the recorded image minus a factor times the image rendered again [grey levels].
 
-    Only values below full scale in both images count; the result is 0 if there are none. The factor is the one with the
-    smallest RMS. It is needed because auto-exposure follows the light with a delay, and the image rendered again is
-    exposed without this delay.
+    Only values below full scale in both images count; the result is 0 if there are none. The factor, which makes the
+    RMS smallest, is needed because auto-exposure follows the light with a delay, which the image rendered again lacks.
     """
     below = (recorded < 255) & (noise_free < 255)
     seen, rendered = recorded[below].astype(np.float64), noise_free[below].astype(np.float64)
@@ -180,13 +154,7 @@ def floor_normals(
     """Returns the unit normals (H, W, 3) of the floor in the axes of the camera; zero where there is no floor.
 
     A point of the floor lies in the south-eastern or the north-western triangle of its cell of the height grid; the
-    normal is that of this triangle.
-
-    Args:
-        terrain: the floor.
-        depth_m: (H, W) depth of the floor along the optical axis; inf where there is no floor.
-        world_from_camera: (4, 4) pose of the camera.
-        rig: calibration of the camera.
+    normal is that of this triangle. `depth_m` (H, W) is inf where there is no floor.
     """
     known = np.isfinite(depth_m)
     points = geometry.transform(world_from_camera, _points(np.where(known, depth_m, 1.0), rig).reshape(-1, 3))
@@ -211,12 +179,10 @@ def optical_flow(
     Args:
         depth_m, next_depth_m: (H, W) depths in this and in the next image; inf where there is nothing.
         next_from_camera: (4, 4) pose of this camera in the axes of the next one.
-        rig: calibration of both images.
 
     Returns:
         (H, W, 2) displacements (columns, rows) [px]; NaN where there is nothing, where the point is outside the next
-        image, and where it is hidden there. A point is hidden if its depth in the next image is more than 2 % larger
-        than the depths of all 3 x 3 pixels around it.
+        image, and where it is hidden there, i.e. more than 2 % deeper than all 3 x 3 pixels around it.
     """
     shape = depth_m.shape
     known = np.isfinite(depth_m).ravel()
@@ -246,9 +212,12 @@ def _uint8(image: Image) -> Image:
     return np.clip(np.round(np.nan_to_num(image, nan=0.0)), 0, 255).astype(np.uint8)
 
 
-def _read(file: Path) -> Image:
-    """Returns an image file as RGB (H, W, 3); raises TwinError if it cannot be read."""
+def _read(file: Path, rig: StereoRig) -> Image:
+    """Returns an image file as RGB (H, W, 3); raises TwinError if it cannot be read or has the wrong size."""
     image = read_rgb(file)
     if image is None:
         raise TwinError(str(file), "cannot be read", "a PNG, written by `twin run`")
+    if image.shape[1::-1] != (rig.width_px, rig.height_px):
+        size = f"{rig.width_px} x {rig.height_px} px, the size of the images of the run"
+        raise TwinError(str(file), f"is {image.shape[1]} x {image.shape[0]} px", size)
     return image

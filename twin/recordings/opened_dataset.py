@@ -13,8 +13,8 @@ from twin.core.geometry import Array
 from twin.core.records import Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.user_files import is_file, resolved
-from twin.datasets.bag import is_bag
-from twin.datasets.bag_reader import BagTopics
+from twin.datasets.ros2.bag import is_bag
+from twin.datasets.ros2.bag_reader import BagTopics
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.calibration_values import READ
 from twin.datasets.dataset import Dataset

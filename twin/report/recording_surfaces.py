@@ -71,7 +71,7 @@ def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
     """Returns whether two grids have the same north-west corner and nearly the same size.
 
     Their widths and heights may differ by less than a cell plus a pixel: a reduced orthomosaic
-    (`run_folder.read_mosaic`) lacks the last rows and columns that do not fill a reduced pixel.
+    (`geotiff.read_mosaic`) lacks the last rows and columns that do not fill a reduced pixel.
     """
     corner = np.array([pixels.west_m - cells.west_m, pixels.north_m - cells.north_m])
     size = np.array([pixels.cols, pixels.rows]) * pixels.cell_m - np.array([cells.cols, cells.rows]) * cells.cell_m

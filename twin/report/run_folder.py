@@ -8,37 +8,19 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import rasterio
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
 
-from twin.core.raster_files import open_raster
-from twin.core.records import Array, MapGrid, Trajectory
+from twin.core.records import Array, Trajectory
 from twin.core.user_files import is_file, path_problem, read_json, read_text, reading
 from twin.errors import TwinError
-from twin.exchange import geotiff
+from twin.exchange.geotiff import Raster, read_mosaic, read_raster
 from twin.report.run_files import checked_environment, checked_index, checked_metrics, checked_scenario
 from twin.scenario.toml_text import parse_toml
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
-MOST_CELLS = 100_000_000  #: of a map that is read as a whole
-_LEAST_CELLS = 10_000_000  # of a map that may be larger than its file
 SCENARIO_FILE = "scenario.resolved.toml"
 _OBSERVATION_KEYS = ("row", "n_points", "contrast")  # columns of `Keyframes.stereo_observations`
 RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error")
-MAX_MOSAIC_PX = 16_000_000
-
-
-class Raster(NamedTuple):
-    """A raster in scene coordinates.
-
-    Args:
-        grid: position and size of its cells.
-        values: (rows, cols) with NaN for no data, or (rows, cols, 3) RGB.
-    """
-
-    grid: MapGrid
-    values: NDArray[Any]
 
 
 class Network(NamedTuple):
@@ -127,50 +109,6 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         _read_existing({"network": folder / "posegraph.g2o"}, read_network).get("network", _empty_network()),
         _read_keyframes(folder / "keyframes" / "index.json"),
     )
-
-
-def read_raster(file: Path) -> Raster:
-    """Reads a GeoTIFF as a raster in scene coordinates; row 0 is the northernmost.
-
-    In a raster with one band, cells without data become NaN, and elevations in a vertical datum become heights in the
-    scene.
-
-    Raises:
-        TwinError: the file is not a readable GeoTIFF or has more than MOST_CELLS cells, the raster is rotated, its
-            cells are not square, or its tags are damaged.
-    """
-    with open_raster(file) as source:
-        _check_size(source, file.stat().st_size)
-        grid, elevation_m = geotiff.scene_placement(source)
-        bands = source.read(masked=source.count == 1)
-    if len(bands) == 1:
-        return Raster(grid, bands[0].astype(float).filled(np.nan) - elevation_m)
-    return Raster(grid, np.moveaxis(bands[:3], 0, 2))
-
-
-def _check_size(source: rasterio.DatasetReader, n_bytes: int) -> None:
-    """Raises ValueError if a raster has more cells than fit into memory, or than a file of its size can contain."""
-    n_cells = source.width * source.height
-    if n_cells > min(MOST_CELLS, _LEAST_CELLS + 1000 * n_bytes):  # DEFLATE compresses to a thousandth at most
-        raise ValueError(f"{source.width} x {source.height} cells in {n_bytes} bytes, at most {MOST_CELLS}")
-
-
-def read_mosaic(file: Path) -> Raster:
-    """Reads the RGB values of the orthomosaic, reduced to at most `MAX_MOSAIC_PX` pixels by averaging.
-
-    Rows and columns at the south and east edges that do not fill a reduced pixel are left out.
-
-    Raises:
-        TwinError: see `read_raster`.
-    """
-    with open_raster(file) as source:
-        grid, _ = geotiff.scene_placement(source)
-        step = int(np.ceil(np.sqrt(source.width * source.height / MAX_MOSAIC_PX)))
-        rows, cols = source.height // step, source.width // step
-        whole = (0, rows * step), (0, cols * step)
-        bands = source.read((1, 2, 3), window=whole, out_shape=(3, rows, cols), resampling=Resampling.average)
-    cells = MapGrid(grid.west_m, grid.north_m, grid.cell_m * step, rows, cols)
-    return Raster(cells, np.moveaxis(bands, 0, 2))
 
 
 def read_network(file: Path) -> Network:

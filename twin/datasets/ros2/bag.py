@@ -26,34 +26,21 @@ _PURPOSE = "reading ROS 2 bags"
 
 
 class BagMessage(NamedTuple):
-    """Position of a message in a bag and the time in its header.
-
-    Args:
-        topic: topic of the message.
-        logged_ns: time at which the message was recorded [ns].
-        repetition: number of earlier messages of the topic with the same `logged_ns`.
-        stamp_ns: time in the header of the message [ns]; 0 if the publisher did not set it.
-    """
+    """Position of a message in a bag, and the time in its header."""
 
     topic: str
-    logged_ns: int
-    repetition: int
-    stamp_ns: int
+    logged_ns: int  #: time at which the message was recorded
+    repetition: int  #: number of earlier messages of the topic with the same `logged_ns`
+    stamp_ns: int  #: time in the header of the message; 0 if the publisher did not set it
 
 
 def is_bag(path: Path) -> bool:
-    """Returns whether a path is a file with the suffix .mcap or .db3 (SQLite), or a folder with metadata.yaml.
-
-    False for an invalid path.
-    """
+    """Returns whether a path is a file with the suffix .mcap or .db3 (SQLite), or a folder with metadata.yaml."""
     return (path.suffix in _SUFFIXES and is_file(path)) or is_file(path / "metadata.yaml")
 
 
 class Bag:
-    """An open ROS 2 bag.
-
-    Args:
-        path: file or folder of the bag.
+    """An open ROS 2 bag; every method raises TwinError if the bag is damaged.
 
     Attributes:
         path: file or folder of the bag.
@@ -79,39 +66,19 @@ class Bag:
             self._check_sizes()
 
     def first(self, topic: str) -> Any:
-        """Returns the first message of a topic, decoded; None if the topic has no message.
+        """Returns the first message of a topic, decoded; None if the topic has no message."""
+        return next((message for _, message in self.messages(topic)), None)
 
-        Raises:
-            TwinError: the bag is damaged.
-        """
-        return next(self.messages(topic), None)
-
-    def messages(self, topic: str) -> Iterator[Any]:
-        """Yields the messages of a topic, decoded, in the order in which they were recorded.
-
-        Raises:
-            TwinError: the bag is damaged.
-        """
-        for _, message in self.timed_messages(topic):
-            yield message
-
-    def timed_messages(self, topic: str) -> Iterator[tuple[int, Any]]:
-        """Yields the time of recording [ns] and the decoded message, for each message of a topic in order of recording.
-
-        Raises:
-            TwinError: the bag is damaged.
-        """
+    def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
+        """Yields the time of recording [ns] and the decoded message, for all messages of a topic in their order."""
         with self._damage():
             for _, logged_ns, data in self._reader.messages(self._connections([topic])):
                 yield logged_ns, _typestore().deserialize_cdr(data, self.topics[topic])
 
     def index(self, topics: Sequence[str]) -> dict[str, list[BagMessage]]:
-        """Returns the positions of the messages of each topic, in the order in which they were recorded.
+        """Returns the positions of the messages of each topic in order of recording, without decoding them.
 
-        The messages are not decoded; their types must begin with a header.
-
-        Raises:
-            TwinError: the bag is damaged.
+        The types of the messages must begin with a header.
         """
         found: dict[str, list[BagMessage]] = {topic: [] for topic in topics}
         with self._damage():
@@ -122,11 +89,7 @@ class Bag:
         return found
 
     def message(self, position: BagMessage) -> Any:
-        """Returns the message at a position, decoded.
-
-        Raises:
-            ValueError: the message is damaged or missing.
-        """
+        """Returns the message at a position, decoded; raises ValueError if it is damaged or missing."""
         try:
             connections = self._connections([position.topic])
             start = position.logged_ns
@@ -145,13 +108,11 @@ class Bag:
         """Raises ValueError if there are too many messages, a chunk is too large, or the index of chunks is missing."""
         if self._reader.message_count > _MOST_MESSAGES:
             raise ValueError(f"{self._reader.message_count} messages; at most {_MOST_MESSAGES}")
-        storages = getattr(self._reader.storage, "storages", [self._reader.storage])
-        for storage in storages:
+        for storage in getattr(self._reader.storage, "storages", [self._reader.storage]):
             chunks = getattr(storage, "chunks", None)
             if chunks is not None and not chunks and self._reader.message_count:
                 raise ValueError("no index of chunks; `mcap recover FILE -o NEW` writes one")
-            if chunks and max(chunk.uncompressed_size for chunk in chunks) > _MOST_CHUNK_BYTES:
-                raise ValueError(f"a chunk is larger than {_MOST_CHUNK_BYTES / 2**20:g} MiB")
+            _check_chunk(max((chunk.uncompressed_size for chunk in chunks or ()), default=0))
 
     @contextmanager
     def _damage(self) -> Iterator[None]:
@@ -166,7 +127,7 @@ class Bag:
 
 
 def _files(path: Path) -> list[Path]:
-    """Returns the files of a bag: the path itself, or the files that metadata.yaml lists in the folder of the bag.
+    """Returns the files of a bag: the path itself, or those that metadata.yaml lists in the folder of the bag.
 
     Raises:
         TwinError: metadata.yaml is damaged, the bag is compressed, or a file is missing or is a link that leads out of
@@ -201,12 +162,14 @@ def _check_end(file: Path) -> None:
             raise TwinError(str(file), "is truncated", "a complete bag; `mcap recover FILE -o NEW` saves its beginning")
 
 
-def _stamp_ns(data: bytes | memoryview) -> int:
-    """Returns the time [ns] in the header with which a message in CDR begins (OMG DDS-XTypes 1.3, section 7.4).
+def _check_chunk(size: int) -> None:
+    """Raises ValueError if the stated size of a decompressed chunk is too large [bytes]."""
+    if size > _MOST_CHUNK_BYTES:
+        raise ValueError(f"a chunk is larger than {_MOST_CHUNK_BYTES / 2**20:g} MiB")
 
-    Raises:
-        ValueError: the message is too short.
-    """
+
+def _stamp_ns(data: bytes | memoryview) -> int:
+    """Returns the time [ns] in the header with which a message in CDR begins (OMG DDS-XTypes 1.3, section 7.4)."""
     if len(data) < 12:
         raise ValueError("a message without header")
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
@@ -224,26 +187,17 @@ def _typestore() -> Any:
 def _bound_decompression() -> None:
     """Makes rosbags stop the decompression of a chunk one byte after the size that the chunk states.
 
-    rosbags decompresses a chunk before it compares the size, so a small chunk could fill the memory. A chunk that
-    states more than `_MOST_CHUNK_BYTES` is not decompressed.
+    rosbags decompresses a chunk before it compares the size, so a small chunk could fill the memory.
     """
     storage = optional("rosbags.rosbag2.storage_mcap", "exchange", _PURPOSE)
     lz4 = optional("lz4.frame", "exchange", _PURPOSE)
 
-    def limited(size: int) -> int:
-        """Returns the largest number of bytes that a decompressor may return: one more than the chunk states.
-
-        Raises:
-            ValueError: the chunk states more than `_MOST_CHUNK_BYTES`.
-        """
-        if size > _MOST_CHUNK_BYTES:
-            raise ValueError(f"a chunk is larger than {_MOST_CHUNK_BYTES / 2**20:g} MiB")
-        return size + 1
-
     def from_zstd(data: bytes, size: int) -> bytes:
-        return storage.zstd.ZstdDecompressor().decompress(data, max_length=limited(size))
+        _check_chunk(size)
+        return storage.zstd.ZstdDecompressor().decompress(data, max_length=size + 1)
 
     def from_lz4(data: bytes, size: int) -> bytes:
-        return lz4.LZ4FrameDecompressor().decompress(data, max_length=limited(size))
+        _check_chunk(size)
+        return lz4.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
 
     storage.DECOMPRESSORS.update({"zstd": from_zstd, "lz4": from_lz4})

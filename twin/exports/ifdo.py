@@ -16,13 +16,34 @@ from numpy.typing import ArrayLike
 from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
-from twin.exchange.attitude import yaw_pitch_roll_deg
-from twin.exchange.image_copy import copy_images
-from twin.exchange.run_contents import CameraIntrinsics, RecordedFrame, RunContents
+from twin.datasets.calibration import RecordedCamera
+from twin.datasets.image_copy import copy_images
+from twin.datasets.run_contents import RecordedFrame, RunContents
+from twin.exports.attitude import yaw_pitch_roll_deg
 
 VERSION = "v2.1.0"
 _START = datetime(1970, 1, 1, tzinfo=UTC)  # a run has no date
 _UNKNOWN = "unknown"
+#: Fields of the whole image set that state the origin of simulated images.
+_SIMULATED = {
+    "image-context": {"name": "simulated survey"},
+    "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
+    "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
+    "image-copyright": "simulated images, no copyright holder",
+    "image-platform": {"name": "BlueROV2 Heavy, simulated"},
+    "image-sensor": {"name": "stereo camera, simulated"},
+    "image-quality": "raw",
+}
+#: The same of the rectified images of a replay, of whose origin a run folder knows no more. Their light is left out.
+_RECORDED = {
+    "image-context": {"name": "replay of a recorded survey"},
+    "image-abstract": "Rectified images of a recorded stereo survey. Times count from 1970-01-01.",
+    "image-license": {"name": _UNKNOWN},
+    "image-copyright": _UNKNOWN,
+    "image-platform": {"name": _UNKNOWN},
+    "image-sensor": {"name": "stereo camera"},
+    "image-quality": "processed",
+}
 _WGS84 = "EPSG:4326"
 _UTM_LATITUDES = -80.0, 84.0  # [deg]
 _LINE_M = 100.0  # length of the line to the grid north of the scene whose direction is transformed
@@ -42,10 +63,6 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     Times count from 1970-01-01, because a run has no date.
 
     For a replay, the file states that the images are recorded; their platform, licence and copyright are "unknown".
-
-    Raises:
-        TwinError: an image is truncated or not a PNG image.
-        OSError: a file cannot be read or written.
     """
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
     items, place = dict[str, Any](), _place(contents.georeference)
@@ -61,7 +78,6 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
     """Returns the fields that hold for the whole image set."""
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
-    named = {"image-project": contents.name, "image-event": contents.name}
     header: dict[str, Any] = {
         "image-set-name": contents.name,
         "image-set-uuid": identifier,
@@ -76,9 +92,13 @@ def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
         "image-marine-zone": "seafloor",
         "image-spectral-resolution": "rgb",
         "image-camera-calibration-model": _calibration(contents.believed.left),
+        "image-project": {"name": contents.name},
+        "image-event": {"name": contents.name},
     }
-    header |= {key: {"name": name} for key, name in named.items()}
-    header |= _recorded() if "replay" in contents.scenario else _simulated(_illumination(contents.scenario))
+    if "replay" in contents.scenario:
+        header |= _RECORDED
+    else:
+        header |= _SIMULATED | {"image-illumination": _illumination(contents.scenario)}
     if place is None:
         return header | {"image-abstract": header["image-abstract"] + _LOCAL}
     return header | {"image-coordinate-reference-system": _WGS84}
@@ -90,44 +110,11 @@ def _illumination(scenario: Mapping[str, Any]) -> str:
     return "mixed light" if lamps and sun else "artificial light" if lamps else "sunlight"
 
 
-def _simulated(illumination: str) -> dict[str, Any]:
-    """Returns the iFDO fields that describe the origin of simulated images and their light (`illumination`)."""
-    return {
-        "image-context": {"name": "simulated survey"},
-        "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
-        "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
-        "image-copyright": "simulated images, no copyright holder",
-        "image-platform": {"name": "BlueROV2 Heavy, simulated"},
-        "image-sensor": {"name": "stereo camera, simulated"},
-        "image-quality": "raw",
-        "image-illumination": illumination,
-    }
-
-
-def _recorded() -> dict[str, Any]:
-    """Returns the iFDO fields that describe the origin of the images of a replay.
-
-    The images are rectified copies of recorded images; the run folder has no further information on their origin. The
-    optional field that describes the light is left out.
-    """
-    return {
-        "image-context": {"name": "replay of a recorded survey"},
-        "image-abstract": "Rectified images of a recorded stereo survey. Times count from 1970-01-01.",
-        "image-license": {"name": _UNKNOWN},
-        "image-copyright": _UNKNOWN,
-        "image-platform": {"name": _UNKNOWN},
-        "image-sensor": {"name": "stereo camera"},
-        "image-quality": "processed",
-    }
-
-
-def _calibration(camera: CameraIntrinsics) -> dict[str, Any]:
-    """Returns the fields of a camera model as iFDO defines them [px, degrees].
-
-    The centre of the first pixel is at (0, 0).
-    """
+def _calibration(camera: RecordedCamera) -> dict[str, Any]:
+    """Returns the fields of a camera model as iFDO defines them [px, degrees]; the first pixel has its centre at 0."""
+    assert camera.size_px is not None
     matrix = camera.matrix
-    field = np.rad2deg(2 * np.arctan([camera.size_px[k] / 2 / matrix[k, k] for k in (0, 1)]))
+    field = np.rad2deg(2 * np.arctan(np.array(camera.size_px) / 2 / matrix.diagonal()[:2]))
     return {
         "calibration-model-type": "rectilinear water",
         "calibration-focal-length-xy-pixel": [float(matrix[0, 0]), float(matrix[1, 1])],
@@ -155,18 +142,12 @@ def _item(place: _Place | None, frame: RecordedFrame, image: Path, pose: Array) 
 
 
 class _Place(NamedTuple):
-    """Place of a scene on the Earth.
+    """Place of a scene on the Earth."""
 
-    Args:
-        origin: position of the scene in its CRS.
-        zone, epsg: UTM zone (for example "33N") and its EPSG code on WGS 84.
-        north_from_scene, utm_from_scene: (3, 3) rotations from the scene axes to (east, true north, up) and to the grid
-            axes of the zone, at the origin of the scene.
-    """
-
-    origin: Georeference
-    zone: str
-    epsg: int
+    origin: Georeference  #: position of the scene in its CRS
+    zone: str  #: UTM zone, for example "33N"
+    epsg: int  #: EPSG code of the zone on WGS 84
+    #: (3, 3) rotations from the scene axes to (east, true north, up) and to the grid axes of the zone, at the origin.
     north_from_scene: Array
     utm_from_scene: Array
 
@@ -206,10 +187,9 @@ def _turn(line: Array) -> Array:
 
 
 def _position(place: _Place | None, pose: Array) -> dict[str, Any]:
-    """Returns the fields of the position and the pose (4, 4) of a camera in the world.
+    """Returns the fields of the position (in EPSG:4326) and the pose (4, 4) (in UTM on WGS 84) of a camera.
 
-    The position is in EPSG:4326, the pose in UTM on WGS 84. Without a place, iFDO has no field for either; both are
-    then written as settings of the acquisition, in scene coordinates [m].
+    Without a place, iFDO has no field for either; both are then settings of the acquisition, in scene coordinates [m].
     """
     x, y, z = (float(value) for value in pose[:3, 3])
     if place is None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from twin.core.georeference import Georeference
 from twin.core.records import Trajectory
-from twin.exchange.attitude import yaw_pitch_roll_deg
-from twin.exchange.image_copy import CopiedImage, copy_images
-from twin.exchange.run_contents import RunContents
+from twin.datasets.image_copy import CopiedImage, copy_images
+from twin.datasets.run_contents import RunContents
+from twin.exports.attitude import yaw_pitch_roll_deg
 
 _HEADER = "#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll"
 
@@ -18,13 +18,6 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     The label of an image is the name of its file. Positions are in the CRS of the export or, without one, in scene
     coordinates [m]; angles are in degrees (`yaw_pitch_roll_deg`).
-
-    Returns:
-        The folder of the images and the CSV files.
-
-    Raises:
-        TwinError: an image is truncated or not a PNG image.
-        OSError: a file cannot be read or written.
     """
     origin = contents.georeference or Georeference(0.0, 0.0)
     images = list(copy_images(contents, folder / "images", contents.rig.left_from_right))
@@ -39,13 +32,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _line(image: CopiedImage, path: Trajectory, origin: Georeference) -> str:
-    """Returns the line of one image in the reference file.
-
-    Args:
-        image: the image; its name is the label.
-        path: trajectory of the left camera in the world.
-        origin: position of the scene in the CRS; the zero position for scene coordinates.
-    """
+    """Returns the line of one image, given the trajectory of the left camera in the world."""
     pose = path.world_from_camera[image.frame.index] @ image.left_from_camera
     x, y, z = pose[:3, 3]
     easting, northing = origin.from_scene(x, y)

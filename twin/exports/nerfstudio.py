@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.exchange.image_copy import copy_images
-from twin.exchange.run_contents import RunContents
+from twin.datasets.image_copy import copy_images
+from twin.datasets.run_contents import RunContents
 
 #: Pose of OpenGL camera axes (x right, y up, z backward) in those of OpenCV (x right, y down, z forward).
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -21,17 +21,14 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     listed, each with the intrinsics of its camera. If the true calibration is known, the intrinsics and the pose of the
     right camera relative to the left one are the true ones, otherwise the believed ones. In nerfstudio, the corner of
     the first pixel is at (0, 0), so the coordinates of the principal point are larger by 0.5 px than in OpenCV.
-
-    Raises:
-        TwinError: an image is truncated or not a PNG image.
-        OSError: a file cannot be read or written.
     """
-    rig = contents.true or contents.believed
-    poses = contents.poses.world_from_camera
+    rig = contents.best_calibration
+    cameras, poses = dict(rig.sides), contents.poses.world_from_camera
     frames = []
     for image in copy_images(contents, folder / "images", rig.left_from_right):
         world_from_camera = poses[image.frame.index] @ image.left_from_camera @ OPENCV_FROM_OPENGL
-        camera = rig.left if image.camera == "left" else rig.right
+        camera = cameras[image.camera]
+        assert camera.size_px is not None
         (width, height), matrix = camera.size_px, camera.matrix
         k1, k2, p1, p2, k3 = (float(value) for value in camera.distortion)
         frames.append(

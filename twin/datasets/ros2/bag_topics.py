@@ -7,13 +7,15 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.datasets.bag_images import COMPRESSED_IMAGE, IMAGE
+from twin.datasets.ros2.bag_images import COMPRESSED_IMAGE, IMAGE
 from twin.errors import TwinError
 
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
-#: Words in the names of topics that state the side of a camera.
-_LEFT = re.compile(r"(^|[/_])(left|cam0|cam_0|camera0|camera_0|infra1|image_0)([/_]|$)", re.IGNORECASE)
-_RIGHT = re.compile(r"(^|[/_])(right|cam1|cam_1|camera1|camera_1|infra2|image_1)([/_]|$)", re.IGNORECASE)
+#: Words in the names of topics that state the side of a camera: left, right.
+_SIDES = (
+    re.compile(r"(^|[/_])(left|cam0|cam_0|camera0|camera_0|infra1|image_0)([/_]|$)", re.IGNORECASE),
+    re.compile(r"(^|[/_])(right|cam1|cam_1|camera1|camera_1|infra2|image_1)([/_]|$)", re.IGNORECASE),
+)
 _RECTIFIED = re.compile(r"[/_]rect(_|$|/|ified)", re.IGNORECASE)
 
 
@@ -35,9 +37,7 @@ def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
     """Returns the image topics of a bag, each with the topic of its calibration, or None if this was not recorded.
 
     The topic of the calibration of an image topic NAMESPACE/NAME or NAMESPACE/NAME/compressed is NAMESPACE/camera_info.
-
-    Args:
-        topics: type of the messages of each topic of the bag.
+    `topics` has the type of the messages of each topic of the bag.
     """
     found = {}
     for topic, kind in topics.items():
@@ -49,24 +49,22 @@ def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
 
 
 def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any], path: Path) -> StereoTopics:
-    """Returns the only stereo pair among the image topics that have a calibration.
+    """Returns the only stereo pair among the image topics (`image_topics`) that have a calibration.
 
     A topic of uncompressed images takes precedence over the topic of the same images in compressed form. Left and
     right are recognised by words in the topics, such as "left" or "cam0". If these do not decide and there are two
-    topics, the right camera is the one whose projection matrix P has a baseline (P[0, 3] < 0).
-
-    Args:
-        images: image topics, each with the topic of its calibration (None: not recorded).
-        first: function that returns the first message of a topic, or None for a topic without messages.
-        path: the bag, for messages.
+    topics, the right camera is the one whose projection matrix P has a baseline (P[0, 3] < 0); `first` returns the
+    first message of a topic, or None.
 
     Raises:
-        TwinError: there is no pair with calibrations, or there are several.
+        TwinError: the bag `path` has no pair with calibrations, or several.
     """
     calibrated = {topic: info for topic, info in images.items() if info and not _has_uncompressed(topic, images)}
-    sides = [[topic for topic in calibrated if word.search(topic)] for word in (_LEFT, _RIGHT)]
+    sides = [[topic for topic in calibrated if word.search(topic)] for word in _SIDES]
     if [len(side) for side in sides] != [1, 1] and len(calibrated) == 2:
-        sides = _by_baseline(calibrated, first)
+        infos = {topic: first(info) for topic, info in calibrated.items()}
+        is_right = {topic: float(info.p[3]) < 0 for topic, info in infos.items() if info is not None}
+        sides = [[topic for topic in is_right if is_right[topic] == right] for right in (False, True)]
     if [len(side) for side in sides] == [1, 1] and sides[0] != sides[1]:
         (left,), (right,) = sides
         return StereoTopics(left, right, images[left], images[right])
@@ -79,13 +77,3 @@ def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any],
 def _has_uncompressed(topic: str, images: Mapping[str, str | None]) -> bool:
     """Returns whether the images of a compressed topic are also recorded uncompressed."""
     return topic.endswith("/compressed") and topic.removesuffix("/compressed") in images
-
-
-def _by_baseline(calibrated: Mapping[str, str | None], first: Callable[[str], Any]) -> list[list[str]]:
-    """Returns the image topics of left cameras and those of right ones, whose CameraInfo has P[0, 3] < 0."""
-    sides: list[list[str]] = [[], []]
-    for topic, info in calibrated.items():
-        message = first(info) if info else None
-        if message is not None:
-            sides[int(float(message.p[3]) < 0)].append(topic)
-    return sides

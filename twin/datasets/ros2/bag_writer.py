@@ -13,11 +13,11 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.optional_packages import optional
 from twin.core.records import PASCAL_PER_METRE, Trajectory
+from twin.datasets.image_copy import encoded_image
+from twin.datasets.ros2.messages import BODY, LEFT, RIGHT, WORLD, MessageFactory
+from twin.datasets.run_contents import RecordedImu, RunContents
+from twin.datasets.sensor_folders import timestamp_ns
 from twin.errors import TwinError
-from twin.exchange.euroc import timestamp_ns
-from twin.exchange.image_copy import encoded_image
-from twin.exchange.ros2_messages import BODY, LEFT, RIGHT, WORLD, MessageFactory
-from twin.exchange.run_contents import RecordedImu, RunContents
 
 BAG = "ros2_bag"  # folder of the bag, and the name of its MCAP file
 _AIR_PA = 101_325.0  # standard air pressure
@@ -37,7 +37,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     All messages are in the order of time. Topics: /left/image_rect/compressed, /left/camera_info and the same for
     right; /tf_static; /odometry and /tf of the final trajectory; /ground_truth/odometry if the truth is known; and, if
     recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure and /dvl. All times are those
-    that `euroc.timestamp_ns` returns.
+    that `timestamp_ns` returns.
 
     Raises:
         TwinError: the package rosbags is not installed, the bag exists already, or an image is truncated or not a PNG
@@ -61,15 +61,10 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def pressure_pa(height_m: float, surface_m: float) -> float:
-    """Returns the pressure [Pa] at a height in the water.
+    """Returns the pressure [Pa] at a height in the water, both above the plane z = 0, if the surface is known (> 0).
 
-    If the height of the water surface is known, this is the absolute pressure p = p_air + rho g (surface - height),
-    with the standard air pressure p_air and rho g = `PASCAL_PER_METRE`. Otherwise it is the pressure relative to that
-    at the plane z = 0.
-
-    Args:
-        height_m: height of the sensor above the plane z = 0 [m].
-        surface_m: height of the water surface above this plane [m]; 0: not known.
+    This is the absolute pressure p = p_air + rho g (surface - height), with the standard air pressure p_air and rho g =
+    `PASCAL_PER_METRE`. If the height of the surface is 0 (not known), the pressure is relative to that at z = 0.
     """
     air_pa = _AIR_PA if surface_m > 0 else 0.0
     return air_pa + PASCAL_PER_METRE * (surface_m - height_m)
@@ -80,10 +75,9 @@ def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
     streams = [_static(contents, factory), _images(contents, factory), _readings(contents, factory)]
     if contents.imu is not None:
         streams.append(_inertial(contents.imu, factory))
-    body_from_left = contents.rig.body_from_camera
     for topic, name in (("/odometry", "final"), ("/ground_truth/odometry", "truth")):
         if name in contents.trajectories and len(contents.trajectories[name]):
-            streams.append(_odometry(factory, topic, contents.trajectories[name], body_from_left))
+            streams.append(_odometry(factory, topic, contents.trajectories[name], contents.rig.body_from_camera))
     return heapq.merge(*streams, key=lambda one: one.time_ns)
 
 
@@ -97,32 +91,22 @@ def _static(contents: RunContents, factory: MessageFactory) -> Iterator[Message]
 
 def _images(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
     """Yields the images of the recorded frames, each with its CameraInfo."""
-    believed = contents.believed
-    baseline_m = contents.rig.baseline_m
+    left, right = contents.believed.left, contents.believed.right
     for k, frame in enumerate(contents.frames):
         time_ns = timestamp_ns(frame.time_s)
-        for side, name, file, camera in (
-            ("left", LEFT, frame.left, believed.left),
-            ("right", RIGHT, frame.right, believed.right),
+        for side, name, file, camera, distance_m in (
+            ("left", LEFT, frame.left, left, 0.0),
+            ("right", RIGHT, frame.right, right, contents.rig.baseline_m),
         ):
             if file is not None:
-                kind, data = encoded_image(file, contents.jpeg_quality)
-                topic, distance_m = f"/{side}/image_rect/compressed", baseline_m if side == "right" else 0.0
-                yield Message(time_ns, topic, factory.compressed_image(time_ns, name, kind, data))
-                info = factory.camera_info(time_ns, name, camera, distance_m)
-                yield Message(time_ns, f"/{side}/camera_info", info)
+                image = factory.compressed_image(time_ns, name, *encoded_image(file, contents.jpeg_quality))
+                yield Message(time_ns, f"/{side}/image_rect/compressed", image)
+                yield Message(time_ns, f"/{side}/camera_info", factory.camera_info(time_ns, name, camera, distance_m))
         contents.progress((k + 1) / len(contents.frames))
 
 
 def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_from_left: Array) -> Iterator[Message]:
-    """Yields pose and twist of the body at each frame; with the topic /odometry, also the pose as a message of /tf.
-
-    Args:
-        factory: makes the messages.
-        topic: "/odometry" for the estimate, "/ground_truth/odometry" for the truth.
-        trajectory: poses of the left camera in the world.
-        body_from_left: (4, 4) pose of the left camera in the body.
-    """
+    """Yields pose and twist of the body at each frame; with the topic /odometry, also the pose as a message of /tf."""
     poses = trajectory.world_from_camera @ geometry.inverse(body_from_left)
     twists = body_twists(trajectory.times_s, poses)
     for time_s, pose, twist in zip(trajectory.times_s, poses, twists, strict=True):
@@ -133,13 +117,9 @@ def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_
 
 
 def body_twists(times_s: Array, poses: Array) -> Array:
-    """Returns the twists (n, 6) [rotation, translation] (rad/s, m/s) in body axes, from the motions to the next pose.
+    """Returns the twists (n, 6) [rotation, translation] (rad/s, m/s) in body axes of poses (n, 4, 4) world_from_body.
 
-    The last pose has the twist of the one before; the twist of a single pose is zero.
-
-    Args:
-        times_s: (n,) increasing times [s].
-        poses: (n, 4, 4) poses world_from_body.
+    They follow from the motions to the next pose; the last pose has the twist of the one before, a single pose zero.
     """
     found = np.zeros((len(poses), 6))
     for k in range(len(poses) - 1):
@@ -151,34 +131,25 @@ def body_twists(times_s: Array, poses: Array) -> Array:
 
 
 def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
-    """Yields the readings of AHRS, pressure sensor and DVL at the recorded frames.
-
-    The covariances follow from the standard deviations in the section [navigation] of the scenario.
-    """
-    navigation = contents.scenario.get("navigation", {})
+    """Yields the readings of AHRS, pressure sensor and DVL at the recorded frames, with the stated covariances."""
     surface_m = float(contents.scenario.get("sun", {}).get("depth_m", 0.0))
-    level_rad, heading_rad = (
-        np.deg2rad(navigation.get(key, 0.0)) for key in ("attitude_sigma_deg", "heading_sigma_deg")
+    level_rad, heading_rad, height_m, sigma_mps = contents.sigmas(
+        "attitude_sigma_deg", "heading_sigma_deg", "pressure_sigma_m", "dvl_sigma_mps"
     )
-    pressure_sigma_pa = PASCAL_PER_METRE * navigation.get("pressure_sigma_m", 0.0)
+    sigmas_rad, sigma_pa = np.array([level_rad, level_rad, heading_rad]), PASCAL_PER_METRE * height_m
     for frame in contents.frames:
         time_ns, readings = timestamp_ns(frame.time_s), frame.readings
         if readings.ahrs_rpy_rad is not None:
-            sigmas_rad = np.array([level_rad, level_rad, heading_rad])
             yield Message(time_ns, "/imu/data", factory.attitude(time_ns, readings.ahrs_rpy_rad, sigmas_rad))
         if readings.pressure_z_m is not None:
             value_pa = pressure_pa(readings.pressure_z_m, surface_m)
-            yield Message(time_ns, "/pressure", factory.pressure(time_ns, value_pa, pressure_sigma_pa))
+            yield Message(time_ns, "/pressure", factory.pressure(time_ns, value_pa, sigma_pa))
         if readings.dvl_mps is not None:
-            sigma_mps = float(navigation.get("dvl_sigma_mps", 0.0))
             yield Message(time_ns, "/dvl", factory.velocity(time_ns, readings.dvl_mps, sigma_mps))
 
 
 def _inertial(imu: RecordedImu, factory: MessageFactory) -> Iterator[Message]:
-    """Yields the messages with the readings of the IMU.
-
-    The variances are s^2 f, for white noise of density s that is sampled at the rate f.
-    """
+    """Yields the readings of the IMU; the variances are s^2 f of white noise of density s, sampled at the rate f."""
     root = np.sqrt(imu.rate_hz)
     sigmas = imu.noise.gyroscope_noise_density * root, imu.noise.accelerometer_noise_density * root
     for time_s, rates, forces in zip(*imu.readings, strict=True):

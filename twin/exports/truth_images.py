@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from twin.exchange.run_contents import FrameTruth, RunContents
+from twin.datasets.run_contents import FrameTruth, RunContents
 
 _MOST_MM = 65535  # largest value of a 16-bit PNG
 
@@ -43,17 +43,10 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
             }
         )
         contents.progress((k + 1) / len(contents.frames))
-    index = folder / "index.json"
-    index.write_text(json.dumps(_index(contents, frames, layers.object_names), indent=1), encoding="utf-8")
-    return [folder, index]
-
-
-def _index(contents: RunContents, frames: list[dict], names: tuple[str, ...]) -> dict:
-    """Returns the contents of index.json, given its entries for the frames and the names of the objects."""
     compared = [frame["identical"] for frame in frames if frame["identical"] is not None]
-    return {
+    contents_of_index = {
         "camera_matrix": contents.rig.matrix.tolist(),
-        "objects": {str(k + 1): name for k, name in enumerate(names)},
+        "objects": {str(k + 1): name for k, name in enumerate(layers.object_names)},
         "rerendered": {
             "compared_with_noise": len(compared),
             "identical": sum(compared),
@@ -61,6 +54,9 @@ def _index(contents: RunContents, frames: list[dict], names: tuple[str, ...]) ->
         },
         "frames": frames,
     }
+    index = folder / "index.json"
+    index.write_text(json.dumps(contents_of_index, indent=1), encoding="utf-8")
+    return [folder, index]
 
 
 def _write(truth: FrameTruth, folder: Path) -> None:
@@ -76,13 +72,11 @@ def _write(truth: FrameTruth, folder: Path) -> None:
         f"labels/{number}.png": truth.labels,
     }
     files |= {f"{name}/{number}.tiff": layer[..., ::-1] for name, layer in truth.light.items()}
+    if truth.flow_px is not None:
+        files[f"flow/{number}.flo"] = truth.flow_px
     for name, values in files.items():
         file = folder / name
         file.parent.mkdir(exist_ok=True)
-        if not cv2.imwrite(str(file), np.ascontiguousarray(values)):
-            raise OSError(f"{file} cannot be written")
-    if truth.flow_px is not None:
-        file = folder / "flow" / f"{number}.flo"
-        file.parent.mkdir(exist_ok=True)
-        if not cv2.writeOpticalFlow(str(file), truth.flow_px):
+        write = cv2.writeOpticalFlow if file.suffix == ".flo" else cv2.imwrite
+        if not write(str(file), np.ascontiguousarray(values)):
             raise OSError(f"{file} cannot be written")

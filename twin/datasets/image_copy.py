@@ -11,43 +11,26 @@ import numpy as np
 
 from twin.core.records import Array
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
+from twin.datasets.run_contents import RecordedFrame, RunContents
 from twin.errors import TwinError
-from twin.exchange.run_contents import RecordedFrame, RunContents
 
 _PNG_START = b"\x89PNG"
 _PNG_END = b"IEND\xaeB`\x82"  # last bytes of a complete PNG file
 
 
 class CopiedImage(NamedTuple):
-    """An image in an exported data set.
+    """An image in an exported data set."""
 
-    Args:
-        name: name of the file.
-        frame: frame of the image.
-        camera: "left" or "right".
-        left_from_camera: (4, 4) pose of the camera in the axes of the left camera [m].
-    """
-
-    name: str
+    name: str  #: name of the file
     frame: RecordedFrame
-    camera: str
-    left_from_camera: Array
+    camera: str  #: "left" or "right"
+    left_from_camera: Array  #: (4, 4) pose of the camera in the axes of the left camera [m]
 
 
 def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> Iterator[CopiedImage]:
-    """Copies all recorded images to a folder and yields each copy.
+    """Copies all recorded images to a folder as CAMERA_FRAME, for example left_000012.png, and yields each copy.
 
-    The names are CAMERA_FRAME with the number of the frame, for example left_000012.png. Frames without a right image
-    have only the left one.
-
-    Args:
-        contents: recorded frames, quality of JPEG images, and the function to which progress is reported.
-        folder: folder of the copies, which is created if it does not exist.
-        left_from_right: (4, 4) pose of the right camera in the axes of the left camera [m].
-
-    Raises:
-        TwinError: an image is truncated or not a PNG image.
-        OSError: an image cannot be read or written.
+    Frames without a right image have only the left one. `left_from_right` (4, 4) is the pose of the right camera.
     """
     folder.mkdir(exist_ok=True)
     for k, frame in enumerate(contents.frames):
@@ -59,17 +42,7 @@ def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> 
 
 
 def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Path:
-    """Copies an image file, or converts it to JPEG, and returns the path of the new file.
-
-    Args:
-        source: PNG file.
-        stem: path of the new file without its suffix.
-        jpeg_quality: quality of the JPEG, 1 to 100; None: the file is copied unchanged.
-
-    Raises:
-        TwinError: the source is truncated or not a PNG image.
-        OSError: the source cannot be read, or the new file cannot be written.
-    """
+    """Copies a PNG file to `stem` with a suffix, as it is or as JPEG (`encoded_image`); returns the new file."""
     kind, data = encoded_image(source, jpeg_quality)
     file = stem.with_name(f"{stem.name}.{'jpg' if kind == 'jpeg' else kind}")
     file.write_bytes(data)
@@ -77,12 +50,7 @@ def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Pat
 
 
 def encoded_image(source: Path, jpeg_quality: int | None = None) -> tuple[str, bytes]:
-    """Returns the format ("png" or "jpeg") and the encoded bytes of an image.
-
-    Args:
-        source: PNG file.
-        jpeg_quality: quality with which the image is encoded as JPEG, 1 to 100; None: the bytes of the PNG file are
-            returned.
+    """Returns the format ("png" or "jpeg") and the bytes of a PNG file, as they are or, with a quality, as JPEG.
 
     Raises:
         TwinError: the file is truncated or not a PNG image.

@@ -1,0 +1,97 @@
+"""Calibration in files of Kalibr: the camchain of a stereo rig, also of single cameras in EuRoC folders, and imu.yaml.
+
+cam0 is the left camera, cam1 the right one.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix, distortion_kind
+from twin.datasets.calibration_values import numbers_of, refuse_unknown, size_of, table_of
+from twin.datasets.run_contents import RecordedImu
+from twin.errors import TwinError
+
+_COEFFICIENTS = "distortion_coeffs", "distortion_coefficients"  # of Kalibr, and of sensor.yaml in EuRoC folders
+_READ = ("camera_model", "intrinsics", "distortion_model", "resolution", *_COEFFICIENTS)
+_IRRELEVANT = (
+    "cam_overlaps", "rostopic", "T_cam_imu", "timeshift_cam_imu", "sensor_type", "comment", "camera_id", "rate_hz",
+    "T_BS", "T_cn_cnm1",
+)  # fmt: skip
+
+
+def read_camchain(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
+    """Returns the calibration in the keys and values of a camchain.
+
+    Raises:
+        TwinError: cam1 is missing, or a camera or T_cn_cnm1 is not valid.
+    """
+    if "cam1" not in tree:
+        raise TwinError(str(file), "has one camera only, so it has no baseline", "cam0 and cam1 with T_cn_cnm1")
+    refuse_unknown((key for key in tree if not re.fullmatch(r"cam\d", str(key))), file)
+    left, right = (camera_of(tree[name], file) for name in ("cam0", "cam1"))
+    return StereoCalibration(left, right, pose_of(tree["cam1"], "T_cn_cnm1", file), file)
+
+
+def camera_of(table: Any, file: Path) -> RecordedCamera:
+    """Returns the camera in a table of a camchain or of an EuRoC sensor.yaml.
+
+    Raises:
+        TwinError: a value is missing or not valid, or the camera model or the lens model is not supported.
+    """
+    table = table_of(table, file)
+    if (model := table.get("camera_model", "pinhole")) != "pinhole":
+        raise TwinError(str(file), f"camera model {model!r} is not supported", "pinhole with radtan or equidistant")
+    coefficients = next((table[name] for name in _COEFFICIENTS if name in table), None)
+    refuse_unknown((key for key in table if key not in _READ + _IRRELEVANT), file)
+    fx, fy, cx, cy = numbers_of(table.get("intrinsics"), file, "intrinsics", (4,))
+    distortion = numbers_of([] if coefficients is None else coefficients, file, "distortion_coeffs").ravel()
+    kind = distortion_kind(table.get("distortion_model", "radtan"), file)
+    return RecordedCamera(size_of(table.get("resolution"), file), camera_matrix(fx, fy, cx, cy), distortion, kind)
+
+
+def pose_of(table: Any, key: str, file: Path) -> Array:
+    """Returns the matrix (4, 4) of a pose, which may be no rigid motion; raises TwinError if it is missing or damaged.
+
+    The pose is a list of rows (Kalibr), or has `rows`, `cols` and `data` (EuRoC).
+    """
+    return numbers_of(table_of(table, file).get(key), file, key, (4, 4))
+
+
+def write_camchain(file: Path, rig: StereoCalibration, body_from_left: Array | None = None) -> None:
+    """Writes a camchain; with an IMU, whose axes are those of the body, each camera also has T_cam_imu.
+
+    The coefficient k3 is left out, because Kalibr's model radtan has none.
+    """
+    tree = {name: _table(camera, name) for name, camera in (("cam0", rig.left), ("cam1", rig.right))}
+    tree["cam1"]["T_cn_cnm1"] = rig.right_from_left.tolist()
+    if body_from_left is not None:
+        left_from_body = geometry.inverse(body_from_left)
+        tree["cam0"]["T_cam_imu"] = left_from_body.tolist()
+        tree["cam1"]["T_cam_imu"] = (rig.right_from_left @ left_from_body).tolist()
+    file.write_text(yaml.safe_dump(tree, sort_keys=False, default_flow_style=None), encoding="utf-8")
+
+
+def _table(camera: RecordedCamera, name: str) -> dict[str, Any]:
+    matrix = camera.matrix
+    return {
+        "camera_model": "pinhole",
+        "intrinsics": [float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])],
+        "distortion_model": "radtan",
+        "distortion_coeffs": [float(value) for value in camera.distortion[:4]],
+        "resolution": list(camera.size_px or ()),
+        "rostopic": f"/{name}/image_raw",
+    }
+
+
+def write_imu(file: Path, imu: RecordedImu) -> None:
+    """Writes imu.yaml: noise densities, random walks, rate, and the topic in the ROS 2 bag of the same run."""
+    tree = {"rostopic": "/imu/data_raw", "update_rate": float(imu.rate_hz), **imu.noise._asdict()}
+    file.write_text(yaml.safe_dump(tree, sort_keys=False), encoding="utf-8")

@@ -1,0 +1,112 @@
+"""Formats of `twin export`: the table of all formats, and the checks of a request."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+from twin.datasets.run_contents import POSES, RunContents
+from twin.errors import TwinError
+
+
+class ExportFormat(NamedTuple):
+    """A format of `twin export`."""
+
+    description: str  #: one line for the list of formats
+    needs: tuple[str, ...]  #: contents without which the format cannot be written (`_NEEDS`)
+    writer: str  #: module and function, imported when they are called, because writers need large packages
+
+    def write(self, contents: RunContents, folder: Path) -> list[Path]:
+        """Writes the contents to an existing folder; returns the files, or the folders with many files."""
+        module, function = self.writer.split(":")
+        return getattr(import_module(f"twin.{module}"), function)(contents, folder)
+
+
+#: Name, needs, writer and description of each format, in the order in which `twin export --list` shows them.
+_TABLE = (
+    ("euroc", "images", "datasets.euroc:export",
+     "EuRoC/ASL folder: stereo images, calibration, truth, sensor readings"),
+    ("kitti", "pairs", "datasets.kitti:export",
+     "KITTI odometry sequence: stereo pairs, calib.txt, times.txt, true poses"),
+    ("tum", "", "datasets.tum:export", "TUM: trajectories of the left camera, lists of images"),
+    ("colmap", "pairs poses", "datasets.colmap:export",
+     "COLMAP text model: stereo rig, poses, 3D points of the map with tracks"),
+    ("nerfstudio", "images poses", "exports.nerfstudio:export", "nerfstudio: transforms.json and images"),
+    ("calibration", "", "datasets.calibration_files:export",
+     "camera calibration in OpenCV, Kalibr and COLMAP form, true and believed"),
+    ("ifdo", "images poses", "exports.ifdo:export", "iFDO v2.1 metadata of the images (JSON)"),
+    ("metashape", "images poses", "exports.metashape:export",
+     "Metashape reference CSV: position and attitude of each image"),
+    ("truth", "images world", "exports.truth_images:export",
+     "exact truth of each left image: depth, flow, normals, albedo, clear water, light, veil, labels"),
+    ("mcap", "images", "datasets.ros2.bag_writer:export",
+     "ROS 2 bag in MCAP: images, camera_info, tf, odometry, attitude, pressure, DVL"),
+    ("cog", "map", "exports.cloud_optimised:export", "cloud-optimised GeoTIFF: elevation, sigma, error, orthomosaic"),
+    ("ply", "map", "exports.point_cloud:export_ply", "point cloud of the map with colour and sigma, PLY"),
+    ("laz", "map", "exports.point_cloud:export_laz", "point cloud of the map with colour and sigma, LAZ"),
+    ("glb", "map", "exports.textured_mesh:export_glb", "mesh of the map with the orthomosaic as texture, binary glTF"),
+    ("obj", "map", "exports.textured_mesh:export_obj",
+     "mesh of the map with the orthomosaic as texture, Wavefront OBJ"),
+)  # fmt: skip
+FORMATS = {name: ExportFormat(text, tuple(needs.split()), writer) for name, needs, writer, text in _TABLE}
+
+
+class _Need(NamedTuple):
+    """Contents that a format may need."""
+
+    is_met: Callable[[RunContents], bool]
+    problem: str  #: of a run that lacks them
+    allowed: str  #: a run that has them
+
+
+_NEEDS = {
+    "images": _Need(
+        lambda run: bool(run.frames),
+        "has no images",
+        'a run of a scenario with record = "all" (every frame) or "keyframes"',
+    ),
+    "pairs": _Need(
+        lambda run: bool(run.pairs),
+        "has no stereo pairs",
+        'a run of a scenario with record = "all" or "keyframes"',
+    ),
+    "poses": _Need(
+        lambda run: not run.trajectories.keys().isdisjoint(POSES),
+        "has neither a true nor a final trajectory",
+        "a run with trajectory_truth.tum or trajectory_final.tum",
+    ),
+    "map": _Need(lambda run: run.elevation is not None, "has no elevation map", "a run with dem.tif"),
+    "world": _Need(
+        lambda run: run.true_layers is not None,
+        "has no simulated world or no frames/truth.npz",
+        "a run of `twin run` with rendered images, whose record is not none",
+    ),
+}
+
+
+def chosen_formats(names: Sequence[str]) -> list[str]:
+    """Returns the names of the requested formats without repetitions; a name may be several, separated by commas.
+
+    Raises:
+        TwinError: a name is unknown, or no format is named.
+    """
+    parts = [part.strip() for name in names for part in name.split(",") if part.strip()]
+    for part in parts:
+        if part not in FORMATS:
+            close = difflib.get_close_matches(part, FORMATS, 1)
+            hint = f"; did you mean {close[0]!r}?" if close else ""
+            raise TwinError("--to", f"{part[:40]!r} is not a format{hint}", ", ".join(FORMATS))
+    if not parts:
+        raise TwinError("--to", "is missing", ", ".join(FORMATS))
+    return list(dict.fromkeys(parts))
+
+
+def check_needs(name: str, contents: RunContents) -> None:
+    """Raises TwinError if the run lacks contents that the format called `name` needs."""
+    for need in sorted(FORMATS[name].needs):
+        is_met, problem, allowed = _NEEDS[need]
+        if not is_met(contents):
+            raise TwinError(f"--to {name}", f"{contents.folder} {problem}", allowed)
