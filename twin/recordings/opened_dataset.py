@@ -13,13 +13,13 @@ from twin.core.geometry import Array
 from twin.core.records import Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.user_files import is_file, resolved
-from twin.datasets.ros2.bag import is_bag
-from twin.datasets.ros2.bag_reader import BagTopics
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.calibration_values import READ
 from twin.datasets.dataset import Dataset
 from twin.datasets.image_files import Bayer
 from twin.datasets.readers import read_dataset
+from twin.datasets.ros2.bag import is_bag
+from twin.datasets.ros2.bag_reader import BagTopics
 from twin.datasets.truth_files import read_true_map, read_truth
 from twin.errors import TwinError
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
