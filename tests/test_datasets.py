@@ -28,7 +28,7 @@ from twin.datasets.readers import read_dataset
 from twin.datasets.truth_files import read_truth
 from twin.errors import TwinError
 from twin.plugin import loading
-from twin.recordings import replay
+from twin.recordings import opened_dataset
 from twin.recordings.frames import RecordedFrames, increasing
 from twin.recordings.rectification import rectification
 from twin.recordings.replay import ReplayOptions, open_dataset
@@ -619,7 +619,7 @@ def test_a_truth_without_poses_is_one_line(euroc, monkeypatch):
     """Readers of other packages may return one; those of this package refuse such files."""
     dataset, name = read_dataset(euroc)
     empty = replace(dataset, truth=Trajectory(np.zeros(0), np.zeros((0, 4, 4))))
-    monkeypatch.setattr(replay, "read_dataset", lambda *_: (empty, name))
+    monkeypatch.setattr(opened_dataset, "read_dataset", lambda *_: (empty, name))
     with pytest.raises(TwinError, match="set: the truth has no poses"):
         open_dataset(euroc, ReplayOptions())
 
