@@ -11,28 +11,36 @@ from twin.core import geometry
 from twin.core.records import SensorNoise, StereoRig
 from twin.scenario.model import NavigationConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
-from twin.simulate.sensors import (
-    AcousticPositioning,
-    DopplerVelocityLog,
-    NavigationSensors,
-    detect_beacons,
-    read_pressure_and_attitude,
-)
-from twin.simulate.thrusters import LaggedThrusters, steady_thrust_n
+from twin.simulate.sensors import NavigationSensors
+from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, steady_thrust_n, step_thrusters
 
 NOISE = SensorNoise(pressure_m=0.02, attitude_rad=0.003, heading_rad=0.01)
 POSE = geometry.pose(geometry.rotation_from_rpy(0.05, -0.08, 3.1), np.array([1.0, 2.0, 3.0]))
 CAMERA = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
+RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, CAMERA)
+CLEAR = np.full((240, 320), 10.0, np.float32)
+
+
+def sensors_of(aiding, noise, seed=0, **settings):
+    streams = zip(("navigation", "dvl", "usbl", "beacons"), np.random.SeedSequence(seed).spawn(4), strict=True)
+    rng = {name: np.random.default_rng(seed) for name, seed in streams}
+    return NavigationSensors(NavigationConfig(aiding=tuple(aiding), **settings), noise, RIG, rng)
+
+
+def readings_at(pose, aiding, n, seed=0, noise=NOISE, velocity=(0.0, 0.0, 0.0), depth_m=None):
+    """Returns n readings at a pose world_from_body; with a depth image, all of them are at keyframes."""
+    sensors, twist = sensors_of(aiding, noise, seed), np.array([0.0, 0.0, 0.0, *velocity])
+    return [sensors.read(k / 30, pose, twist, None if depth_m is None else lambda: depth_m) for k in range(n)]
 
 
 def test_a_command_step_gives_the_step_response_of_the_published_lag():
     step_s, command = 1 / 120, np.linspace(-1, 1, 8)
-    thrusters = LaggedThrusters(ROV, step_s)
-    thrusters.command(command)
+    thrusters = lagged_thrusters(ROV, step_s)
+    set_thruster_command(thrusters, command)
     history = []
     for _ in range(120):
-        history.append(thrusters.state.c @ thrusters.state.lag_state)
-        thrusters.step()
+        history.append(thrusters.c @ thrusters.lag_state)
+        step_thrusters(thrusters)
     _, expected = signal.step(ROV.thruster_lag, T=np.arange(120) * step_s)
     steady = steady_thrust_n(command, ROV.thrust_coefficients)
     np.testing.assert_allclose(history, np.outer(expected, steady), atol=1e-9)
@@ -44,8 +52,8 @@ def test_steady_thrust_agrees_with_the_published_points(command, thrust):
 
 
 def test_errors_of_height_and_attitude_have_the_given_standard_deviations_and_no_bias():
-    rng, n = np.random.default_rng(3), 4000
-    readings = [read_pressure_and_attitude(POSE, CAMERA, NOISE, ("pressure", "ahrs"), rng) for _ in range(n)]
+    n = 4000
+    readings = readings_at(POSE, ("pressure", "ahrs"), n)
     height = np.array([r.pressure_z_m for r in readings]) - (POSE @ CAMERA)[2, 3]
     angles = geometry.wrap_angle(np.array([r.ahrs_rpy_rad for r in readings]) - [0.05, -0.08, 3.1])
     sigma = np.array([0.02, 0.003, 0.003, 0.01])
@@ -57,53 +65,35 @@ def test_errors_of_height_and_attitude_have_the_given_standard_deviations_and_no
 
 
 def test_headings_are_wrapped_to_plus_minus_pi():
-    rng = np.random.default_rng(0)
     pose = geometry.pose(geometry.rotation_from_rpy(0.0, 0.0, np.pi - 1e-3), np.zeros(3))
-    yaws = [read_pressure_and_attitude(pose, CAMERA, NOISE, ("ahrs",), rng).ahrs_rpy_rad[2] for _ in range(50)]
+    yaws = [reading.ahrs_rpy_rad[2] for reading in readings_at(pose, ("ahrs",), 50)]
     assert min(yaws) >= -np.pi and max(yaws) < np.pi and min(yaws) < 0 < max(yaws)
 
 
-def test_random_numbers_do_not_depend_on_the_aiding_sensors():
-    def third_reading(aiding):
-        rng = np.random.default_rng(7)
-        return [read_pressure_and_attitude(POSE, CAMERA, NOISE, aiding, rng) for _ in range(3)][-1]
-
-    both, pressure, ahrs, none = (third_reading(a) for a in (("pressure", "ahrs"), ("pressure",), ("ahrs",), ()))
-    assert both.pressure_z_m == pressure.pressure_z_m
-    np.testing.assert_array_equal(both.ahrs_rpy_rad, ahrs.ahrs_rpy_rad)
-    assert pressure.ahrs_rpy_rad is None and ahrs.pressure_z_m is None
-    assert none.pressure_z_m is None and none.ahrs_rpy_rad is None
-
-
-RIG = StereoRig(320, 240, 277.0, 0.15, 30.0, CAMERA)
 LEVEL = geometry.pose(np.eye(3), np.array([1.0, 2.0, 3.0]))
 POSE_ABOVE = LEVEL @ CAMERA
 SURVEYED = ((1.2, 2.3, 0.5), (0.7, 1.6, 0.4), (9.0, 2.0, 0.4))  # the last one is outside the image
 BEACONS = SensorNoise(0.02, 0.003, 0.01, beacon_px=0.3, beacons_m=SURVEYED)
-CLEAR = np.full((240, 320), 10.0, np.float32)
 
 
 def test_the_doppler_log_has_white_noise_and_one_scale_error_per_survey():
     noise, velocity, n = SensorNoise(0.02, 0.003, 0.01, dvl_mps=0.01, dvl_scale=0.05), np.array([0.4, -0.2, 0.1]), 2000
-    log = DopplerVelocityLog(noise, np.random.default_rng(0))
-    early, late = (np.array([log.read(velocity) for _ in range(n)]) for _ in range(2))
+    early, late = np.array([r.dvl_mps for r in readings_at(POSE, ("dvl",), 2 * n, 0, noise, velocity)]).reshape(2, n, 3)
     # 4 standard errors of a standard deviation, and of the difference of two means
     assert np.all(np.abs(early.std(axis=0) / 0.01 - 1) < 4 / np.sqrt(2 * n))
     assert np.abs(np.corrcoef(early.T) - np.eye(3)).max() < 4 / np.sqrt(n)
     assert np.all(np.abs(early.mean(axis=0) - late.mean(axis=0)) < 4 * 0.01 * np.sqrt(2 / n))
     silent = SensorNoise(0.02, 0.003, 0.01, dvl_mps=1e-12, dvl_scale=0.05)
-    ratios = np.array(
-        [DopplerVelocityLog(silent, np.random.default_rng(k)).read(velocity) / velocity for k in range(n)]
-    )
+    ratios = np.array([readings_at(POSE, ("dvl",), 1, k, silent, velocity)[0].dvl_mps / velocity for k in range(n)])
     assert np.ptp(ratios, axis=1).max() < 1e-9  # equal on all axes
     assert abs(ratios.mean() - 1) < 4 * 0.05 / np.sqrt(n)
     assert abs(ratios[:, 0].std() / 0.05 - 1) < 4 / np.sqrt(2 * n)
 
 
 def test_acoustic_fixes_are_unbiased_and_at_least_one_interval_apart():
-    noise, position = SensorNoise(0.02, 0.003, 0.01, usbl_m=0.5), np.array([3.0, -4.0, 2.0])
-    usbl, times = AcousticPositioning(noise, 1.0, np.random.default_rng(1)), np.arange(8000) * 0.4
-    fixes = [usbl.read(time_s, position) for time_s in times]
+    noise, position = SensorNoise(0.02, 0.003, 0.01, usbl_m=0.5), (POSE @ CAMERA)[:3, 3]
+    sensors, times = sensors_of(("usbl",), noise, usbl_interval_s=1.0), np.arange(8000) * 0.4
+    fixes = [sensors.read(time_s, POSE, np.zeros(6), lambda: CLEAR).usbl_m for time_s in times]
     taken = np.array([fix is not None for fix in fixes])
     np.testing.assert_allclose(np.diff(times[taken]), 1.2)  # the first keyframe at or after 1 s
     errors = np.array([fix for fix in fixes if fix is not None]) - position
@@ -113,12 +103,13 @@ def test_acoustic_fixes_are_unbiased_and_at_least_one_interval_apart():
 
 
 def test_beacon_pixels_are_opencv_s_projection_plus_noise():
-    rng, n = np.random.default_rng(2), 2000
+    n = 2000
     world_from_camera = POSE_ABOVE @ geometry.exp(np.array([0.03, -0.05, 0.4, 0.1, 0.05, 0.0]))
     camera_from_world = geometry.inverse(world_from_camera)
     rotation = cv2.Rodrigues(camera_from_world[:3, :3])[0]
     expected = cv2.projectPoints(np.array(SURVEYED), rotation, camera_from_world[:3, 3], RIG.matrix, None)[0][:2, 0]
-    sightings = [detect_beacons(world_from_camera, CLEAR, RIG.project, BEACONS, rng) for _ in range(n)]
+    readings = readings_at(world_from_camera @ geometry.inverse(CAMERA), ("beacons",), n, 2, BEACONS, depth_m=CLEAR)
+    sightings = [reading.beacons for reading in readings]
     assert {tuple(s.beacon for s in sighting) for sighting in sightings} == {(0, 1)}
     errors = np.array([[s.pixel for s in sighting] for sighting in sightings]) - expected
     assert np.all(np.abs(errors.mean(axis=0)) < 4 * 0.3 / np.sqrt(n))
@@ -126,19 +117,20 @@ def test_beacon_pixels_are_opencv_s_projection_plus_noise():
 
 
 def test_a_surface_in_front_of_a_beacon_hides_it():
-    rng = np.random.default_rng(0)
+    def seen():
+        (readings,) = readings_at(LEVEL, ("beacons",), 1, 0, BEACONS, depth_m=half)
+        return [s.beacon for s in readings.beacons]
+
     half = CLEAR.copy()
     half[:, :160] = 2.0  # the camera is at z = 2.85 m; beacon 0 is at a depth of 2.35 m in this half of the image
-    assert [s.beacon for s in detect_beacons(POSE_ABOVE, half, RIG.project, BEACONS, rng)] == [1]
+    assert seen() == [1]
     half[:, :160] = 2.35  # the floor on which the beacon is mounted does not hide it
-    assert [s.beacon for s in detect_beacons(POSE_ABOVE, half, RIG.project, BEACONS, rng)] == [0, 1]
+    assert seen() == [0, 1]
 
 
 def readings_of(aiding, n=40):
     """Returns the readings of a stationary vehicle over n frames; every fifth frame is a keyframe."""
-    streams = zip(("navigation", "dvl", "usbl", "beacons"), np.random.SeedSequence(5).spawn(4), strict=True)
-    rng = {name: np.random.default_rng(seed) for name, seed in streams}
-    sensors = NavigationSensors(NavigationConfig(aiding=tuple(aiding)), BEACONS, RIG, rng)
+    sensors = sensors_of(aiding, BEACONS, 5)
     twist = np.array([0, 0, 0, 0.3, 0.0, 0.0])
     return [sensors.read(k / 30, LEVEL, twist, (lambda: CLEAR) if k % 5 == 0 else None) for k in range(n)]
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.controllers.allocation import pseudo_inverse_allocation
+from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
 from twin.controllers.tracking import HullModel, PoseController, feedforward_wrench
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hull import trimmed_hull
-from twin.simulate.hydrodynamics import angular_first
+from twin.simulate.hydrodynamics import Hull, angular_first
 from twin.simulate.thrusters import steady_thrust_n
 
 
@@ -24,31 +24,25 @@ def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> 
     Args:
         natural_frequency_radps: natural frequency of the closed loop in position.
     """
-    hull = trimmed_hull(VehicleConfig.model_validate({}))
-    model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
-    allocation = pseudo_inverse_allocation(angular_first(BLUEROV2_HEAVY.thrust_configuration), _thrust_n)
-    return PoseController(model, allocation, natural_frequency_radps, 1 / frame_rate_hz)
+    model = _controller_model(trimmed_hull(VehicleConfig.model_validate({})))
+    return PoseController(model, _allocation(), natural_frequency_radps, 1 / frame_rate_hz)
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     """Returns the speed in still water along a direction at which the first thruster reaches full thrust [m/s].
 
-    Full thrust is the steady thrust at command 1. Drag along each axis is a u + b u |u|, with the velocity u along the
-    axis and the coefficients a of linear and b of quadratic drag. At the speed v, each thruster therefore needs the
-    thrust p v + q v^2; p and q follow from a, b and the thrust allocation. The Munk moment and the net buoyancy are
-    neglected.
+    Drag along each axis is a u + b u |u|, with the velocity u along the axis and the coefficients a of linear and b of
+    quadratic drag. At the speed v, each thruster therefore needs the thrust p v + q v^2; p and q follow from a, b and
+    the thrust allocation. The Munk moment and the net buoyancy are neglected.
 
     Args:
-        vehicle: vehicle settings of the scenario, with the factor on drag.
         direction: (3,) unit vector of the velocity, in body axes.
     """
     hull = trimmed_hull(vehicle)
-    configuration = angular_first(BLUEROV2_HEAVY.thrust_configuration)
-    thrusts_from_force = pseudo_inverse_allocation(configuration, _thrust_n).thrusts_from_wrench[:, 3:]
+    thrusts_from_force = _allocation().thrusts_from_wrench[:, 3:]
     linear, quadratic = hull.linear_drag[3:] * direction, hull.quadratic_drag[3:] * np.abs(direction) * direction
-    full_n = float(_thrust_n(np.ones(1))[0])
     coefficients = zip(thrusts_from_force @ quadratic, thrusts_from_force @ linear, strict=True)
-    roots = np.concatenate([np.roots([q, p, sign * full_n]) for q, p in coefficients for sign in (-1, 1)])
+    roots = np.concatenate([np.roots([q, p, sign * _full_thrust_n()]) for q, p in coefficients for sign in (-1, 1)])
     real = roots[np.isreal(roots)].real
     return float(real[real > 0].min())
 
@@ -56,23 +50,33 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
 def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
     """Returns the largest absolute thrust (n,) of a thruster at each steady velocity, as a fraction of full thrust.
 
-    Full thrust is the steady thrust at command 1. The hull is level. The thrusters balance drag, the Munk moment in
-    yaw, and the net buoyancy; the moments in roll and pitch are assumed to be balanced by the righting moment.
+    The hull is level. The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the moments in roll and
+    pitch are assumed to be balanced by the righting moment.
 
     Args:
-        vehicle: vehicle settings of the scenario, with the factors on drag and added mass and the buoyancy.
         velocities: (n, 3) velocities through the water, in body axes [m/s].
     """
     hull = trimmed_hull(vehicle)
-    model = HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
+    model = _controller_model(hull)
     wrenches = np.array([feedforward_wrench(model, np.asarray(v, np.float64)) for v in velocities]).reshape(-1, 6)
     wrenches[:, :2] = 0.0
     wrenches[:, 5] += hull.weight_n - hull.buoyancy_n
-    configuration = angular_first(BLUEROV2_HEAVY.thrust_configuration)
-    thrusts = wrenches @ pseudo_inverse_allocation(configuration, _thrust_n).thrusts_from_wrench.T
-    return np.abs(thrusts).max(axis=1, initial=0.0) / float(_thrust_n(np.ones(1))[0])
+    thrusts = wrenches @ _allocation().thrusts_from_wrench.T
+    return np.abs(thrusts).max(axis=1, initial=0.0) / _full_thrust_n()
+
+
+def _controller_model(hull: Hull) -> HullModel:
+    return HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
+
+
+def _allocation() -> ThrustAllocation:
+    return pseudo_inverse_allocation(angular_first(BLUEROV2_HEAVY.thrust_configuration), _thrust_n)
+
+
+def _full_thrust_n() -> float:
+    """Returns the steady thrust of a thruster at command 1 [N]."""
+    return float(_thrust_n(np.ones(1))[0])
 
 
 def _thrust_n(command: Array) -> Array:
-    """Returns the steady thrust (n,) [N] of a BlueROV2 thruster for commands (n,) in [-1, 1]."""
     return steady_thrust_n(command, BLUEROV2_HEAVY.thrust_coefficients)

@@ -22,41 +22,30 @@ from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.thrusters import (
-    LaggedThrusters,
     ThrusterState,
+    lagged_thrusters,
     set_thruster_command,
     step_thrusters,
     thruster_wrench,
-)
+)  # fmt: skip
 
 
 class RigidBodyState(NamedTuple):
     """State and parameters of a rigid body in water; the arrays of the state are modified in place.
 
-    Args:
-        pose: (4, 4) true pose world_from_body, modified in place.
-        velocity: (6,) [linear in world axes, angular in body axes] velocity [m/s, rad/s], half a timestep before the
-            time of the pose, modified in place.
-        acceleration: (6,) rate of change of `velocity` in the last step [m/s2, rad/s2], modified in place.
-        kick: (1,) number of timesteps over which the next step integrates the acceleration: 0.5 in the first step
-            (leapfrog), then 1; modified in place.
-        thrusters: thrusters of the vehicle, modified in place.
-        hull: hull of the vehicle.
-        current: (3,) velocity of the steady current in the world [m/s].
-        timestep_s: physics timestep.
-        floor: floor that the hull must not touch.
-        left: (1,) number of timesteps that were not simulated since the hull touched the floor; -1 if it did not.
+    The velocity is [linear in world axes, angular in body axes] [m/s, rad/s].
     """
 
-    pose: Array
-    velocity: Array
-    acceleration: Array
-    kick: Array
+    pose: Array  #: (4, 4) true pose world_from_body
+    velocity: Array  #: (6,) velocity half a timestep before the time of the pose
+    acceleration: Array  #: (6,) rate of change of `velocity` in the last step
+    kick: Array  #: (1,) number of timesteps over which the next step integrates: 0.5 in the first (leapfrog), then 1
     thrusters: ThrusterState
     hull: Hull
-    current: Array
+    current: Array  #: (3,) velocity of the steady current in the world [m/s]
     timestep_s: float
-    floor: FloorField
+    floor: FloorField  #: floor that the hull must not touch
+    #: (1,) number of timesteps that were not simulated since the hull touched the floor; -1 if it did not.
     left: NDArray[np.int64]
 
 
@@ -64,32 +53,24 @@ class CompiledVehicle:
     """BlueROV2 Heavy under thrust, drag and current, integrated by compiled code.
 
     Args:
-        vehicle: vehicle settings of the scenario: buoyancy, and factors on drag and added mass.
         current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
-        timestep_s: physics timestep.
         floor: floor that the hull must not touch.
     """
 
     def __init__(
-        self,
-        vehicle: VehicleConfig,
-        current_mps: Array,
-        world_from_body: Array,
-        timestep_s: float,
+        self, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array, timestep_s: float,
         floor: FloorField = OPEN_WATER,
-    ):
-        thrusters = LaggedThrusters(BLUEROV2_HEAVY, timestep_s).state
+    ):  # fmt: skip
+        thrusters = lagged_thrusters(BLUEROV2_HEAVY, timestep_s)
         self.state = RigidBodyState(
             np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
-            trimmed_hull(vehicle), np.array(current_mps, float), timestep_s,
-            floor, np.full(1, -1),
+            trimmed_hull(vehicle), np.array(current_mps, float), timestep_s, floor, np.full(1, -1),
         )  # fmt: skip
         self._time_s = 0.0
 
     @property
     def world_from_body(self) -> Array:
-        """Returns the true pose world_from_body (4, 4)."""
         return self.state.pose.copy()
 
     @property
@@ -108,11 +89,7 @@ class CompiledVehicle:
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
-        """Advances the clock and checks the state (`has_ended`); to be called after `advance`.
-
-        Raises:
-            SurveyAborted: the physics diverged, or the hull touches the floor.
-        """
+        """Advances the clock after `advance`, and raises SurveyAborted as `step` does."""
         self._time_s += duration_s
         if (left := int(self.state.left[0])) >= 0:
             raise contact_error("the floor", self._time_s - left * self.state.timestep_s, self.state.pose)
@@ -129,21 +106,14 @@ def body_twist(body):
 
 @kernel
 def has_ended(body):
-    """Returns whether the hull touches the floor, or the physics diverged.
-
-    It diverged if a component of the velocity is NaN or its magnitude reaches SPEED_LIMIT_MPS or RATE_LIMIT_RADPS.
-    SPEED_LIMIT_MPS applies to the linear components, RATE_LIMIT_RADPS to the angular ones.
-    """
+    """Returns whether the hull touches the floor, or the physics diverged: a velocity is NaN or reaches a limit."""
     speed, rate = np.abs(body.velocity[:3]).max(), np.abs(body.velocity[3:]).max()
     return body.left[0] >= 0 or not (speed < SPEED_LIMIT_MPS and rate < RATE_LIMIT_RADPS)
 
 
 @kernel
 def advance(body, command, n_steps):
-    """Advances the state in place by `n_steps` timesteps under thruster commands (8,), clipped to [-1, 1].
-
-    It stops early if the hull touches the floor.
-    """
+    """Advances the state by `n_steps` timesteps under commands (8,); stops early if the hull touches the floor."""
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
     set_thruster_command(thrusters, command)
     for n in range(n_steps):

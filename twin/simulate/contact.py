@@ -18,22 +18,14 @@ _REACH_M = float(np.linalg.norm(HALF_M))
 
 
 class FloorField(NamedTuple):
-    """Floor with which the hull may come into contact.
-
-    Args:
-        height_m: (ny, nx) heights of the nodes; row 0 = south. Cells are split from node (r, c) to (r + 1, c + 1).
-        spacing_m: distance between neighbouring nodes.
-        west_m, south_m: position of node (0, 0).
-        highest_m: greatest height within the reach of a hull whose centre lies in a block of n x n cells.
-        block_m: side of a block.
-    """
+    """Floor with which the hull may come into contact: a height grid as `twin.core.height_field.HeightField`."""
 
     height_m: NDArray[np.float32]
     spacing_m: float
     west_m: float
     south_m: float
-    highest_m: NDArray[np.float32]
-    block_m: float
+    highest_m: NDArray[np.float32]  #: greatest height within the reach of a hull whose centre lies in a block of cells
+    block_m: float  #: side of a block
 
 
 def floor_field(height_m: NDArray[np.float32], spacing_m: float, west_m: float, south_m: float) -> FloorField:
@@ -70,12 +62,10 @@ def touches_floor(floor, pose):
         return False
     corners, z = np.empty((4, 3)), floor.height_m
     ny, nx = z.shape
-    for r in range(
-        max(int((y - reach[1]) / floor.spacing_m), 0), min(int((y + reach[1]) / floor.spacing_m) + 1, ny - 1)
-    ):
-        for c in range(
-            max(int((x - reach[0]) / floor.spacing_m), 0), min(int((x + reach[0]) / floor.spacing_m) + 1, nx - 1)
-        ):
+    south, north = int((y - reach[1]) / floor.spacing_m), int((y + reach[1]) / floor.spacing_m)
+    west, east = int((x - reach[0]) / floor.spacing_m), int((x + reach[0]) / floor.spacing_m)
+    for r in range(max(south, 0), min(north + 1, ny - 1)):
+        for c in range(max(west, 0), min(east + 1, nx - 1)):
             if max(z[r, c], z[r, c + 1], z[r + 1, c], z[r + 1, c + 1]) < low:
                 continue
             if r == int(y / floor.spacing_m) and c == int(x / floor.spacing_m) and z[r, c] > centre[2]:

@@ -25,20 +25,14 @@ from twin.kernels import kernel
 class Hull(NamedTuple):
     """Parameters of a hull; the body axes are its principal axes, with the origin in the centre of gravity.
 
-    Args:
-        inertia: (6,) moments of inertia [kg m2], then the mass three times [kg].
-        added_inertia: (6,) added moments of inertia [kg m2], then added masses [kg].
-        linear_drag: (6,) coefficients of linear drag [N m s/rad, then N s/m], positive.
-        quadratic_drag: (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive.
-        centre_of_buoyancy_m: (3,) position of the centre of buoyancy in body axes.
-        weight_n, buoyancy_n: weight and buoyancy force [N].
+    Its arrays (6,) have the angular components first.
     """
 
-    inertia: Array
-    added_inertia: Array
-    linear_drag: Array
-    quadratic_drag: Array
-    centre_of_buoyancy_m: Array
+    inertia: Array  #: moments of inertia [kg m2], then the mass three times [kg]
+    added_inertia: Array  #: added moments of inertia [kg m2], then added masses [kg]
+    linear_drag: Array  #: coefficients of linear drag [N m s/rad, then N s/m], positive
+    quadratic_drag: Array  #: coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive
+    centre_of_buoyancy_m: Array  #: (3,)
     weight_n: float
     buoyancy_n: float
 
@@ -76,11 +70,8 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     momentum, added_momentum = hull.inertia * twist, hull.added_inertia * relative
     added_flow = np.zeros(6)
     _add_cross(added_flow, 3, 1.0, twist, 0, flow, 3)
-    force = (
-        wrench
-        - (hull.linear_drag + hull.quadratic_drag * np.abs(relative)) * relative
-        - hull.added_inertia * added_flow
-    )
+    drag = (hull.linear_drag + hull.quadratic_drag * np.abs(relative)) * relative
+    force = wrench - drag - hull.added_inertia * added_flow
     for p in (momentum, added_momentum):
         _add_cross(force, 0, -1.0, twist, 0, p, 0)
         _add_cross(force, 3, -1.0, twist, 0, p, 3)
@@ -95,15 +86,13 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
 def free_joint_acceleration(
     hull: Hull, world_from_body: Array, velocity: Array, current_mps: Array, wrench: Array
 ) -> Array:
-    """Returns the acceleration (6,) in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
+    """Returns the `acceleration` (6,) in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
 
     These coordinates are [linear in world axes, angular in body axes]. The linear part is R (v' + w x v), with R =
     `world_from_body`, v the linear and w the angular velocity in body axes, and v' the rate of change of v.
 
     Args:
-        hull, world_from_body: as defined in `acceleration`.
         velocity: (6,) velocity in these coordinates [m/s, rad/s].
-        current_mps, wrench: as defined in `acceleration`.
     """
     twist = twist_from_free_joint(world_from_body, velocity)
     body_acceleration = acceleration(hull, world_from_body, twist, current_mps, wrench)
@@ -118,10 +107,7 @@ def free_joint_acceleration(
 
 @kernel
 def twist_from_free_joint(world_from_body: Array, velocity: Array) -> Array:
-    """Returns the [angular, linear] velocity (6,) in body axes from the velocity (6,) of a free joint of MuJoCo.
-
-    The velocity of a free joint is [linear in world axes, angular in body axes] [m/s, rad/s].
-    """
+    """Returns the [angular, linear] velocity (6,) in body axes from the velocity (6,) of a free joint of MuJoCo."""
     twist = np.zeros(6)
     for k in range(3):
         twist[k] = velocity[3 + k]

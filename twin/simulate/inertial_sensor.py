@@ -20,18 +20,13 @@ def inertial_quantities(rotation: Array, rate_radps: Array, acceleration_mps2: A
 
     Args:
         rotation: (3, 3) rotation R world_from_body.
-        rate_radps: (3,) angular rate in body axes.
         acceleration_mps2: (3,) acceleration a of the origin of the body, in world axes.
     """
     return np.concatenate([rate_radps, rotation.T @ (acceleration_mps2 + [0.0, 0.0, GRAVITY_MPS2])])
 
 
 def imu_rate_hz(settings: ImuConfig, motion_rate_hz: float) -> float:
-    """Returns the rate of the readings [Hz]: that of the scenario, or `motion_rate_hz` if the scenario gives none.
-
-    Args:
-        settings: section [imu] of the scenario.
-        motion_rate_hz: rate at which the motion of the vehicle is simulated.
+    """Returns the rate of the readings [Hz]: that of the scenario or, without one, of the simulated motion.
 
     Raises:
         TwinError: the rate of the scenario is above that of the simulated motion.
@@ -53,7 +48,6 @@ class InertialSensor:
     deviation w / sqrt(f), with w the density of its random walk.
 
     Args:
-        settings: section [imu] of the scenario.
         motion_rate_hz: rate of the values given to `add`.
         start: (6,) true [angular rate, specific force] at 0 s, in body axes [rad/s, m/s2].
         rng: random generator of this sensor only.

@@ -22,10 +22,9 @@ class KinematicVehicle:
         world_from_body: (4, 4) initial pose, at rest and level.
 
     Attributes:
-        inertial: true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]. The angular rate is zero. The
-            acceleration is the change of velocity at the start of the last step, divided by the duration of the step.
-        after_timestep: function called with `inertial` after each step; None: none is called.
-        touched: as in `MujocoVehicle`; called after each step.
+        inertial: true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]; the acceleration is the change of
+            velocity at the start of the last step, divided by the duration of the step.
+        after_timestep, touched: as in `MujocoVehicle`, with the steps of `step`.
     """
 
     def __init__(self, world_from_body: Array):

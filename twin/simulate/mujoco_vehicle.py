@@ -17,7 +17,7 @@ from twin.simulate.contact import contact_error
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.inertial_sensor import inertial_quantities
-from twin.simulate.thrusters import LaggedThrusters
+from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, step_thrusters, thruster_wrench
 
 
 class MujocoVehicle:
@@ -29,14 +29,12 @@ class MujocoVehicle:
 
     Args:
         model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
-        vehicle: vehicle settings of the scenario: buoyancy, and factors on drag and added mass.
         current_mps: (3,) velocity of the steady current: east, north, up.
         world_from_body: (4, 4) initial pose, at rest.
 
     Attributes:
-        after_timestep: function called with `inertial` after each timestep; None: none is called.
-        touched: function that returns which obstacle the hull touches at a pose world_from_body, "" for none; called
-            after each timestep.
+        after_timestep: called with `inertial` after each timestep; None: nothing is called.
+        touched: returns which obstacle the hull touches at a pose world_from_body, "" for none.
     """
 
     def __init__(self, model: MjModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
@@ -49,7 +47,7 @@ class MujocoVehicle:
         self._dofs = slice(first_v, first_v + 6)
         self._acceleration = np.zeros(6)
         self._kick = 0.5  # the first step advances the velocity by half a timestep, see the class docstring
-        self._thrusters = LaggedThrusters(BLUEROV2_HEAVY, self._model.opt.timestep)
+        self._thrusters = lagged_thrusters(BLUEROV2_HEAVY, self._model.opt.timestep)
         self._history: deque[tuple[float, Array, Array]] = deque(maxlen=3)
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
@@ -59,12 +57,10 @@ class MujocoVehicle:
 
     @property
     def time_s(self) -> float:
-        """Returns the simulated time [s]."""
         return float(self._data.time)
 
     @property
     def world_from_body(self) -> Array:
-        """Returns the true pose world_from_body (4, 4)."""
         return geometry.pose(self._rotation, self._data.xpos[self._body])
 
     @property
@@ -75,13 +71,12 @@ class MujocoVehicle:
     @property
     def inertial(self) -> Array:
         """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2], at the time of the pose."""
-        velocity, wrench = self._velocity_now(), self._thrusters.wrench()
+        velocity, wrench = self._velocity_now(), thruster_wrench(self._thrusters)
         acceleration = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
         return inertial_quantities(self._rotation, velocity[3:], acceleration[:3])
 
     @property
     def _rotation(self) -> Array:
-        """Returns the rotation world_from_body (3, 3)."""
         return self._data.xmat[self._body].reshape(3, 3)
 
     def _velocity_now(self) -> Array:
@@ -96,10 +91,10 @@ class MujocoVehicle:
             ValueError: the duration is not a whole number of timesteps.
         """
         n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
-        self._thrusters.command(thruster_u)
+        set_thruster_command(self._thrusters, thruster_u)
         for _ in range(n_steps):
-            self._advance(self._thrusters.wrench())
-            self._thrusters.step()
+            self._advance(thruster_wrench(self._thrusters))
+            step_thrusters(self._thrusters)
             if self.after_timestep is not None:
                 self.after_timestep(self.inertial)
             if obstacle := self.touched(self.world_from_body):
@@ -107,7 +102,7 @@ class MujocoVehicle:
         self._history.append(self._snapshot())
 
     def _advance(self, wrench: Array) -> None:
-        """Simulates one timestep under the wrench (6,) of the thrusters, [moment, force] in body axes [N m, N]."""
+        """Simulates one timestep under the wrench (6,) of the thrusters."""
         model, data = self._model, self._data
         velocity = self._velocity_now()
         target = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
@@ -122,12 +117,7 @@ class MujocoVehicle:
         self._acceleration, self._kick = target, 1.0
 
     def _check_divergence(self, acceleration: Array, velocity: Array) -> None:
-        """Raises SurveyAborted, listing the last states, if the physics has diverged.
-
-        It has diverged if a component of the acceleration (6,) is not finite, or if a component of the velocity (6,) is
-        NaN or reaches SPEED_LIMIT_MPS (linear) or RATE_LIMIT_RADPS (angular). Both are in the coordinates of the free
-        joint.
-        """
+        """Raises SurveyAborted, listing the last states, if a value is not finite or reaches a limit of `hull`."""
         speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
         if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:
             return
@@ -135,14 +125,10 @@ class MujocoVehicle:
         raise SurveyAborted(f"the physics diverged at {self.time_s:.3f} s; last states: {states}")
 
     def _snapshot(self) -> tuple[float, Array, Array]:
-        """Returns time [s], position (3,) [m] and velocity of the free joint (6,) [m/s, rad/s].
-
-        The velocity is ordered as `qvel` and refers to the time half a timestep earlier.
-        """
+        """Returns time [s], position (3,) [m] and, of half a timestep earlier, `qvel` (6,) [m/s, rad/s]."""
         return self.time_s, self._data.xpos[self._body].copy(), self._velocity.copy()
 
 
 def _describe(time_s: float, position_m: Array, velocity: Array) -> str:
-    """Returns a state as text for an error message."""
     linear, angular = np.round(velocity, 4).reshape(2, 3).tolist()
     return f"{time_s:.3f} s: at {np.round(position_m, 4).tolist()} m, {linear} m/s, {angular} rad/s"

@@ -31,7 +31,7 @@ def compiled_loop(
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
-    sensors, n_steps = world.sensors.per_frame_sensors(), whole_timesteps(interval_s, vehicle.state.timestep_s)
+    sensors, n_steps = world.sensors.per_frame, whole_timesteps(interval_s, vehicle.state.timestep_s)
 
     def fast_forward(sequence: FrameSequence, first: int) -> int:
         errors, ahead = vision.frame_errors, sequence.keyframe[first:]
