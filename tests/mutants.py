@@ -115,8 +115,8 @@ MUTANTS = [
         # plug-ins, world, surrogate, sessions
         ("twin/plugin/guard.py", "max(error, turned) > _ROTATION_TOLERANCE", "error > _ROTATION_TOLERANCE", "plugin_guard"),
         ("twin/plugin/guard.py", "function(*copy.deepcopy(arguments))", "function(*arguments)", "plugin_guard"),
-        ("twin/world/limits.py", "hold_s = scenario.control.hold_s * plan.n_tracks", "hold_s = scenario.control.hold_s", "world_mission hostile_input"),
-        ("twin/world/clearance.py", "2 * round(side / 2 / terrain.spacing_m) + 1", "2 * round(side / terrain.spacing_m) + 1", "world_planned_surface world_planning"),
+        ("twin/world/planning.py", "(duration_s + hold_s * plan.n_tracks)", "(duration_s + hold_s)", "world_mission hostile_input"),
+        ("twin/world/path_checks.py", "2 * round(side / 2 / terrain.spacing_m) + 1", "2 * round(side / terrain.spacing_m) + 1", "world_planned_surface world_planning"),
         ("twin/surrogate/sampling.py", "(normals[k] - errors.anticorrelation * previous_normals[k])", "(normals[k] + errors.anticorrelation * previous_normals[k])", "surrogate"),
         ("twin/session/mission_actions.py", "change_per_s = (target - self._rate) / BRAKING_S", "change_per_s = (target - self._rate) * 4 / BRAKING_S", "session_mission_actions"),
         ("twin/session/survey_check.py", "MAX_OFF_COURSE * min(mission.plan.footprint_m)", "MAX_OFF_COURSE * max(mission.plan.footprint_m)", "session_survey_check"),

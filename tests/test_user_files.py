@@ -25,7 +25,7 @@ from twin.report.comparison import load_runs
 from twin.report.run_folder import read_raster
 from twin.scenario.file import load_scenario
 from twin.terrains.objects.mesh_file import read_mesh
-from twin.world.placement import read_geojson
+from twin.world.asked_area import read_geojson
 
 ROOT = Path(__file__).parent.parent
 PLACED = from_origin(500000.0, 8000000.0, 0.5, 0.5)

@@ -7,7 +7,8 @@ import pytest
 
 from twin.core import geometry
 from twin.core.records import MapGrid, StereoRig
-from twin.world.coverage import Coverage, true_heights
+from twin.world.observed_cells import Coverage
+from twin.world.top_surface import true_heights
 
 RIG = StereoRig(320, 240, 277.128, 0.15, 30, np.eye(4))
 GRID = MapGrid(-2.0, 2.0, 0.02, 200, 200)

@@ -23,10 +23,10 @@ from twin.terrains.objects import mesh_file
 from twin.terrains.objects.floor_mesh import divided, levelled, tiles_of
 from twin.terrains.objects.mesh import Mesh, joined
 from twin.terrains.objects.mesh_file import TexturedMesh
-from twin.world import mesh_floor
-from twin.world.coverage import true_heights
+from twin.world import mesh_floor, top_surface
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, prepare
+from twin.world.top_surface import true_heights
 from twin.world.true_albedo import true_albedo
 
 W, H, FOCAL = 160, 120, 130.0
@@ -138,7 +138,7 @@ def ray_points(depth: np.ndarray) -> np.ndarray:
 
 def test_a_height_grid_as_a_mesh_has_the_same_truth(tmp_path, monkeypatch):
     """The zero of the height is the lowest node of a grid that is finer by 3 %, which adds an offset below 1 mm."""
-    monkeypatch.setattr(mesh_floor, "_ROWS_PER_BLOCK", 100)
+    monkeypatch.setattr(top_surface, "_ROWS_PER_BLOCK", 100)
     mission = mission_of(exported(sheet(), tmp_path))
     assert mission.mesh_floor is not None and mission.terrain.n_filled == 0
     surface, expected = floor_surface(mission.mesh_floor, GRID), true_heights(GRID, REEF.height_at)

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from twin.errors import ScenarioError, TwinError
+from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.surrogate import matchability
-from twin.world.mission import load_terrain, prepare
+from twin.world.floor import load_terrain
+from twin.world.mission import prepare
 
 BAD_BEACONS = [
     (
@@ -59,8 +60,8 @@ BAD_SENSORS = [
     ],
 )
 def test_texture_keys_without_effect_are_rejected(overrides, error):
-    with pytest.raises(TwinError, match=error):
-        load_terrain(load_scenario("quickstart", overrides))
+    with pytest.raises(ScenarioError, match=error):
+        prepare(load_scenario("quickstart", overrides))
 
 
 @pytest.mark.parametrize("fidelity", ["surrogate", "rendered"])

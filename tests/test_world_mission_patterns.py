@@ -1,6 +1,5 @@
 """Surveys other than the lawnmower of the ROV: loops and the paper's level motion; every scene can be planned."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,8 @@ from twin.core.records import Trajectory
 from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.scenario.file import load_scenario
 from twin.simulate.kinematic_vehicle import KinematicVehicle
-from twin.world.mission import _check_speed, prepare
+from twin.world.mission import prepare
+from twin.world.thrust_authority import check_speed
 
 pytestmark = pytest.mark.long
 
@@ -121,7 +121,7 @@ def test_the_speed_limit_of_loops_is_that_of_the_slowest_direction_at_the_speed_
     mission = prepare(load_scenario("reef", [*LOOPS, "plan.speed_mps=0.7"]))
     assert mission.plan.speed_mps < 0.3  # of loops with a diameter of 0.8 m
     with pytest.raises(TwinError, match=r"0.7: too fast for the thrusters \(allowed: up to 0.63\)"):
-        _check_speed(mission.scenario.vehicle, mission.scenario.plan, dataclasses.replace(mission.plan, speed_mps=0.7))
+        check_speed(mission.scenario.vehicle, mission.scenario.plan, 0.7)
 
 
 def test_the_speed_limit_is_that_of_the_bow_and_a_kinematic_vehicle_has_none():

@@ -13,9 +13,9 @@ from twin.terrains.objects.mesh import mesh_of
 from twin.terrains.objects.model import PlacedObject, model_of
 from twin.terrains.objects.primitives import sphere
 from twin.terrains.objects.shapes import build_shape
-from twin.world.coverage import Coverage
 from twin.world.mission import prepare
-from twin.world.top_surface import top_surface
+from twin.world.observed_cells import Coverage
+from twin.world.top_surface import TopSurface, top_surface
 from twin.world.true_albedo import without_objects
 
 GRID = MapGrid(-0.6, 0.5, 0.01, 100, 120)
@@ -31,7 +31,7 @@ def placed(mesh, position, scale=1.0):
 def test_the_surface_of_a_ball_from_above_is_its_upper_half():
     """A ball of radius 0.3 centred 0.1 above the floor: facets of 2.6 deg lie at most 0.1 mm inside the sphere."""
     ball = placed(mesh_of(*sphere(), (1, 1, 1)), (0.1, -0.05, 0.0), 0.3)  # stands on z = 0, so its centre is at 0.3
-    surface = top_surface(GRID, FLOOR, [ball])
+    surface = top_surface(GRID, TopSurface(FLOOR), [ball])
     x, y = np.meshgrid(*GRID.centres())
     square = 0.09 - (x - 0.1) ** 2 - (y + 0.05) ** 2
     inside, outside = square > 0.001, square < -0.001
@@ -44,9 +44,9 @@ def test_the_surface_of_a_ball_from_above_is_its_upper_half():
 
 def test_blocks_of_rows_do_not_change_the_surface(monkeypatch):
     items = [placed(build_shape("table_coral", None, np.random.default_rng(0)), (0, 0, 0.1), 0.8)]
-    whole = top_surface(GRID, FLOOR, items)
+    whole = top_surface(GRID, TopSurface(FLOOR), items)
     monkeypatch.setattr("twin.world.top_surface._ROWS_PER_BLOCK", 7)
-    for part, same in zip(top_surface(GRID, FLOOR, items), whole, strict=True):
+    for part, same in zip(top_surface(GRID, TopSurface(FLOOR), items), whole, strict=True):
         np.testing.assert_array_equal(part, same)
     assert whole.objects.any() and whole.overhung.any() and not whole.objects.all()
 

@@ -16,8 +16,8 @@ from twin.exchange import geotiff
 from twin.report.run_folder import load_run, read_raster
 from twin.scenario.file import load_scenario
 from twin.scenario.model import PlanConfig
+from twin.world.asked_area import read_geojson, survey_area
 from twin.world.mission import prepare
-from twin.world.placement import read_geojson, survey_area
 
 UTM = "EPSG:32755"
 WEST, NORTH, CELL = 412_345.25, 8_345_678.5, 0.05

@@ -16,10 +16,10 @@ from twin.terrains import Terrain, TextureSource
 from twin.terrains.objects.mesh import mesh_of
 from twin.terrains.objects.model import PlacedObject, model_of
 from twin.terrains.objects.primitives import box
-from twin.world.floor_forecast import forecast_over_floor
+from twin.world.floor_forecast import forecast_over_floor, planned_surface
 from twin.world.mission import prepare
 from twin.world.planned_images import floor_of
-from twin.world.planned_surface import FINE_M, planned_surface
+from twin.world.top_surface import FINE_M
 
 LEVEL = Terrain(np.zeros((141, 181), np.float32), 0.05, -4.5, -3.5, np.zeros((2, 2, 3), np.uint8), 4.5)
 LOW, HIGH = np.array([-0.423, -0.311, 0.0]), np.array([0.197, 0.209, 0.35])  #: corners of the crate
@@ -106,7 +106,7 @@ def test_beside_the_objects_the_surface_is_that_of_the_floor(monkeypatch):
 
 def test_a_large_terrain_keeps_to_the_limit_of_nodes(monkeypatch):
     mission = mission_over(LEVEL, monkeypatch, objects=[crate()])
-    monkeypatch.setattr("twin.world.planned_surface.MAX_NODES", 4 * LEVEL.height_m.size)
+    monkeypatch.setattr("twin.world.top_surface.MAX_NODES", 4 * LEVEL.height_m.size)
     assert planned_surface(mission).spacing_m == pytest.approx(0.025)
 
 

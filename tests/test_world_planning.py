@@ -13,13 +13,12 @@ from twin.judge.overlap import overlap_metrics
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.terrains import Terrain, TextureSource
-from twin.world.clearance import path_points
-from twin.world.coverage import true_heights
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread
 from twin.world.mission import prepare
-from twin.world.planned_images import planned_keyframes
+from twin.world.planned_images import planned_keyframes, planned_references
 from twin.world.planning import plan_survey, survey_request
 from twin.world.thrust_authority import check_thrust, climb_slope
+from twin.world.top_surface import true_heights
 
 SMALL = ["terrain.texture_px_m=0.2", "plan.area_m=[3.0, 1.6]", "plan.altitude_m=2.0"]
 
@@ -194,7 +193,7 @@ def test_a_path_over_a_slope_higher_than_the_altitude_follows_it(grade, monkeypa
     """The level path at 1.2 m would lie below the upper part of the slope."""
     slope = floor(lambda x, y: 1.0 + grade * x)
     mission = over(slope, monkeypatch, "plan.height=floor", "plan.altitude_m=1.2", "plan.area_m=[5.0, 1.0]")
-    x, y, z = path_points(mission.plan).T
+    x, y, z = planned_references(mission.plan).position.T
     assert np.ptp(z) > 4.9 * abs(grade)
     assert z - slope.height_at(x, y) == pytest.approx(1.2, abs=0.03)
 
@@ -241,5 +240,5 @@ def test_without_a_current_a_level_plan_needs_no_check():
     mission = prepare(scenario())
     check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, mission.plan)
     hopeless = dataclasses.replace(mission.plan, speed_mps=9.0)
-    check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, hopeless)  # that is `_check_speed`'s
+    check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, hopeless)  # that is `check_speed`'s
     assert survey_request(mission.scenario, mission.terrain).along_scale == 1

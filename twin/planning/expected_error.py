@@ -23,9 +23,9 @@ from twin.surrogate.map_model import (
     step_slope,
 )
 from twin.surrogate.matchability import Matchability
-from twin.world.coverage import true_heights
 from twin.world.floor_forecast import FloorForecast
 from twin.world.mission import Mission
+from twin.world.top_surface import true_heights
 
 #: Largest number of floor points from which the distribution of the height error is computed.
 _POINTS = 20_000

@@ -26,7 +26,7 @@ from twin.kernels import kernel
 from twin.surrogate.error_model import DepthLaw, ErrorModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import IDEAL_TABLE, ViewTable, measure_point
-from twin.world.coverage import DEPTH_TOLERANCE
+from twin.world.observed_cells import DEPTH_TOLERANCE
 
 Map = NDArray[np.float32]
 WINDOW_PX = 11  #: side of the window of dense matching, over which the roughness of a cell is computed

@@ -31,10 +31,10 @@ from twin.surrogate.map_model import MapModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import measured_view
 from twin.surrogate.vision import SurrogateVision, TrueScene
-from twin.world.coverage import true_heights
 from twin.world.mission import Mission, Step
 from twin.world.obstacles import Obstacles, floor_of
 from twin.world.pilot import PilotOfEstimates, RovPilot
+from twin.world.top_surface import true_heights
 from twin.world.world import CameraImages, FastForward, World, left_camera, streams
 
 _BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # placeholder: an image without pixels

@@ -11,18 +11,17 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.core.height_field import HeightField, cast_pixels, ray_grid
 from twin.core.image_overlap import RAY_COLUMNS, image_overlap
-from twin.core.records import MapGrid, StereoRig
+from twin.core.records import MapGrid
 from twin.judge.overlap import KeyframePoses
 from twin.terrains import Terrain
-from twin.world.coverage import Coverage
 from twin.world.mission import Mission
+from twin.world.observed_cells import Coverage
 from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned
-from twin.world.planned_surface import planned_surface
+from twin.world.top_surface import with_objects
 
-#: Approximate number of columns of the depth images from which the coverage is computed, and largest number of grid
-#: cells along the longer side of the terrain.
-_COVERAGE_COLUMNS = 80
-_COVERAGE_CELLS = 1000
+#: Approximate number of columns of the binned depth images from which the coverage is computed, and largest number of
+#: grid cells along the longer side of the terrain.
+_COVERAGE_COLUMNS, _COVERAGE_CELLS = 80, 1000
 
 
 class Spread(NamedTuple):
@@ -40,45 +39,36 @@ class FloorForecast:
 
     There are k pairs of consecutive keyframes along the swaths, and j pairs across neighbouring swaths.
 
-    Args:
-        surface: floor and objects as seen from above, see `planned_surface`; "floor" below refers to this surface.
-        keyframes: planned poses of the keyframes.
-        depth_m: (n, m) depth along the optical axis at m pixels on a regular grid [m].
-        altitude_m: (n,) height of the camera above the floor straight below it [m].
-        clearance_m: (n,) height of the camera above the highest floor in its image [m].
-        footprint_m: (n, 2) extent of the image on a level floor at its median depth, across and along the heading [m].
-        gsd_m: (n,) ground sample distance at the median depth [m].
-        stereo_share: (n,) share of the floor in the left image that the right image shows too.
-        along_position_m, across_position_m: (k, 2) and (j, 2) horizontal midpoint of the two cameras of each pair [m].
-        overlap_along: (k,) overlap of consecutive keyframes of the same swath.
-        overlap_across: (j,) sidelap: overlap of a keyframe with the image abreast of it on the next swath.
-        coverage: share of the asked area that both cameras see in at least one keyframe, approximated with depth images
-            of fewer pixels.
     """
 
-    surface: Terrain
+    surface: Terrain  #: `planned_surface`; "floor" below refers to this surface
     keyframes: KeyframePoses
-    depth_m: Array
-    altitude_m: Array
-    clearance_m: Array
-    footprint_m: Array
-    gsd_m: Array
-    stereo_share: Array
+    depth_m: Array  #: (n, m) depth along the optical axis at m pixels on a regular grid
+    altitude_m: Array  #: (n,) height of the camera above the floor straight below it
+    clearance_m: Array  #: (n,) height of the camera above the highest floor in its image
+    footprint_m: Array  #: (n, 2) extent on a level floor at the median depth, across and along the heading
+    gsd_m: Array  #: (n,) ground sample distance at the median depth
+    stereo_share: Array  #: (n,) share of the floor in the left image that the right image shows too
+    #: along_position_m, across_position_m: (k, 2) and (j, 2) horizontal midpoint of the two cameras of each pair.
     along_position_m: Array
     across_position_m: Array
-    overlap_along: Array
-    overlap_across: Array
-    coverage: float
+    overlap_along: Array  #: (k,) overlap of consecutive keyframes of the same swath
+    overlap_across: Array  #: (j,) sidelap: overlap of a keyframe with the image abreast of it on the next swath
+    coverage: float  #: share of the asked area that both cameras see in a keyframe, from images of fewer pixels
 
 
 class PlannedOverlap(NamedTuple):
-    """Median overlap and sidelap of the planned keyframes, by ray casting on floor and objects.
-
-    A value is None if there is no pair whose first image shows floor.
-    """
+    """Median overlap and sidelap of the planned keyframes; None if there is no pair whose first image shows floor."""
 
     along: float | None
     across: float | None
+
+
+def planned_surface(mission: Mission) -> Terrain:
+    """Returns the floor with its objects as seen from above; the surrogate, which simulates none, sees the floor."""
+    if not mission.objects or mission.scenario.imaging.fidelity != "rendered":
+        return mission.terrain
+    return with_objects(mission.terrain, mission.objects)
 
 
 def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedOverlap:
@@ -145,7 +135,7 @@ def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
 
     It is 0 if no cell of the terrain lies in the asked area.
     """
-    small, grid = _reduced(mission.rig), _grid_of_terrain(mission)
+    small, grid = mission.rig.binned(max(1, mission.rig.width_px // _COVERAGE_COLUMNS)), _grid_of_terrain(mission)
     coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
     shape = small.height_px, small.width_px
     for left in poses:
@@ -165,8 +155,3 @@ def _grid_of_terrain(mission: Mission) -> MapGrid:
     cell_m = max(mission.grid.cell_m, max(t.size_m) / _COVERAGE_CELLS)
     cols, rows = (max(1, int(side / cell_m)) for side in t.size_m)
     return MapGrid(t.west_m, t.north_m, cell_m, rows, cols)
-
-
-def _reduced(rig: StereoRig) -> StereoRig:
-    """Returns the calibration for images binned to about _COVERAGE_COLUMNS columns."""
-    return rig.binned(max(1, rig.width_px // _COVERAGE_COLUMNS))

@@ -22,60 +22,54 @@ from twin.core.records import Array, Image, MapGrid
 from twin.errors import TwinError
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 from twin.imaging.scene.object_view import Objects, draw_objects
-from twin.scenario.model import Scenario, TerrainConfig
+from twin.scenario.model import Scenario
 from twin.terrains.holes import known_nodes
 from twin.terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
 from twin.terrains.objects.mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
 from twin.terrains.terrain import texture_shape
-from twin.world.coverage import true_heights
-from twin.world.top_surface import FROM_ABOVE, FROM_BELOW, OVERHANG_M
+from twin.world.top_surface import (
+    FROM_ABOVE,
+    FROM_BELOW,
+    OVERHANG_M,
+    Layer,
+    TopSurface,
+    row_blocks,
+    true_heights,
+    view_from_above,
+)  # fmt: skip
 
 FIELD = "terrain.mesh_file"
+_COVERING = "a mesh that covers the planned area"
 FINEST_GRID_M = 0.005  #: least spacing of the height grid
 MOST_NODES = 2_000_000  #: most nodes of the height grid; its spacing exceeds `terrain.grid_m` if necessary
 MARGIN_M = 0.005  #: distance by which the height grid below the mesh is lowered
-_ROWS_PER_BLOCK = 256  # the images of a block take 33 bytes per texel
-
-Layer = NDArray[np.float32]
 
 
 class MeshFloor(NamedTuple):
-    """Sea floor that is a mesh.
+    """Sea floor that is a mesh."""
 
-    Args:
-        terrain: height grid of the highest surface, with its colours as texture.
-        under: height grid below the mesh; it is rendered together with the mesh.
-        tiles: the mesh, divided into tiles.
-    """
-
-    terrain: terrains.Terrain
-    under: terrains.Terrain
-    tiles: FloorTiles
-
-
-class FloorSurface(NamedTuple):
-    """Surface of a mesh floor as seen from above; both arrays (rows, cols) are defined as in `TopSurface`."""
-
-    height_m: Layer
-    overhung: NDArray[np.bool_]
+    terrain: terrains.Terrain  #: height grid of the highest surface, with its colours as texture
+    under: terrains.Terrain  #: height grid below the mesh; it is rendered together with the mesh
+    tiles: FloorTiles  #: the mesh, divided into tiles
 
 
 def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     """Returns the mesh floor of a scenario: reads its mesh and computes the height grids.
 
     Raises:
-        TwinError: a key contradicts terrain.kind, or the mesh cannot be read or used as a floor.
+        TwinError: the mesh cannot be read or used as a floor.
     """
     t = scenario.terrain
-    file = _mesh_file(t)
+    assert t.mesh_file is not None  # `scenario_checks.floor_contradictions`
+    file = Path(t.mesh_file)
     y_up = t.mesh_up == "y" or (t.mesh_up is None and file.suffix.lower() == ".glb")
     whole = _divided(levelled(read_textured_mesh(file, FIELD, y_up), t.mesh_scale), file)
     grid = _node_grid(whole.mesh, t.grid_m, file)
     top = -_depth([whole.mesh], grid, FROM_ABOVE)
     covered = np.isfinite(top)
     if not covered.any():
-        raise TwinError(FIELD, f"{file.name!r} has no surface that faces up", "a mesh that covers the planned area")
+        raise TwinError(FIELD, f"{file.name!r} has no surface that faces up", _COVERING)
     lowest_m = top[covered].min()
     whole, top = raised(whole, -lowest_m), top - lowest_m
     upward = upward_part(whole.mesh)
@@ -89,7 +83,7 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     return MeshFloor(_terrain(top_m, grid, texture, covered), _terrain(under_m, grid, colours, covered), tiles)
 
 
-def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
+def floor_surface(floor: MeshFloor, grid: MapGrid) -> TopSurface:
     """Returns the highest surface of a mesh floor at the cell centres of a grid.
 
     In holes of the mesh, it is the height of `floor.under`. A cell is overhung if the highest surface of the mesh that
@@ -100,27 +94,17 @@ def floor_surface(floor: MeshFloor, grid: MapGrid) -> FloorSurface:
     low = _depth([upward_part(mesh) for mesh in meshes], grid, FROM_BELOW)
     roof = -_depth([downward_part(mesh) for mesh in meshes], grid, FROM_ABOVE)
     under = true_heights(grid, floor.under.height_at)
-    return FloorSurface(np.where(np.isfinite(top), top, under), roof - low > OVERHANG_M)
+    return TopSurface(np.where(np.isfinite(top), top, under), overhung=roof - low > OVERHANG_M)
 
 
 def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
     """Returns the mesh with its long edges divided."""
     if not np.isfinite(extent(whole.mesh)).all():
-        raise TwinError(FIELD, f"{file.name!r} is too large", "a mesh that covers the planned area")
+        raise TwinError(FIELD, f"{file.name!r} is too large", _COVERING)
     try:
         return divided(whole)
     except ValueError as error:
         raise TwinError(FIELD, f"{file.name!r} {error}", "triangles of similar width and length") from None
-
-
-def _mesh_file(t: TerrainConfig) -> Path:
-    """Returns the file of the mesh; raises TwinError if it is not given, or keys without effect on a mesh are set."""
-    if t.mesh_file is None:
-        raise TwinError(FIELD, "missing", 'a mesh, as terrain.kind is "mesh"')
-    for key in ("height_file", "texture_file", "orthophoto_file", "z", "cover", "plugin", "wall_texture"):
-        if getattr(t, key) != TerrainConfig.model_fields[key].default:
-            raise TwinError(f"terrain.{key}", 'has no effect on a mesh (terrain.kind = "mesh")', "without it")
-    return Path(t.mesh_file)
 
 
 def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
@@ -135,9 +119,7 @@ def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
     step_m = max(wanted_m, float(np.sqrt(size.prod() / MOST_NODES)), float(size.max()) / MOST_NODES)
     n = np.floor(size / step_m + 1e-3).astype(int) + 1  # an extent of single precision may be too small
     if n.min() < 2:
-        raise TwinError(
-            FIELD, f"{file.name!r} covers {size[0]:.3g} m x {size[1]:.3g} m", "a mesh that covers the planned area"
-        )
+        raise TwinError(FIELD, f"{file.name!r} covers {size[0]:.3g} m x {size[1]:.3g} m", _COVERING)
     step_m = min(step_m, float((size / (n - 1)).min()) * (1 - 1e-6))  # rays along the border might pass by the mesh
     west_m, north_m = -(n[0] - 1) * step_m / 2, (n[1] - 1) * step_m / 2
     return MapGrid(west_m - step_m / 2, north_m + step_m / 2, step_m, int(n[1]), int(n[0]))
@@ -146,14 +128,8 @@ def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
 def _depth(meshes: Sequence[Mesh], grid: MapGrid, axes: Array) -> Layer:
     """Returns the depth (rows, cols) at which vertical rays through the cell centres first meet meshes; inf: never."""
     depth = np.full((grid.rows, grid.cols), np.inf, np.float32)
-    draw_meshes([DrawnMesh(mesh, axes) for mesh in meshes], _projection(grid, 0), Target(depth))
+    draw_meshes([DrawnMesh(mesh, axes) for mesh in meshes], view_from_above(grid), Target(depth))
     return depth
-
-
-def _projection(grid: MapGrid, first: int) -> Projection:
-    """Returns the parallel projection whose pixels are the cells of a grid from row `first` on."""
-    column, row = -grid.west_m / grid.cell_m - 0.5, grid.north_m / grid.cell_m - 0.5 - first
-    return Projection(1 / grid.cell_m, column, row, -np.inf, False)
 
 
 def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
@@ -181,13 +157,12 @@ def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArra
     axes = np.diag([1.0, stretch, 1.0, 1.0]) @ FROM_ABOVE
     colours, seen = np.zeros((grid.rows, grid.cols, 3), np.uint8), np.zeros((grid.rows, grid.cols), np.bool_)
     square = replace(grid, north_m=grid.north_m * stretch)
-    for first in range(0, grid.rows, _ROWS_PER_BLOCK):
-        rows = slice(first, min(first + _ROWS_PER_BLOCK, grid.rows))
+    for rows in row_blocks(grid):
         shape = rows.stop - rows.start, grid.cols
         normal, uv = (np.empty((*shape, 3), np.float32) for _ in range(2))
         label = np.zeros(shape, np.uint16)
         target = Target(np.full(shape, np.inf, np.float32), colours[rows], normal, label, uv)
-        view = _projection(square, first)
+        view = view_from_above(square, rows.start)
         draw_objects(drawn, target, axes, _borders(view, shape), view)
         seen[rows] = label > 0
     return colours, seen
@@ -222,10 +197,8 @@ def _terrain(height_m: Layer, grid: MapGrid, texture: Image, covered: NDArray[np
     Row 0 of the heights is in the north. `covered` (rows, cols) marks the nodes that the mesh covers.
     """
     west_m, south_m = grid.west_m + grid.cell_m / 2, grid.north_m - (grid.rows - 0.5) * grid.cell_m
-    heights, texel_m = (
-        np.ascontiguousarray(height_m[::-1], np.float32),
-        (grid.cols - 1) * grid.cell_m / texture.shape[1],
-    )
+    heights = np.ascontiguousarray(height_m[::-1], np.float32)
+    texel_m = (grid.cols - 1) * grid.cell_m / texture.shape[1]
     return terrains.Terrain(
         heights, grid.cell_m, west_m, south_m, np.ascontiguousarray(texture), texel_m, int((~covered).sum()),
         known=known_nodes(covered[::-1]),

@@ -1,28 +1,26 @@
-"""Objects of a scenario: loaded or built, placed on the floor, and checked against the path of the vehicle."""
+"""Objects of a scenario: loaded or built, and placed on the floor."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from twin import terrains
-from twin.controllers.survey_plan import SurveyPlan
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario
 from twin.terrains.objects.mesh_file import read_mesh
 from twin.terrains.objects.model import ObjectModel, PlacedObject, model_of
-from twin.terrains.objects.placement import disc_of, place
+from twin.terrains.objects.placement import place
 from twin.terrains.objects.shapes import SHAPES, build_shape
-from twin.world.clearance import path_points
+from twin.world.scenario_checks import keys_without_effect
 
 GREY = (0.4, 0.4, 0.4)  #: albedo of a mesh without colours
 SHAPE_SIZE_M = 0.4  #: size of a built-in shape without `size_m`
 MAX_FACES = 8_000_000  #: largest number of triangles of all built-in shapes and mesh files together
 MAX_OBJECTS = 20_000
-VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up
 
 Attempt = Callable[[Callable[[], object]], object]
 
@@ -47,7 +45,7 @@ def _entry(
     world: tuple[terrains.Terrain, int],
 ) -> list[PlacedObject]:  # fmt: skip
     """Returns the objects of one entry of `[[objects]]` and adds its models to `models` if they are not there yet."""
-    _check_keys(number, config)
+    _check_keys(f"objects.{number}", config)
     terrain, seed = world
     variant = None if config.position_m is None or config.shape == "mesh" else number % SHAPES[config.shape].variants
     key = repr((config.shape, config.mesh_file, config.mesh_up, config.colour, _pipe_width(config), variant))
@@ -86,50 +84,22 @@ def _pipe_width(config: ObjectConfig) -> float:
     return (config.width_m or 0.0) / (config.size_m or SHAPE_SIZE_M)
 
 
-def _check_keys(number: int, config: ObjectConfig) -> None:
+def _check_keys(path: str, config: ObjectConfig) -> None:
     """Raises TwinError for keys that are missing or have no effect on the object, and for a pipe wider than long."""
-    field = f"objects.{number}"
     if config.shape == "mesh" and config.mesh_file is None:
-        raise TwinError(f"{field}.mesh_file", "missing", 'a mesh, as shape is "mesh"')
+        raise TwinError(f"{path}.mesh_file", "missing", 'a mesh, as shape is "mesh"')
     if (config.position_m is None) == (config.per_m2 is None):
         given = "both are given" if config.per_m2 is not None else "missing"
-        raise TwinError(f"{field}.position_m", given, "either position_m or per_m2")
-    for key in _unused_keys(config):
-        if getattr(config, key) != ObjectConfig.model_fields[key].default:
-            place_or_shape = "scattered objects" if config.per_m2 is not None else "an object at position_m"
-            kind = f"shape {config.shape!r}" if key in ("mesh_file", "mesh_up", "width_m") else place_or_shape
-            raise TwinError(f"{field}.{key}", f"has no effect on {kind}", "without it")
-    if config.shape == "pipe" and config.width_m and _pipe_width(config) > 1:
-        raise TwinError(
-            f"{field}.width_m", f"{config.width_m:g}: wider than long", f"up to {config.size_m or SHAPE_SIZE_M:g}"
-        )
-
-
-def _unused_keys(config: ObjectConfig) -> list[str]:
-    """Returns the keys that have no effect, given the shape and the kind of placement."""
+        raise TwinError(f"{path}.position_m", given, "either position_m or per_m2")
     unused = [] if config.shape == "mesh" else ["mesh_file", "mesh_up"]
     unused += [] if config.shape == "pipe" else ["width_m"]
-    return unused + (["height_m"] if config.position_m is None else ["on", "area_m", "centre_m", "spacing_m"])
-
-
-def check_path(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
-    """Raises TwinError if the vehicle comes too close to an object on its planned path.
-
-    The highest corner of the bounding box of an object must be at least `clearance_m` below the cameras wherever their
-    horizontal distance to the circle around this box is less than VEHICLE_REACH_M.
-    """
-    if not objects:
-        return
-    path = path_points(plan)
-    for item in objects:
-        disc, top_m = disc_of(item), item.corners_m()[:, 2].max()
-        away = np.hypot(path[:, 0] - disc.x_m, path[:, 1] - disc.y_m) - disc.radius_m - VEHICLE_REACH_M
-        gap = np.where(away < 0, path[:, 2] - top_m, np.inf)
-        k = int(gap.argmin())
-        if gap[k] < clearance_m:
-            raise TwinError(
-                f"objects.{item.group}",
-                f"the object at x {disc.x_m:.2f}, y {disc.y_m:.2f} is in the path of the vehicle: its top is at"
-                f" z {top_m:.2f} m, the cameras are at {path[k, 2]:.2f} m",
-                f"objects at least {clearance_m:g} m below the cameras (plan.clearance_m)",
-            )
+    for error in keys_without_effect(path, config, unused, f"has no effect on shape {config.shape!r}", "without it"):
+        raise error
+    scattered = config.per_m2 is not None
+    kind = "scattered objects" if scattered else "an object at position_m"
+    unused = ["height_m"] if scattered else ["on", "area_m", "centre_m", "spacing_m"]
+    for error in keys_without_effect(path, config, unused, f"has no effect on {kind}", "without it"):
+        raise error
+    if config.shape == "pipe" and config.width_m and _pipe_width(config) > 1:
+        allowed = f"up to {config.size_m or SHAPE_SIZE_M:g}"
+        raise TwinError(f"{path}.width_m", f"{config.width_m:g}: wider than long", allowed)

@@ -13,17 +13,11 @@ SAME_TIME_S = 1e-9  #: times that differ by less are treated as equal
 
 
 class Pace(NamedTuple):
-    """Pace along the path. The path time s, at which the plan is evaluated, advances by ds/dt = rate.
+    """Pace along the path. The path time s, at which the plan is evaluated, advances by ds/dt = rate."""
 
-    Args:
-        rate: derivative ds/dt of the path time, 0 to 1; 1 is the planned speed.
-        change_per_s: derivative of the rate [1/s].
-        keyframe: whether the next frame is a keyframe in addition to the planned ones.
-    """
-
-    rate: float = 1.0
-    change_per_s: float = 0.0
-    keyframe: bool = False
+    rate: float = 1.0  #: derivative ds/dt of the path time, 0 to 1; 1 is the planned speed
+    change_per_s: float = 0.0  #: derivative of the rate
+    keyframe: bool = False  #: whether the next frame is a keyframe in addition to the planned ones
 
     def path_times(self, last_s: float, end_s: float, interval_s: float) -> Array:
         """Returns the path times (n,) of the next frames [s]: one or, at full pace, all to the end of the track.
@@ -39,11 +33,7 @@ class Pace(NamedTuple):
         return np.minimum(last_s + self.rate * interval_s * np.arange(1, n + 1), end_s)
 
     def scaled(self, reference: Reference) -> Reference:
-        """Returns the reference with time derivatives: dx/dt = r x', d2x/dt2 = r^2 x'' + (dr/dt) x', where r = rate.
-
-        Args:
-            reference: the reference with derivatives with respect to path time, x' = dx/ds and x'' = d2x/ds2.
-        """
+        """Returns a reference x(s) with time derivatives: dx/dt = r x', d2x/dt2 = r^2 x'' + (dr/dt) x', r = rate."""
         return reference._replace(
             velocity=self.rate * reference.velocity,
             acceleration=self.rate**2 * reference.acceleration + self.change_per_s * reference.velocity,

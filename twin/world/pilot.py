@@ -21,32 +21,24 @@ from twin.world.mission import Mission
 
 _VELOCITY_SMOOTHING_S = 0.1  # time constant of the filter: velocity from F2F is noisy, the true velocity varies slowly
 
-
+#: Function from the estimate and the reference of the left camera to the vehicle command.
 PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 
 def make_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot: a function from the estimate and the reference of the left camera to the vehicle command.
-
-    Raises:
-        TwinError: the controller plug-in cannot be loaded.
-    """
+    """Returns the pilot of a mission; raises TwinError if its plug-in cannot be loaded."""
     scenario = mission.scenario
     if scenario.control.plugin is not None:
-        return PluginPilot(mission, scenario.control.plugin)
+        return _plugin_pilot(mission, scenario.control.plugin)
     return RovPilot(mission) if scenario.vehicle.dynamics == "rigid" else _kinematic_pilot(mission)
 
 
 def without_feedback(estimate: Estimate, reference: Reference, readings: Readings) -> Estimate:
     """Returns the estimate; position and velocity are those of the reference if they were predicted, not measured.
 
-    A prediction contains no information on the deviation of the vehicle from its path. If the pilot corrects a
-    predicted deviation, the true vehicle moves by it, and no measurement reveals this motion. The attitude is always
-    kept; height and vertical velocity are kept if there is a reading of the pressure sensor. The estimate is returned
-    unchanged if its motion was measured or a DVL reading is available.
-
-    Args:
-        readings: readings of the navigation sensors at the frame.
+    If the pilot corrected a predicted deviation, the true vehicle would move by it, and no measurement would reveal
+    this motion. The attitude is always kept; height and vertical velocity are kept if there is a reading of the
+    pressure sensor. The estimate is returned unchanged if its motion was measured or a DVL reading is available.
     """
     if estimate.status == "ok" or readings.dvl_mps is not None:
         return estimate
@@ -58,27 +50,21 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     return estimate._replace(world_from_camera=pose, camera_velocity=twist)
 
 
-class PluginPilot:
-    """Pilot that returns the checked commands of a plug-in.
+def _plugin_pilot(mission: Mission, name: str) -> PilotOfEstimates:
+    """Returns the pilot that gives the checked commands of the plug-in `control.plugin`.
 
-    Args:
-        mission: the survey to fly.
-        name: value of `control.plugin`.
-
-    Raises:
-        TwinError: the plug-in cannot be loaded.
+    A call raises PluginFailed if the plug-in fails or its command is unusable.
     """
+    scenario, rig = mission.scenario, mission.rig
+    nominal = nominal_controller(scenario.control.natural_frequency_radps, rig.frame_rate_hz).state
+    n = 8 if scenario.vehicle.dynamics == "rigid" else 3
+    setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
+    plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
 
-    def __init__(self, mission: Mission, name: str):
-        scenario, rig = mission.scenario, mission.rig
-        nominal = nominal_controller(scenario.control.natural_frequency_radps, rig.frame_rate_hz).state
-        self._n = 8 if scenario.vehicle.dynamics == "rigid" else 3
-        setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, self._n)
-        self._plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
+    def command(estimate: Estimate, reference: Reference) -> Array:
+        return plugin.numbers("command", plugin.call("command", estimate, reference), (n,))
 
-    def __call__(self, estimate: Estimate, reference: Reference) -> Array:
-        """Returns the command of the plug-in; raises PluginFailed if the plug-in fails or its command is unusable."""
-        return self._plugin.numbers("command", self._plugin.call("command", estimate, reference), (self._n,))
+    return command
 
 
 def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
@@ -92,22 +78,13 @@ def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
 
 
 class PilotState(NamedTuple):
-    """State and constants of the ROV's pilot; `twist` and `controller` are modified in place.
+    """State and constants of the ROV's pilot; `twist` and `controller` are modified in place."""
 
-    Args:
-        camera_from_body: (4, 4) pose of the body in the left camera.
-        body_from_camera_twist: (6, 6) adjoint that transforms a twist of the camera to the body.
-        lever_arm_m: (3,) position of the left camera in the body [m].
-        smoothing: weight of a new twist in the exponential moving average.
-        twist: (6,) smoothed twist of the body in body axes [rad/s, m/s].
-        controller: state of the pose controller.
-    """
-
-    camera_from_body: Array
-    body_from_camera_twist: Array
-    lever_arm_m: Array
-    smoothing: float
-    twist: Array
+    camera_from_body: Array  #: (4, 4) pose of the body in the left camera
+    body_from_camera_twist: Array  #: (6, 6) adjoint that transforms a twist of the camera to the body
+    lever_arm_m: Array  #: (3,) position of the left camera in the body
+    smoothing: float  #: weight of a new twist in the exponential moving average
+    twist: Array  #: (6,) smoothed twist of the body in body axes [rad/s, m/s]
     controller: ControllerState
 
 
@@ -142,10 +119,8 @@ def steer(state, world_from_camera, camera_velocity, position, velocity, acceler
         position, velocity, acceleration: (3,) reference of the left camera in the world [m, m/s, m/s2].
         yaw: reference yaw [rad].
     """
-    geometry.copy_into(
-        state.twist,
-        state.twist + state.smoothing * (state.body_from_camera_twist @ camera_velocity - state.twist),
-    )
+    change = state.body_from_camera_twist @ camera_velocity - state.twist
+    geometry.copy_into(state.twist, state.twist + state.smoothing * change)
     body = geometry.compose(world_from_camera, state.camera_from_body)
     target = position - rotate_lever_arm(yaw, state.lever_arm_m)
     return control_thrusters(state.controller, body, state.twist, target, velocity, acceleration, yaw)

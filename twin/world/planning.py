@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
-from twin.core.height_field import HeightField
+from twin.core.geometry import Array
+from twin.core.height_field import HeightField, height_field
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.scenario.model import Scenario
 from twin.terrains import Terrain
-from twin.world.placement import survey_area
-from twin.world.planned_images import floor_of, level_floor, overlaps, planned_keyframes, planned_pairs, thinned
+from twin.world.asked_area import survey_area
+from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned
 from twin.world.thrust_authority import climb_slope
 
 #: Percentage of the pairs of keyframes that may have less overlap over the floor than required. If it were 0, a
@@ -25,10 +25,8 @@ SHORT_PERCENT = 5.0
 #: Largest number of pairs of keyframes, along and across each, whose overlap is computed to choose the spacing.
 _PAIRS = 250
 _ITERATIONS = 25
-#: Relative tolerance of 1 - overlap.
-_TOLERANCE = 0.005
-#: Least `along_scale` and `across_scale` of a request: spacing relative to that over the reference plane.
-_LEAST_SCALE = 0.05
+_TOLERANCE = 0.005  # of 1 - overlap, relative
+_LEAST_SCALE = 0.05  # of the spacing relative to that over the reference plane
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
 
@@ -37,13 +35,6 @@ _MOST_TRACKS = 1000
 MAX_FRAMES, MAX_KEYFRAMES, MAX_MAP_CELLS = 2_000_000, 200_000, 25_000_000
 
 _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
-
-
-class NonOverlap(NamedTuple):
-    """Percentile (100 - SHORT_PERCENT) of 1 - overlap over the pairs of keyframes, along and across the swaths."""
-
-    along: float
-    across: float
 
 
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
@@ -147,30 +138,29 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     The overlap suffices if all but SHORT_PERCENT of the pairs of keyframes, both along and across the swaths, have at
     least the smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT of the pairs have over
     the reference plane in the plan with scales of 1 at constant height. The scales start at 1 and are repeatedly
-    multiplied by the factors of `_reduction`. On a floor at the reference plane they stay 1.
+    multiplied by allowed / found of 1 - overlap (0.3 to 0.99). The numbers of frames per keyframe and of tracks are
+    integers, so a small step may leave them unchanged: the least step of 1 % is doubled after each step without effect.
+    On a floor at the reference plane the scales stay 1.
     """
     make = _PATTERNS[pattern]
-    whole = request._replace(tracks=0) if _n_whole(request, pattern) <= _MOST_TRACKS else request
-    plane = make(whole._replace(surface=None))
-    centre_m = request.area.centre_m if request.area else (0.0, 0.0)
-    reach_m = 10 * (max(request.area_m) + max(request.footprint_m)) + 2 * float(np.hypot(*centre_m))
-    allowed = _non_overlap(plane, pattern, level_floor(0.0, reach_m), rig)
-    allowed = NonOverlap(max(allowed.along, 1 - request.overlap_along), max(allowed.across, 1 - request.overlap_across))
-    plan, unchanged = make(whole), [0, 0]
+    rough_tracks = max(request.area_m) / make(request._replace(tracks=1)).swath_spacing_m
+    whole = request._replace(tracks=0) if rough_tracks <= _MOST_TRACKS else request
+    level = _non_overlap(make(whole._replace(surface=None)), pattern, _level_floor(request), rig)
+    allowed = np.maximum(level, [1 - request.overlap_along, 1 - request.overlap_across])
+    plan, scale, unchanged = make(whole), np.ones(2), np.zeros(2)
     for _ in range(_ITERATIONS):
         found = _non_overlap(plan, pattern, field, rig)
-        if all(f <= a * (1 + _TOLERANCE) for f, a in zip(found, allowed, strict=True)):
+        short = found > allowed * (1 + _TOLERANCE)
+        if not short.any():
             return whole._replace(tracks=request.tracks)
-        reduced = [_reduction(f, a, n) for f, a, n in zip(found, allowed, unchanged, strict=True)]
-        whole = whole._replace(along_scale=whole.along_scale * reduced[0], across_scale=whole.across_scale * reduced[1])
-        if min(whole.along_scale, whole.across_scale) < _LEAST_SCALE:
+        step = np.maximum(np.minimum(allowed / np.where(short, found, 1), 1 - 0.01 * 2**unchanged), 0.3)
+        scale = np.where(short, scale * step, scale)
+        whole = whole._replace(along_scale=float(scale[0]), across_scale=float(scale[1]))
+        if scale.min() < _LEAST_SCALE:
             break
         previous, plan = plan, make(whole)
-        same = (
-            plan.n_frames_per_keyframe == previous.n_frames_per_keyframe,
-            plan.swath_spacing_m == previous.swath_spacing_m,
-        )
-        unchanged = [n + 1 if kept else 0 for n, kept in zip(unchanged, same, strict=True)]
+        same = np.equal(_spacing(plan), _spacing(previous))
+        unchanged = np.where(same, unchanged + 1, 0)
     raise TwinError(
         "plan.altitude_m",
         f"{request.altitude_m:g}: no spacing keeps the required overlap over the floor, which comes too near",
@@ -178,29 +168,24 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     )
 
 
-def _n_whole(request: SurveyRequest, pattern: str) -> float:
-    """Returns the longer side of the area divided by the swath spacing: a rough number of the tracks that fill it."""
-    swath_m = _PATTERNS[pattern](request._replace(tracks=1)).swath_spacing_m
-    return max(request.area_m) / swath_m
+def _level_floor(request: SurveyRequest) -> HeightField:
+    """Returns a level square floor on the reference plane, far larger than the area."""
+    centre_m = request.area.centre_m if request.area else (0.0, 0.0)
+    reach_m = 10 * (max(request.area_m) + max(request.footprint_m)) + 2 * float(np.hypot(*centre_m))
+    return height_field(np.zeros((2, 2)), 2 * reach_m, -reach_m, -reach_m)
 
 
-def _reduction(found: float, allowed: float, unchanged: int) -> float:
-    """Returns the factor by which a scale is multiplied: 1 if the overlap suffices, otherwise 0.3 to 0.99.
-
-    The numbers of frames per keyframe and of tracks are integers, so a small step may leave them unchanged. The least
-    step of 1 % is therefore doubled after each of the last `unchanged` steps without effect.
-    """
-    if found <= allowed * (1 + _TOLERANCE):
-        return 1.0
-    return max(min(allowed / found, 1 - 0.01 * 2**unchanged), 0.3)
+def _spacing(plan: SurveyPlan) -> tuple[int, float]:
+    """Returns the spacing of the keyframes along the swaths [frames] and that of the swaths [m]."""
+    return plan.n_frames_per_keyframe, plan.swath_spacing_m
 
 
-def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> NonOverlap:
-    """Returns the `NonOverlap` of a plan over a floor, from at most _PAIRS pairs along and _PAIRS across the swaths.
+def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> Array:
+    """Returns the percentiles (100 - SHORT_PERCENT) of 1 - overlap of a plan over a floor, (2,): along and across.
 
-    A value is 0 without pairs whose first image shows floor.
+    From at most _PAIRS pairs along and _PAIRS across the swaths; 0 without pairs whose first image shows floor.
     """
     pairs = planned_pairs(planned_keyframes(plan, pattern))
     missed = [1 - overlaps(field, thinned(p, _PAIRS), rig) for p in pairs]
     known = [m[np.isfinite(m)] for m in missed]
-    return NonOverlap(*(float(np.percentile(m, 100 - SHORT_PERCENT)) if len(m) else 0.0 for m in known))
+    return np.array([np.percentile(m, 100 - SHORT_PERCENT) if len(m) else 0.0 for m in known])

@@ -18,12 +18,12 @@ from twin.simulate.inertial_sensor import InertialSensor
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.sensors import NavigationSensors
-from twin.world.coverage import Coverage, true_heights
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, Step, motion_rate_hz
+from twin.world.observed_cells import Coverage
 from twin.world.obstacles import Obstacles
-from twin.world.top_surface import top_surface
-from twin.world.world import CameraImages, TrueSurface, World, streams
+from twin.world.top_surface import TopSurface, top_surface, true_heights
+from twin.world.world import CameraImages, World, streams
 
 
 class RenderedWorld(World):
@@ -59,7 +59,7 @@ class RenderedWorld(World):
         image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
         self.camera = StereoCamera(self.renderer, image_formation, scenario, *noise_rngs, stopwatch, cameras)
-        self._surface = _surface(mission)
+        self._surface = _overhanging_surface(mission)
         top_m = None if self._surface is None else self._surface.height_m
         self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
 
@@ -75,21 +75,17 @@ class RenderedWorld(World):
     def extra_pair(self) -> tuple[Image, Image]:
         return self.camera.capture_apart(self.world_from_camera, self.vehicle.twist_body)
 
-    def true_surface(self) -> TrueSurface:
+    def true_surface(self) -> TopSurface:
         return super().true_surface() if self._surface is None else self._surface
 
     def seen(self) -> NDArray[np.bool_]:
         return self.coverage.seen
 
 
-def _surface(mission: Mission) -> TrueSurface | None:
+def _overhanging_surface(mission: Mission) -> TopSurface | None:
     """Returns the true surface of the map with objects or a mesh floor; None for a height grid without objects."""
     grid, whole = mission.grid, mission.mesh_floor
     if whole is None and not mission.objects:
         return None
-    if whole is None:
-        return TrueSurface(*top_surface(grid, true_heights(grid, mission.terrain.height_at), mission.objects))
-    floor = floor_surface(whole, grid)
-    surface = top_surface(grid, floor.height_m, mission.objects)
-    overhung = surface.overhung | ((surface.objects == 0) & floor.overhung)
-    return TrueSurface(surface.height_m, surface.objects, overhung)
+    bare = TopSurface(true_heights(grid, mission.terrain.height_at)) if whole is None else floor_surface(whole, grid)
+    return top_surface(grid, bare, mission.objects)

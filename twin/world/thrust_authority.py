@@ -1,4 +1,4 @@
-"""Thrust authority: checks that the thrusters can hold station and fly the plan against the current."""
+"""Thrust authority: whether the thrusters reach the planned speed, and hold station and fly against the current."""
 
 from __future__ import annotations
 
@@ -10,14 +10,29 @@ from scipy.optimize import root_scalar
 from twin.controllers.survey_plan import SurveyPlan
 from twin.core.geometry import Array
 from twin.errors import TwinError
-from twin.scenario.model import VehicleConfig
-from twin.simulate.autopilot import thrust_loads
+from twin.scenario.model import PlanConfig, VehicleConfig
+from twin.simulate.autopilot import thrust_loads, top_speed_mps
+from twin.world.planned_images import planned_references
 
 #: A path over the floor may climb and descend at this share of the greatest vertical speed at cruise speed; the rest is
 #: reserved for the controller.
 _CLIMB_SHARE = 0.5
 #: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.
 _MAX_SLOPE = 0.6
+
+
+def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> None:
+    """Raises TwinError if a cruise speed exceeds the top speed: forwards or, for loops, in the slowest direction.
+
+    A kinematic vehicle is not checked.
+    """
+    if vehicle.dynamics == "kinematic":
+        return
+    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if asked.pattern == "loops" else np.zeros(1)
+    directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
+    reach = min(top_speed_mps(vehicle, direction) for direction in directions)
+    if speed_mps > reach:
+        raise TwinError("plan.speed_mps", f"{asked.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}")
 
 
 def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float], plan: SurveyPlan) -> None:
@@ -31,13 +46,19 @@ def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float]
     current = np.array(current_mps)
     if vehicle.dynamics == "kinematic" or not (current.any() or plan.surface is not None):
         return
-    yaw, velocity = _planned_velocities(plan)
-    hold = _body_velocities(yaw, -np.tile(current, (len(yaw), 1)))
-    _check_station_keeping(vehicle, float(np.linalg.norm(current)), hold)
-    through_water = lambda factor: _body_velocities(yaw, factor * velocity - current)  # noqa: E731
-    if _load(vehicle, through_water(1.0)) > 1:
-        factor = _root(lambda k: _load(vehicle, through_water(k)) - 1, 1.0)
-        against = f" in a current of {np.linalg.norm(current):.2f} m/s" if current.any() else " up the slopes"
+    planned = planned_references(plan)
+    rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity]), 3)
+    distinct = np.unique(rounded, axis=0)
+    yaw, velocity = distinct[:, 0], distinct[:, 1:]
+    hold, speed_mps = _body_velocities(yaw, -np.tile(current, (len(yaw), 1))), float(np.linalg.norm(current))
+    if (factor := _saturating_factor(vehicle, lambda k: k * hold)) is not None:
+        raise TwinError(
+            "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
+            f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
+        )  # fmt: skip
+    factor = _saturating_factor(vehicle, lambda k: _body_velocities(yaw, k * velocity - current))
+    if factor is not None:
+        against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " up the slopes"
         raise TwinError(
             "plan.speed_mps", f"{plan.speed_mps:g}: too fast for the thrusters{against}",
             f"up to {np.floor(1000 * factor * plan.speed_mps) / 1000:.3f}",
@@ -58,15 +79,11 @@ def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
     return _CLIMB_SHARE * climb / speed_mps
 
 
-def _check_station_keeping(vehicle: VehicleConfig, speed_mps: float, hold: Array) -> None:
-    """Raises TwinError if station keeping, at body velocities through the water (n, 3), saturates a thruster."""
-    if _load(vehicle, hold) <= 1:
-        return
-    factor = _root(lambda k: _load(vehicle, k * hold) - 1, 1.0)
-    raise TwinError(
-        "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
-        f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
-    )  # fmt: skip
+def _saturating_factor(vehicle: VehicleConfig, velocities: Callable[[float], Array]) -> float | None:
+    """Returns the factor below 1 at which velocities(factor) (n, 3) saturate a thruster; None if there is none."""
+    if _load(vehicle, velocities(1.0)) <= 1:
+        return None
+    return _root(lambda factor: _load(vehicle, velocities(factor)) - 1, 1.0)
 
 
 def _root(function: Callable[[float], float], high: float) -> float:
@@ -77,16 +94,6 @@ def _root(function: Callable[[float], float], high: float) -> float:
 def _load(vehicle: VehicleConfig, velocities: Array) -> float:
     """Returns the greatest thrust of any thruster at body velocities (n, 3) through the water; 1 is full thrust."""
     return float(thrust_loads(vehicle, velocities).max(initial=0.0))
-
-
-def _planned_velocities(plan: SurveyPlan) -> tuple[Array, Array]:
-    """Returns the distinct pairs of yaw (n,) [rad] and world velocity (n, 3) [m/s] along the plan, rounded to 0.001."""
-    rows = []
-    for track in range(1, plan.n_tracks + 1):
-        reference = plan.references(track, plan.frames_of_track(track)[0])
-        rows.append(np.round(np.column_stack([np.asarray(reference.yaw), reference.velocity]), 3))
-    unique = np.unique(np.concatenate(rows), axis=0)
-    return unique[:, 0], unique[:, 1:]
 
 
 def _body_velocities(yaw: Array, velocity: Array) -> Array:

@@ -1,13 +1,14 @@
-"""True surface as seen from above: the highest of floor and objects at each cell of the map.
+"""Surface as seen from above: the highest of floor and objects on the vertical line through each cell of a grid.
 
-The truth of a map is the height of the highest surface, floor or object, on the vertical line through each cell centre.
-The objects are drawn in a parallel projection. Below an overhang, the map has the height of the object, not that of the
+Meshes are drawn in a parallel projection. Below an overhang, the map has the height of the object, not that of the
 floor. Plants are upright, as in still water.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from math import ceil
 from typing import NamedTuple
 
 import numpy as np
@@ -15,64 +16,104 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, MapGrid
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.terrains import Terrain
 from twin.terrains.objects.model import PlacedObject
+from twin.terrains.terrain import MAX_NODES
 
+Layer = NDArray[np.float32]
+
+FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes east, south, down
+FROM_BELOW: Array = np.diag([1.0, -1.0, 1.0, 1.0])  #: axes east, south, up, so that the lowest surface is the nearest
 OVERHANG_M = 0.01  #: least gap between the floor and an object that overhangs it
-_ROWS_PER_BLOCK = 256  # normals and colours, which are not kept, take 15 bytes per cell
+FINE_M = 0.01  #: largest spacing of the nodes of `with_objects`, unless MAX_NODES requires a larger one
+_ROWS_PER_BLOCK = 256  # images of a block, which are not kept, take up to 33 bytes per cell
+_HEIGHTS_PER_BLOCK = 64  # the coordinates of heights take several times the memory of the grid
 
 
 class TopSurface(NamedTuple):
-    """Surface as seen from above; all arrays are (rows, cols).
+    """Surface as seen from above; all arrays are (rows, cols)."""
+
+    height_m: Layer  #: height of the highest surface [m]
+    objects: NDArray[np.uint16] | None = None  #: 1 + number (from 0) of the object at the top, 0: floor
+    #: whether the floor is hidden below an object or a part of the floor, with a gap of more than OVERHANG_M.
+    overhung: NDArray[np.bool_] | None = None
+
+
+def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> Layer:
+    """Returns the height of the floor at the cell centres (rows, cols) [m].
 
     Args:
-        height_m: float32, height of the highest surface [m].
-        objects: uint16, 1 + number (from 0) of the object at the top; 0: the floor.
-        overhung: bool, whether the floor is hidden below an object with a gap of more than OVERHANG_M.
+        height_at: returns the heights [m] at arrays x and y [m] of equal shape.
     """
-
-    height_m: NDArray[np.float32]
-    objects: NDArray[np.uint16]
-    overhung: NDArray[np.bool_]
-
-
-def top_surface(grid: MapGrid, floor_m: NDArray[np.float32], objects: Sequence[PlacedObject]) -> TopSurface:
-    """Returns the surface of floor and objects as seen from above.
-
-    Args:
-        floor_m: (rows, cols) height of the floor at the cell centres [m].
-        objects: the objects; at most 65,535.
-    """
-    surface = TopSurface(floor_m.copy(), np.zeros(floor_m.shape, np.uint16), np.zeros(floor_m.shape, np.bool_))
-    for first in range(0, grid.rows, _ROWS_PER_BLOCK):
-        rows = slice(first, min(first + _ROWS_PER_BLOCK, grid.rows))
-        block = TopSurface(surface.height_m[rows], surface.objects[rows], surface.overhung[rows])
-        _fill(block, grid, first, objects)
-    return surface
+    x, y = grid.centres()
+    height = np.empty((grid.rows, grid.cols), np.float32)
+    for rows in row_blocks(grid, _HEIGHTS_PER_BLOCK):
+        height[rows] = height_at(*np.meshgrid(x, y[rows]))
+    return height
 
 
-def _fill(block: TopSurface, grid: MapGrid, first: int, objects: Sequence[PlacedObject]) -> None:
-    """Adds the objects to a block of rows of the surface, in place; `first` is the row number at which it starts."""
-    shape, floor_m = block.height_m.shape, block.height_m.copy()
-    view = Projection(
-        1 / grid.cell_m, -grid.west_m / grid.cell_m - 0.5, grid.north_m / grid.cell_m - 0.5 - first, -np.inf, False
-    )
-    above = Target(-floor_m, np.empty((*shape, 3), np.uint8), np.empty((*shape, 3), np.float32), block.objects)
-    below = Target(np.full(shape, np.inf, np.float32))
-    north_m = grid.north_m - first * grid.cell_m
-    south_m = north_m - shape[0] * grid.cell_m
+def row_blocks(grid: MapGrid, size: int | None = None) -> Iterator[slice]:
+    """Yields the rows of a grid in blocks, to limit memory."""
+    size = size or _ROWS_PER_BLOCK
+    return (slice(first, min(first + size, grid.rows)) for first in range(0, grid.rows, size))
+
+
+def view_from_above(grid: MapGrid, first: int = 0) -> Projection:
+    """Returns the parallel projection whose pixels are the cells of a grid from row `first` on."""
+    column, row = -grid.west_m / grid.cell_m - 0.5, grid.north_m / grid.cell_m - 0.5 - first
+    return Projection(1 / grid.cell_m, column, row, -np.inf, False)
+
+
+def top_surface(grid: MapGrid, floor: TopSurface, objects: Sequence[PlacedObject]) -> TopSurface:
+    """Returns the surface of a floor without objects and of at most 65,535 objects as seen from above."""
+    height_m, on_top = floor.height_m.copy(), np.zeros(floor.height_m.shape, np.uint16)
+    overhung = np.zeros(on_top.shape, np.bool_)
+    for rows in row_blocks(grid):
+        _add_objects(grid, rows, objects, height_m[rows], on_top[rows], overhung[rows])
+    if floor.overhung is not None:
+        overhung |= (on_top == 0) & floor.overhung
+    return TopSurface(height_m, on_top, overhung)
+
+
+def _add_objects(
+    grid: MapGrid, rows: slice, objects: Sequence[PlacedObject],
+    height_m: Layer, on_top: NDArray[np.uint16], overhung: NDArray[np.bool_],
+) -> None:  # fmt: skip
+    """Adds the objects to a block of rows of the layers of a `TopSurface`, in place."""
+    floor_m, view = height_m.copy(), view_from_above(grid, rows.start)
+    above = Target(-floor_m, np.empty((*on_top.shape, 3), np.uint8), np.empty((*on_top.shape, 3), np.float32), on_top)
+    below = Target(np.full(on_top.shape, np.inf, np.float32))
+    north_m = grid.north_m - rows.start * grid.cell_m
+    south_m = north_m - len(on_top) * grid.cell_m
     seen_from_above, seen_from_below = [], []
     for number, item in enumerate(objects):
-        y, reach_m = item.centre_m[1], item.radius_m
-        if south_m - reach_m <= y <= north_m + reach_m:
+        if south_m - item.radius_m <= item.centre_m[1] <= north_m + item.radius_m:
             mesh, _, parts = item.model.levels[0]
             pose, closed = item.world_from_object, item.model.closed
             seen_from_above.append(DrawnMesh(mesh, FROM_ABOVE @ pose, number + 1, closed, parts))
             seen_from_below.append(DrawnMesh(mesh, FROM_BELOW @ pose, parts=parts))
     draw_meshes(seen_from_above, view, above)
     draw_meshes(seen_from_below, view, below)
-    block.height_m[:] = -above.depth
-    block.overhung[:] = (block.objects > 0) & (below.depth - floor_m > OVERHANG_M)
+    height_m[:] = -above.depth
+    overhung[:] = (on_top > 0) & (below.depth - floor_m > OVERHANG_M)
 
 
-FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  # axes east, south, down
-FROM_BELOW: Array = np.diag([1.0, -1.0, 1.0, 1.0])  # axes east, south, up, so that the lowest surface is the nearest
+def with_objects(floor: Terrain, objects: Sequence[PlacedObject]) -> Terrain:
+    """Returns the terrain whose heights are those of the highest of floor and objects.
+
+    Each cell of the floor is divided into n x n small cells. The diagonal of a cell consists of diagonals of small
+    cells, so the surface away from the objects is that of the floor. The side of an object is a slope between two
+    nodes, and there is no space below overhangs.
+    """
+    wanted = ceil(floor.spacing_m / FINE_M - 1e-6)
+    divisions = max(1, min(wanted, int(np.sqrt(MAX_NODES / floor.height_m.size))))
+    spacing_m = floor.spacing_m / divisions
+    rows, cols = ((n - 1) * divisions + 1 for n in floor.height_m.shape)
+    nodes = MapGrid(floor.west_m - spacing_m / 2, floor.north_m + spacing_m / 2, spacing_m, rows, cols)
+
+    def height_at(x: Array, y: Array) -> Array:  # rounding may place nodes of the border outside
+        return floor.height_at(np.clip(x, floor.west_m, floor.east_m), np.clip(y, floor.south_m, floor.north_m))
+
+    heights = top_surface(nodes, TopSurface(true_heights(nodes, height_at)), objects).height_m
+    known = None if floor.known is None else ~floor.in_hole(*np.meshgrid(*nodes.centres()))[::-1]
+    return replace(floor, height_m=np.ascontiguousarray(heights[::-1]), spacing_m=spacing_m, known=known)

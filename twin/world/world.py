@@ -18,9 +18,9 @@ from twin.errors import TwinError
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
-from twin.world.coverage import true_heights
 from twin.world.mission import FrameSequence, Mission, Step
 from twin.world.pilot import PilotOfEstimates
+from twin.world.top_surface import TopSurface, true_heights
 from twin.world.true_albedo import true_albedo, without_objects
 
 if TYPE_CHECKING:
@@ -38,36 +38,19 @@ FastForward = Callable[[FrameSequence, int], int]
 
 
 class CameraImages(NamedTuple):
-    """Images of the stereo cameras at one time.
-
-    Args:
-        left, right: (H, W, 3) uint8 RGB images; the right one is None between keyframes.
-        depth_m: function that returns the true depth (H, W) of the left image [m].
-        exposure: exposure that the cameras report, see `Frame.exposure`; None without images.
-    """
+    """Images of the stereo cameras at one time."""
 
     left: Image
-    right: Image | None
-    depth_m: Callable[[], NDArray[np.float32]]
-    exposure: Exposure | None = None
-
-
-class TrueSurface(NamedTuple):
-    """True surface of the map as seen from above; for its members, see those of `Truth` with the same names."""
-
-    height_m: NDArray[np.float32]
-    objects: NDArray[np.uint16] | None = None
-    overhung: NDArray[np.bool_] | None = None
+    right: Image | None  #: None between keyframes
+    depth_m: Callable[[], NDArray[np.float32]]  #: returns the true depth (H, W) of the left image [m]
+    exposure: Exposure | None = None  #: as `Frame.exposure`
 
 
 class World(ABC):
     """Simulated world of a mission. Use as a context manager.
 
     Args:
-        mission: the survey to fly.
-        stopwatch: timer of the stages of the simulation.
         vehicle: simulated vehicle at the start of the survey.
-        sensors: navigation sensors of the vehicle.
 
     Attributes:
         warnings: sentences on the limitations of this simulated world, for the log and the report of the survey.
@@ -75,13 +58,7 @@ class World(ABC):
 
     warnings: tuple[str, ...] = ()
 
-    def __init__(
-        self,
-        mission: Mission,
-        stopwatch: StageTimer,
-        vehicle: MujocoVehicle | CompiledVehicle | KinematicVehicle,
-        sensors: NavigationSensors,
-    ):
+    def __init__(self, mission: Mission, stopwatch: StageTimer, vehicle: AnyVehicle, sensors: NavigationSensors):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         self._true_poses = GrowingArray(4, 4)
         self._sequences: list[tuple[FrameSequence, int]] = []  # each with the number of its track
@@ -118,11 +95,7 @@ class World(ABC):
         return left_camera(self.vehicle, self.mission.rig)
 
     def start_sequence(self, sequence: FrameSequence, track: int) -> None:
-        """Starts the next sequence of planned frames of a track.
-
-        The caller must simulate all frames of a sequence before it starts another one, unless it ends the sequence
-        early (`end_sequence`) or the survey is aborted.
-        """
+        """Starts the next planned frames of a track, after all frames of the last sequence (or `end_sequence`)."""
         self._sequences.append((sequence, track))
 
     def end_sequence(self, n: int) -> None:
@@ -153,15 +126,12 @@ class World(ABC):
         self._true_poses.append(poses)
 
     def fast_forward(self, navigator: Any, pilot: PilotOfEstimates) -> FastForward:
-        """Returns a function that simulates frames between keyframes quickly, without images.
-
-        In this base class, the returned function simulates no frames; `SurrogateWorld` overrides the method.
-        """
+        """Returns a function that simulates frames between keyframes quickly; here, one that simulates none."""
         return lambda sequence, k: k
 
     def truth(self) -> Truth:
         """Returns the ground truth of the survey so far."""
-        n, sequences, surface = len(self), self._sequences, self.true_surface()
+        n, surface = len(self), self.true_surface()
         cells, in_hole = np.meshgrid(*self.mission.grid.centres()), self.mission.terrain.in_hole
         unknown = in_hole(*cells)
 
@@ -170,27 +140,27 @@ class World(ABC):
             colours[in_hole(*np.meshgrid(*grid.centres()))] = np.nan
             return colours
 
-        lengths = np.array([len(sequence) for sequence, _ in sequences], np.int64)
-        positions = [np.empty((0, 3)), *(sequence.reference.position for sequence, _ in sequences)]
-        yaws = [np.empty(0), *(np.asarray(sequence.reference.yaw) for sequence, _ in sequences)]
+        frames = [(part.reference, len(part), part.holding, track) for part, track in self._sequences]
+        references, lengths, holding, tracks = zip(*frames, strict=True) if frames else ((),) * 4
+        lengths = np.array(lengths, np.int64)
         return Truth(
             trajectory=Trajectory(np.arange(n) / self.mission.rig.frame_rate_hz, self._true_poses.array),
-            reference=np.concatenate(positions)[:n],
-            holding=np.repeat(np.array([sequence.holding for sequence, _ in sequences], np.bool_), lengths)[:n],
-            track=np.repeat(np.array([track for _, track in sequences], np.int64), lengths)[:n],
+            reference=np.concatenate([np.empty((0, 3)), *(part.position for part in references)])[:n],
+            holding=np.repeat(np.array(holding, np.bool_), lengths)[:n],
+            track=np.repeat(np.array(tracks, np.int64), lengths)[:n],
             height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
             seen=self.seen() & ~unknown,
             asked=self.mission.asked(*cells),
-            reference_yaw=np.concatenate(yaws)[:n],
+            reference_yaw=np.concatenate([np.empty(0), *(np.asarray(part.yaw) for part in references)])[:n],
             albedo=albedo,
             in_area=self.mission.asked,
             objects=surface.objects,
             overhung=surface.overhung,
         )
 
-    def true_surface(self) -> TrueSurface:
+    def true_surface(self) -> TopSurface:
         """Returns the true surface of the map; in this base class, the floor without objects."""
-        return TrueSurface(true_heights(self.mission.grid, self.mission.terrain.height_at))
+        return TopSurface(true_heights(self.mission.grid, self.mission.terrain.height_at))
 
 
 def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:

@@ -1,0 +1,139 @@
+"""Checks of the planned path: it stays over the floor, and cameras and lamps stay above the floor and the objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, maximum_filter
+
+from twin.controllers.forecast import Clearance, least_clearance
+from twin.controllers.survey_plan import SurveyPlan
+from twin.controllers.tracking import rotate_lever_arm
+from twin.core.geometry import Array
+from twin.errors import TwinError
+from twin.scenario.model import PlanConfig
+from twin.terrains import Terrain
+from twin.terrains.objects.model import PlacedObject
+from twin.terrains.objects.placement import disc_of
+from twin.world.planned_images import planned_references
+
+VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up
+#: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
+#: number of these points; on longer paths they are farther apart.
+LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
+
+
+def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> None:
+    """Raises TwinError if the area exceeds the terrain, or the path leaves the terrain or is too near the floor."""
+    size, outline = terrain.size_m, plan.area.outline()
+    extent = f"{size[0]:.2f} x {size[1]:.2f} m"
+    # a tolerance: rotation rounds the corners of an area as large as the terrain
+    if (np.ptp(outline, axis=0) > np.array(size) + 1e-9).any():
+        shown = " x ".join(f"{a:g}" for a in asked.area_m)
+        turned = f" at a heading of {asked.heading_deg:g} deg" if asked.heading_deg else ""
+        raise TwinError("plan.area_m", f"{shown} m{turned} is larger than the terrain", f"up to {extent}")
+    clearance = _clearance(plan, terrain)
+    field = "plan.area_m" if asked.polygon is None else "plan.polygon"
+    if not clearance.inside:
+        raise TwinError(field, "the path leaves the terrain", f"a path inside {extent}")
+    _check_over_heights(field, terrain, plan)
+    if clearance.least_m < asked.clearance_m:
+        needed = asked.altitude_m - clearance.least_m + asked.clearance_m
+        raise TwinError(
+            "plan.altitude_m",
+            f"{asked.altitude_m:g}: the cameras come within {clearance.least_m:.2f} m of the floor"
+            f" at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
+            f"at least {needed:.2f} for {asked.clearance_m:g} m of clearance",
+        )
+
+
+def _clearance(plan: SurveyPlan, terrain: Terrain) -> Clearance:
+    """Returns the least clearance of the planned path: height of the camera above the highest floor in its footprint.
+
+    For a path at constant height, the floor between the swaths is checked too, see `forecast.least_clearance`. For a
+    path that follows the floor, the position in the result is that of the camera, not of the highest floor point.
+    """
+    if plan.surface is None:
+        return least_clearance(plan, terrain.height_at)
+    across_m, along_m = plan.footprint_m
+    turned = plan.area.heading != 0 or plan.turns_on_the_spot
+    footprint_m = (np.hypot(across_m, along_m),) * 2 if turned else (across_m, along_m)  # along y and x
+    sides = [2 * round(side / 2 / terrain.spacing_m) + 1 for side in footprint_m]
+    nearby = np.asarray(maximum_filter(terrain.height_m, sides, mode="nearest"))
+    x, y, z = planned_references(plan).position.T
+    inside = bool(np.isfinite(terrain.height_at(x, y)).all())
+    rows, cols = _nodes(terrain, x, y)
+    gap = z - nearby[np.clip(rows, 0, nearby.shape[0] - 1), np.clip(cols, 0, nearby.shape[1] - 1)]
+    k = int(gap.argmin())
+    return Clearance(float(gap[k]), float(x[k]), float(y[k]), inside)
+
+
+def _nodes(terrain: Terrain, x: Array, y: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Returns row and column, each (n,), of the nodes of a terrain that are nearest to points."""
+    cols, rows = (x - terrain.west_m) / terrain.spacing_m, (y - terrain.south_m) / terrain.spacing_m
+    return np.rint(rows).astype(np.intp), np.rint(cols).astype(np.intp)
+
+
+def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
+    """Raises TwinError if the path leads over floor without a height, farther from the next height than an image shows.
+
+    There is nothing to plan a height or a clearance from. Smaller holes are flown over, but not judged.
+    """
+    if terrain.known is None:
+        return
+    x, y, _ = planned_references(plan).position.T
+    away_m = np.asarray(distance_transform_edt(~terrain.known)) * terrain.spacing_m
+    away_m = away_m[_nodes(terrain, x, y)]
+    k, limit_m = int(away_m.argmax()), min(plan.footprint_m) / 2
+    if away_m[k] > limit_m:
+        raise TwinError(
+            field, f"the path leads over floor without a height, up to {away_m[k]:.2f} m from the next height"
+            f" (at x {x[k]:.1f}, y {y[k]:.1f})",
+            f"a path within {limit_m:.2f} m of heights: another plan.centre_m, plan.area_m or plan.polygon",
+        )  # fmt: skip
+
+
+def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
+    """Raises TwinError if the vehicle comes too close to an object on its planned path.
+
+    The highest corner of the bounding box of an object must be at least `clearance_m` below the cameras wherever their
+    horizontal distance to the circle around this box is less than VEHICLE_REACH_M.
+    """
+    path = planned_references(plan).position if objects else np.empty((0, 3))
+    for item in objects:
+        disc, top_m = disc_of(item), item.corners_m()[:, 2].max()
+        away = np.hypot(path[:, 0] - disc.x_m, path[:, 1] - disc.y_m) - disc.radius_m - VEHICLE_REACH_M
+        gap = np.where(away < 0, path[:, 2] - top_m, np.inf)
+        k = int(gap.argmin())
+        if gap[k] < clearance_m:
+            raise TwinError(
+                f"objects.{item.group}",
+                f"the object at x {disc.x_m:.2f}, y {disc.y_m:.2f} is in the path of the vehicle: its top is at"
+                f" z {top_m:.2f} m, the cameras are at {path[k, 2]:.2f} m",
+                f"objects at least {clearance_m:g} m below the cameras (plan.clearance_m)",
+            )
+
+
+def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain, plan: SurveyPlan) -> None:
+    """Raises TwinError if a lamp is below the floor at a point of the path, with any heading of the bow on the legs.
+
+    Args:
+        number: number of the lamp in the scenario.
+        position_m, camera_m: (3,) positions of the lamp and of the left camera in the body.
+    """
+    corners = plan.outline()
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+    along = np.append(np.arange(0.0, lengths[-1], max(LAMP_STEP_M, lengths[-1] / LAMP_POINTS)), lengths[-1])
+    x, y = (np.interp(along, lengths, corners[:, k]) for k in range(2))
+    camera = np.column_stack([x, y, plan.camera_height_at(x, y)])
+    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + plan.turns_on_the_spot]
+    offset = position_m - camera_m
+    x, y, z = np.concatenate([camera + rotate_lever_arm(heading, offset) for heading in headings]).T
+    above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
+    if (least := above.min()) < 0:
+        raise TwinError(
+            f"lamps.{number}.position_m", f"is {-least:.2f} m below the floor at x {x[above.argmin()]:.1f},"
+            f" y {y[above.argmin()]:.1f}", f"{position_m[2] - least:.2f} or more for z (up)",
+        )  # fmt: skip

@@ -1,0 +1,105 @@
+"""Contradictions of a scenario that no range of a single key excludes: between keys, or keys without effect."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+from pydantic import BaseModel
+
+from twin.errors import TwinError
+from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
+from twin.scenario.model import Scenario, SensorConfig, SnowConfig, TerrainConfig
+
+_MESH_KEYS = ("mesh_file", "mesh_up", "mesh_scale")
+_FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z")
+
+
+def contradictions(scenario: Scenario) -> Iterator[TwinError]:
+    """Yields an error for each contradiction in a scenario, apart from its floor and objects."""
+    if scenario.estimate.plugin is not None and scenario.imaging.fidelity != "rendered":
+        yield TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
+    if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
+        problem, allowed = "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
+        yield TwinError("current.velocity_mps", problem, allowed)
+    if "beacons" in scenario.navigation.aiding and not scenario.beacons:
+        yield TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
+    if scenario.sensor is not None:
+        yield from _of_sensor(scenario.sensor, scenario.rig.frame_rate_hz)
+    yield from _of_lens(scenario)
+    yield from _of_snow(scenario.snow)
+
+
+def floor_contradictions(t: TerrainConfig) -> Iterator[TwinError]:
+    """Yields an error for each key of the section `terrain` that is missing, or has no effect on its kind of floor."""
+    if t.texture_file is None:
+        yield from keys_without_effect(
+            "terrain", t, ["texture_tiling"], "has no effect without a photo", "with terrain.texture_file"
+        )
+    elif t.cover is not None:
+        yield TwinError("terrain.cover", "has no effect on a floor with terrain.texture_file", "one of the two")
+    if t.kind == "mesh":
+        if t.mesh_file is None:
+            yield TwinError("terrain.mesh_file", "missing", 'a mesh, as terrain.kind is "mesh"')
+        unused = (*_FILE_KEYS, "cover", "plugin", "wall_texture")
+        problem = 'has no effect on a mesh (terrain.kind = "mesh")'
+        yield from keys_without_effect("terrain", t, unused, problem, "without it")
+        return
+    problem = f"has no effect on terrain.kind = {t.kind!r}"
+    yield from keys_without_effect("terrain", t, _MESH_KEYS, problem, 'terrain.kind = "mesh"')
+    if t.kind != "file":
+        problem = f"has no effect on a generated floor (terrain.kind = {t.kind!r})"
+        yield from keys_without_effect("terrain", t, _FILE_KEYS, problem, 'terrain.kind = "file"')
+        return
+    if t.height_file is None:
+        yield TwinError("terrain.height_file", "missing", 'a DEM, as terrain.kind is "file"')
+    problem = 'has no effect on a measured DEM (terrain.kind = "file")'
+    yield from keys_without_effect("terrain", t, ["plugin"], problem, "another kind")
+
+
+def keys_without_effect(
+    path: str, section: BaseModel, keys: Iterable[str], problem: str, allowed: str
+) -> Iterator[TwinError]:
+    """Yields an error for each of the keys of a section that is set to another value than its default.
+
+    Args:
+        path: dotted path of the section.
+        problem, allowed: as in `TwinError`.
+    """
+    for key in keys:
+        if getattr(section, key) != type(section).model_fields[key].default:
+            yield TwinError(f"{path}.{key}", problem, allowed)
+
+
+def _of_sensor(sensor: SensorConfig, frame_rate_hz: float) -> Iterator[TwinError]:
+    if sensor.exposure_min_ms > sensor.exposure_max_ms:
+        problem = f"{sensor.exposure_min_ms:g}: longer than the longest exposure"
+        allowed = f"up to sensor.exposure_max_ms = {sensor.exposure_max_ms:g}"
+        yield TwinError("sensor.exposure_min_ms", problem, allowed)
+    for key in ("exposure_max_ms", "readout_ms"):
+        if (time_ms := getattr(sensor, key)) > 1000 / frame_rate_hz:
+            longest_ms = np.floor(1e5 / frame_rate_hz) / 100
+            allowed = f"up to {longest_ms:g} at rig.frame_rate_hz = {frame_rate_hz:g}"
+            yield TwinError(f"sensor.{key}", f"{time_ms:g}: longer than a frame", allowed)
+    problem = f'is unused: sensor.white_balance is "{sensor.white_balance}"'
+    for key, mode in (("white_gains", "gains"), ("white_temperature_k", "temperature")):
+        if sensor.white_balance != mode:
+            yield from keys_without_effect("sensor", sensor, [key], problem, f'with sensor.white_balance = "{mode}"')
+
+
+def _of_lens(scenario: Scenario) -> Iterator[TwinError]:
+    lens = scenario.lens
+    for key, used in (("diffraction", lens.diffraction), ("focus_m", lens.focus_m > 0)):
+        if used and scenario.sensor is None:
+            yield TwinError(f"lens.{key}", "needs the f-number and the pixel size of the sensor", "with [sensor]")
+    if 0 < lens.focus_m < NEAREST_FOCUS_M:
+        yield TwinError("lens.focus_m", f"{lens.focus_m:g}: too near", f"0, or {NEAREST_FOCUS_M:g} or more")
+
+
+def _of_snow(snow: SnowConfig) -> Iterator[TwinError]:
+    if snow.junge_exponent is None:
+        limits, problem = ("diameter_min_m", "diameter_max_m"), "is unused: all particles have diameter_m"
+        yield from keys_without_effect("snow", snow, limits, problem, "with snow.junge_exponent")
+    elif snow.diameter_min_m >= snow.diameter_max_m:
+        problem = f"{snow.diameter_min_m:g}: not smaller than the largest diameter"
+        yield TwinError("snow.diameter_min_m", problem, f"below snow.diameter_max_m = {snow.diameter_max_m:g}")
