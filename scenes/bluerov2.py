@@ -8,7 +8,7 @@ paper's: z = -0.085 m for the horizontal thrusters, which lie below the centre o
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,24 +22,11 @@ def _array(*rows: object) -> Array:
     return values
 
 
-def _thruster_positions_m() -> Array:
-    """Returns the default thruster positions (8, 3) [m]."""
-    x, y, z = 0.156, 0.111, -0.085
-    fore, side = 0.12, 0.218
-    horizontal = [[x, -y, z], [x, y, z], [-x, -y, z], [-x, y, z]]
-    vertical = [[fore, -side, 0.0], [fore, side, 0.0], [-fore, -side, 0.0], [-fore, side, 0.0]]
-    return _array(*horizontal, *vertical)
+_X, _Y, _Z, _FORE, _SIDE = 0.156, 0.111, -0.085, 0.12, 0.218  # positions of the thrusters [m]
+_C = np.sqrt(0.5)  # vectored at 45 deg, the front pair inwards, the rear pair outwards
 
 
-def _thruster_directions() -> Array:
-    """Returns the default thruster directions (8, 3), unit vectors in body axes."""
-    c = np.sqrt(0.5)  # vectored at 45 deg, the front pair inwards, the rear pair outwards
-    horizontal = [[c, c, 0.0], [c, -c, 0.0], [c, -c, 0.0], [c, c, 0.0]]
-    return _array(*horizontal, *([[0.0, 0.0, 1.0]] * 4))
-
-
-@dataclass(frozen=True)
-class VehicleParameters:
+class VehicleParameters(NamedTuple):
     """Rigid body, hydrodynamics and thrusters of a vehicle; six-vectors are surge, sway, heave, roll, pitch, yaw (SI).
 
     Args:
@@ -62,19 +49,22 @@ class VehicleParameters:
 
     mass_kg: float = 13.5
     displaced_volume_m3: float = 0.0134
-    inertia_kgm2: Array = field(default_factory=lambda: _array(0.26, 0.23, 0.37))
-    centre_of_buoyancy_m: Array = field(default_factory=lambda: _array(0.0, 0.0, 0.01))
-    added_mass: Array = field(default_factory=lambda: _array(6.36, 7.12, 18.68, 0.189, 0.135, 0.222))
-    linear_damping: Array = field(default_factory=lambda: _array(13.7, 0.0, 33.0, 0.0, 0.8, 0.0))
-    quadratic_damping: Array = field(default_factory=lambda: _array(141.0, 217.0, 190.0, 1.19, 0.47, 1.5))
-    thruster_positions_m: Array = field(default_factory=_thruster_positions_m)
-    thruster_directions: Array = field(default_factory=_thruster_directions)
-    thrust_coefficients: Array = field(default_factory=lambda: _array(-140.3, 389.9, -404.1, 176.0, 8.9))
-    thruster_lag: tuple[Array, Array] = field(
-        default_factory=lambda: (_array(6136.0, 108700.0), _array(1.0, 89.0, 9258.0, 108700.0))
+    inertia_kgm2: Array = _array(0.26, 0.23, 0.37)
+    centre_of_buoyancy_m: Array = _array(0.0, 0.0, 0.01)
+    added_mass: Array = _array(6.36, 7.12, 18.68, 0.189, 0.135, 0.222)
+    linear_damping: Array = _array(13.7, 0.0, 33.0, 0.0, 0.8, 0.0)
+    quadratic_damping: Array = _array(141.0, 217.0, 190.0, 1.19, 0.47, 1.5)
+    thruster_positions_m: Array = _array(
+        [_X, -_Y, _Z], [_X, _Y, _Z], [-_X, -_Y, _Z], [-_X, _Y, _Z],
+        [_FORE, -_SIDE, 0.0], [_FORE, _SIDE, 0.0], [-_FORE, -_SIDE, 0.0], [-_FORE, _SIDE, 0.0],
+    )  # fmt: skip
+    thruster_directions: Array = _array(
+        [_C, _C, 0.0], [_C, -_C, 0.0], [_C, -_C, 0.0], [_C, _C, 0.0], *[[0.0, 0.0, 1.0]] * 4
     )
-    size_m: Array = field(default_factory=lambda: _array(0.457, 0.575, 0.254))
-    hull_centre_m: Array = field(default_factory=lambda: _array(0.0, 0.0, -0.03))
+    thrust_coefficients: Array = _array(-140.3, 389.9, -404.1, 176.0, 8.9)
+    thruster_lag: tuple[Array, Array] = _array(6136.0, 108700.0), _array(1.0, 89.0, 9258.0, 108700.0)
+    size_m: Array = _array(0.457, 0.575, 0.254)
+    hull_centre_m: Array = _array(0.0, 0.0, -0.03)
 
     @property
     def thrust_configuration(self) -> Array:

@@ -34,12 +34,8 @@ def add_floor(spec: MjSpec, terrain: Terrain) -> list[Tile]:
     """Adds the terrain to the model as static, emissive tiles without contacts; returns the tiles."""
     ny, nx = terrain.height_m.shape
     cells = tile_cells(ny - 1, nx - 1)
-    tiles = []
-    for r0 in range(0, ny - 1, cells):
-        for c0 in range(0, nx - 1, cells):
-            rows, cols = slice(r0, min(r0 + cells, ny - 1) + 1), slice(c0, min(c0 + cells, nx - 1) + 1)
-            tiles.append(_add_tile(spec, terrain, rows, cols))
-    return tiles
+    rows, cols = ([slice(k, min(k + cells, n - 1) + 1) for k in range(0, n - 1, cells)] for n in (ny, nx))
+    return [_add_tile(spec, terrain, row, col) for row in rows for col in cols]
 
 
 def tile_cells(n_rows: int, n_cols: int) -> int:
@@ -60,49 +56,30 @@ def _add_tile(spec: MjSpec, terrain: Terrain, rows: slice, cols: slice) -> Tile:
     # Emission only: the scene has no light, so the rendered colour is the colour of the texture.
     material = spec.add_material(name=name, emission=1.0, specular=0.0, shininess=0.0, reflectance=0.0)
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-    vertices = _add_mesh(spec, name, terrain, rows, cols, texcoord)
-    spec.worldbody.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_MESH,
-        meshname=name,
-        material=name,
-        group=FLOOR_GROUP,
-        contype=0,
-        conaffinity=0,
-    )
+    vertices = _vertices(terrain, rows, cols)
+    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
+    mesh.uservert, mesh.usertexcoord = vertices.ravel(), texcoord.ravel()
+    node = np.arange(len(vertices), dtype=np.int32).reshape(rows.stop - rows.start, -1)
+    mesh.userface = grid_triangles(node).ravel()
+    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit; with equal normals the driver shares vertices
+    shape = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": name, "material": name, "group": FLOOR_GROUP}
+    spec.worldbody.add_geom(name=name, contype=0, conaffinity=0, **shape)
     return Tile(name, vertices.min(axis=0), vertices.max(axis=0))
 
 
-def _add_mesh(
-    spec: MjSpec, name: str, terrain: Terrain, rows: slice, cols: slice, texcoord: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Adds the mesh of a tile, with cells split along (r, c)-(r + 1, c + 1); returns its vertices (n, 3) [m]."""
-    heights = terrain.height_m[rows, cols]
+def _vertices(terrain: Terrain, rows: slice, cols: slice) -> NDArray[np.float64]:
+    """Returns the nodes (n, 3) of a tile [m], row by row."""
     x_m = terrain.west_m + terrain.spacing_m * np.arange(cols.start, cols.stop)
     y_m = terrain.south_m + terrain.spacing_m * np.arange(rows.start, rows.stop)
-    grid_x, grid_y = np.meshgrid(x_m, y_m)
-    vertices = np.stack([grid_x, grid_y, heights], axis=-1).reshape(-1, 3).astype(np.float64)
-    mesh = spec.add_mesh(name=name, inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL)
-    mesh.uservert = vertices.ravel()
-    mesh.userface = _faces(*heights.shape).ravel()
-    mesh.usertexcoord = texcoord.ravel()
-    mesh.usernormal = np.tile([0.0, 0.0, 1.0], len(vertices))  # unlit; with equal normals the driver shares vertices
-    return vertices
-
-
-def _faces(n_rows: int, n_cols: int) -> NDArray[np.int32]:
-    """Returns the vertex indices (2 * cells, 3) of the triangles, counter-clockwise as seen from above."""
-    node = np.arange(n_rows * n_cols, dtype=np.int32).reshape(n_rows, n_cols)
-    return grid_triangles(node)
+    nodes = np.stack([*np.meshgrid(x_m, y_m), terrain.height_m[rows, cols]], axis=-1)
+    return nodes.reshape(-1, 3).astype(np.float64)
 
 
 def _tile_texture(terrain: Terrain, rows: slice, cols: slice) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
     """Returns the texture of a tile with margins, and the texture coordinates of its nodes.
 
-    The margins repeat the texture of the neighbouring tiles or, beyond the terrain, the texels of its edge. Filtering
-    therefore reads the same texels on both sides of a border between tiles, and no seam is visible. The tile's texture
-    starts and ends at multiples of 16 texels of the terrain's texture, which aligns the mip-map levels of adjacent
-    tiles.
+    The margins repeat the texture of the neighbouring tiles or, beyond the terrain, the texels of its edge, and start
+    and end at multiples of MARGIN_TEXELS, which aligns the mip-map levels of adjacent tiles: no seam is visible.
     """
     ny, nx = terrain.height_m.shape
     h, w = terrain.texture.shape[:2]

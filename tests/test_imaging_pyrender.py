@@ -16,7 +16,7 @@ from twin.core.records import StereoRig
 from twin.imaging.scene import object_view
 from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.imaging.scene.renderer import Renderer
-from twin.scenes.builder import CameraPair, build
+from twin.scenes.builder import build
 from twin.terrains import TextureSource
 from twin.terrains.objects.model import PlacedObject, model_of
 from twin.terrains.objects.shapes import build_shape
@@ -81,9 +81,7 @@ def poses() -> np.ndarray:
 
 def test_depth_agrees_with_pyrender(poses: np.ndarray, tmp_path: Path) -> None:
     terrain = terrains.generate("reef", (7.0, 5.0), 0.5, 0.1, 0.04, TextureSource(0.02), 5)
-    world = build(
-        terrain, CameraPair(W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))), 0.01
-    )
+    world = build(terrain, 0.01)
     with Renderer(world, W, H, VFOV) as renderer:
         ours = np.array([renderer.render(pose)[1] for pose in poses])
     theirs = pyrender_depths(*triangles(terrain), poses, tmp_path)

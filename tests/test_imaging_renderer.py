@@ -14,7 +14,7 @@ from twin import scenes, terrains
 from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging.scene.renderer import Renderer, linear_depth, visible_tiles
-from twin.scenes.builder import CameraPair, SceneModel, build
+from twin.scenes.builder import SceneModel, build
 from twin.scenes.gl import mujoco
 from twin.terrains import Terrain, TextureSource
 
@@ -30,7 +30,7 @@ POSES = [
 
 
 def world_of(terrain: Terrain) -> SceneModel:
-    return build(terrain, CameraPair(W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))), 0.01)
+    return build(terrain, 0.01)
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +181,7 @@ def test_hidden_tiles_do_not_change_the_image(world: SceneModel, renderer: Rende
         mujoco.mjr_render(renderer._rect, renderer._scene, renderer._context)
         mujoco.mjr_readPixels(renderer._rgb, renderer._z, renderer._rect, renderer._context)
         assert np.array_equal(albedo, renderer._rgb[::-1])
-        assert np.array_equal(depth, linear_depth(renderer._z[::-1], renderer._near, renderer._far))
+        assert np.array_equal(depth, linear_depth(renderer._z[::-1]))
 
 
 def test_depth_is_infinite_where_there_is_no_floor(renderer: Renderer) -> None:
@@ -203,8 +203,8 @@ def test_linear_depth_inverts_the_projection() -> None:
     near, far = np.float32(0.05), np.float32(100.0)
     depth = np.array([0.05, 0.3, 2.2, 3.3, 50.0])
     z = (near * (far - depth) / (depth * (far - near))).astype(np.float32)
-    assert linear_depth(z, near, far) == pytest.approx(depth, rel=1e-5)
-    assert np.isinf(linear_depth(np.zeros(1, np.float32), near, far)[0])
+    assert linear_depth(z) == pytest.approx(depth, rel=1e-5)
+    assert np.isinf(linear_depth(np.zeros(1, np.float32))[0])
 
 
 def test_missing_opengl_is_reported_with_the_package_to_install(

@@ -17,7 +17,7 @@ from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.shadows import BLOCK_CELLS, Shadows
 from twin.imaging.scene.renderer import Renderer
 from twin.scenario.model import LampConfig, Scenario
-from twin.scenes.builder import CameraPair, SceneModel, build
+from twin.scenes.builder import SceneModel, build
 from twin.scenes.floor import FLOOR_GROUP
 from twin.scenes.gl import mujoco
 from twin.terrains import TextureSource
@@ -61,7 +61,7 @@ def cliffs() -> terrains.Terrain:
 
 
 def world_of(terrain: terrains.Terrain) -> SceneModel:
-    return build(terrain, CameraPair(RIG.width_px, RIG.height_px, VFOV, RIG.baseline_m, RIG.body_from_camera), 0.01)
+    return build(terrain, 0.01)
 
 
 def ray_reaches(world: SceneModel, lamp: np.ndarray, points: np.ndarray) -> np.ndarray:

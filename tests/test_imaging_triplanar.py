@@ -15,7 +15,7 @@ from twin.core import geometry
 from twin.core.records import MapGrid
 from twin.imaging.scene.renderer import Renderer
 from twin.imaging.scene.triplanar import paint_walls, wall_surface
-from twin.scenes.builder import CameraPair, build
+from twin.scenes.builder import build
 from twin.terrains import Terrain, TextureSource
 from twin.terrains.walls import wall_weights
 from twin.world.true_albedo import true_albedo
@@ -35,8 +35,7 @@ def floor(heights: Callable[[np.ndarray, np.ndarray], np.ndarray | float], walls
 
 def render(terrain: Terrain, *poses: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Returns albedo (H, W, 3) and depth (H, W) of a floor at each pose (4, 4) of the camera."""
-    rig = CameraPair(W, H, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
-    with Renderer(build(terrain, rig, 0.01), W, H, VFOV) as renderer:
+    with Renderer(build(terrain, 0.01), W, H, VFOV) as renderer:
         return [renderer.render(pose) for pose in poses]
 
 
@@ -255,10 +254,9 @@ def test_walls_take_at_most_as_much_processor_time_as_a_coarse_floor_takes_to_re
     """
     terrain, pose = floor(bumps), looking(np.array([0.1, 0.0, -1.0]), np.zeros(3), 1.6)
     width, height, focal_px = 640, 480, float(240 / np.tan(np.deg2rad(VFOV) / 2))
-    rig = CameraPair(width, height, VFOV, 0.2, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
     surface, ratios = wall_surface(terrain), []
     assert surface is not None
-    with Renderer(build(replace(terrain, walls=None), rig, 0.01), width, height, VFOV) as renderer:
+    with Renderer(build(replace(terrain, walls=None), 0.01), width, height, VFOV) as renderer:
         for _ in range(25):
             begin = time.process_time()
             albedo, depth = renderer.render(pose)

@@ -8,19 +8,16 @@ import pytest
 from twin import terrains
 from twin.core import geometry
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
-from twin.scenes.builder import CameraPair, SceneModel, build
+from twin.scenes.builder import SceneModel, build
 from twin.scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
 from twin.scenes.gl import mujoco
 from twin.terrains import TextureSource
-
-BODY_FROM_LEFT = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.02, 0.1, -0.15]))
-LAMPS = [[0.25, 0.35, -0.05], [0.25, -0.35, -0.05]]
 
 
 @pytest.fixture(scope="module")
 def scene() -> SceneModel:
     terrain = terrains.generate("reef", (6.0, 3.7), 0.5, 0.2, 0.05, TextureSource(0.02), 3)
-    return build(terrain, CameraPair(160, 120, 45.0, 0.2, BODY_FROM_LEFT), 0.004, LAMPS)
+    return build(terrain, 0.004)
 
 
 def data_at(scene: SceneModel, position: np.ndarray, rotation: np.ndarray) -> mujoco.MjData:
@@ -45,32 +42,12 @@ def test_thrust_curve_agrees_with_the_published_points() -> None:
     assert thrust_n == pytest.approx([4.6, 16.6, 26.5, 30.4], abs=0.06)
 
 
-def test_thruster_sites_have_the_published_positions_and_directions(scene: SceneModel) -> None:
-    data = data_at(scene, np.array([0, 0, 2.0]), np.eye(3))
-    axes = data.site_xmat[scene.thruster_site_ids].reshape(8, 3, 3)[:, :, 2]
-    assert axes == pytest.approx(BLUEROV2_HEAVY.thruster_directions, abs=1e-12)
-    assert data.site_xpos[scene.thruster_site_ids] - [0, 0, 2] == pytest.approx(BLUEROV2_HEAVY.thruster_positions_m)
-    assert data.site_xpos[scene.lamp_site_ids] - [0, 0, 2] == pytest.approx(np.array(LAMPS))
-
-
-def test_the_stereo_pair_is_mounted_as_calibrated(scene: SceneModel) -> None:
-    rotation = geometry.rotation_from_rpy(0.1, -0.2, 0.7)
-    data = data_at(scene, np.array([0.3, -0.4, 2.0]), rotation)
-    world_from_left = geometry.pose(rotation, np.array([0.3, -0.4, 2.0])) @ BODY_FROM_LEFT
-    right_from = geometry.pose(np.eye(3), np.array([0.2, 0, 0]))
-    cv_from_gl = np.diag([1.0, -1.0, -1.0])  # a MuJoCo camera has y up and points along -z
-    for camera, expected in zip(scene.camera_ids, (world_from_left, world_from_left @ right_from), strict=True):
-        assert data.cam_xpos[camera] == pytest.approx(expected[:3, 3], abs=1e-9)
-        assert data.cam_xmat[camera].reshape(3, 3) @ cv_from_gl == pytest.approx(expected[:3, :3], abs=1e-9)
-    assert np.all(scene.model.cam_fovy == 45.0)
-
-
 def test_the_vehicle_has_the_published_mass_and_inertia_and_falls_freely(scene: SceneModel) -> None:
-    model = scene.model
-    assert model.body_mass[scene.body_id] == 13.5 and model.body_mass.sum() == 13.5
-    assert model.body_inertia[scene.body_id] == pytest.approx([0.26, 0.23, 0.37])
-    assert model.body_ipos[scene.body_id] == pytest.approx(np.zeros(3))
-    assert model.body_iquat[scene.body_id] == pytest.approx([1, 0, 0, 0])
+    model, body = scene.model, scene.model.body("vehicle").id
+    assert model.body_mass[body] == 13.5 and model.body_mass.sum() == 13.5
+    assert model.body_inertia[body] == pytest.approx([0.26, 0.23, 0.37])
+    assert model.body_ipos[body] == pytest.approx(np.zeros(3))
+    assert model.body_iquat[body] == pytest.approx([1, 0, 0, 0])
     data = data_at(scene, np.zeros(3), np.eye(3))  # inside the floor, which has no contact
     assert data.ncon == 0 and data.qacc[:3] == pytest.approx([0, 0, -9.81]) and model.opt.timestep == 0.004
 

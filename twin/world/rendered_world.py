@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-import twin.scenes.builder
 from twin.core.records import Image
 from twin.core.timing import StageTimer
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.scene.renderer import Renderer
 from twin.imaging.stereo_camera import StereoCamera
+from twin.scenes.builder import build
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import InertialSensor
 from twin.simulate.kinematic_vehicle import KinematicVehicle
@@ -36,11 +36,7 @@ class RenderedWorld(World):
         scenario, cameras = mission.scenario, mission.true_cameras
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
         vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
-        scene = twin.scenes.builder.build(
-            mission.rendered_terrain,
-            twin.scenes.builder.CameraPair(rig.width_px, rig.height_px, vfov_deg, rig.baseline_m, rig.body_from_camera),
-            physics_timestep_s(rig.frame_rate_hz), [lamp.position_m for lamp in scenario.lamps],
-        )  # fmt: skip
+        scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz))
         vehicle = (
             MujocoVehicle(scene.model, scenario.vehicle, np.array(scenario.current.velocity_mps), mission.start_of_body)
             if scenario.vehicle.dynamics == "rigid"

@@ -19,6 +19,8 @@ from twin.scenes.gl import MjModel, MjvScene, mujoco, offscreen_context
 
 Array = NDArray[np.float64]
 
+_NEAR, _FAR = np.float32(NEAR_M), np.float32(100.0)  # depths of the clipping planes [m]
+
 
 class Renderer:
     """Renderer of the floor of a scene, without the vehicle, for a pinhole camera (x right, y down, z forward).
@@ -32,17 +34,8 @@ class Renderer:
         TwinError: OpenGL is not available.
     """
 
-    def __init__(
-        self,
-        scene: SceneModel,
-        width_px: int,
-        height_px: int,
-        vfov_deg: float,
-        znear_m: float = NEAR_M,
-        zfar_m: float = 100.0,
-    ):
+    def __init__(self, scene: SceneModel, width_px: int, height_px: int, vfov_deg: float):
         self._scene_model = scene
-        self._near, self._far = np.float32(znear_m), np.float32(zfar_m)
         self._rect = mujoco.MjrRect(0, 0, width_px, height_px)
         self._tan = np.tan(np.deg2rad(vfov_deg) / 2) * np.array([width_px / height_px, 1.0])
         self._focal_px, self._walls = height_px / 2 / self._tan[1], wall_surface(scene.terrain)
@@ -51,7 +44,10 @@ class Renderer:
         self._gl: Any
         self._gl, self._context = _open(scene.model, width_px, height_px)
         self._scene = _floor_scene(scene.model)
-        self._set_projection()
+        self._set(
+            frustum_near=_NEAR, frustum_far=_FAR, frustum_center=0.0, frustum_width=_NEAR * self._tan[0],
+            frustum_top=_NEAR * self._tan[1], frustum_bottom=-_NEAR * self._tan[1], orthographic=0,
+        )  # fmt: skip
         order = {geom: k for k, geom in enumerate(scene.tile_geom_ids)}
         geoms = [self._scene.geoms[k] for k in range(self._scene.ngeom)]
         self._tiles = sorted(geoms, key=lambda geom: order[geom.objid])
@@ -61,12 +57,13 @@ class Renderer:
     def render(self, world_from_camera: Array) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Returns albedo (H, W, 3) uint8 RGB and depth (H, W) float32 along the optical axis [m]; inf = no floor."""
         self._gl.make_current()
-        self._set_pose(world_from_camera)
+        axes, position_m = world_from_camera[:3, :3], world_from_camera[:3, 3]
+        self._set(pos=position_m, forward=axes[:, 2], up=-axes[:, 1])
         self._show(visible_tiles(self._scene_model, world_from_camera, self._tan))
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
         mujoco.mjr_render(self._rect, self._scene, self._context)
         mujoco.mjr_readPixels(self._rgb, self._z, self._rect, self._context)
-        albedo, depth = self._rgb[::-1].copy(), linear_depth(self._z[::-1], self._near, self._far)  # rows run upwards
+        albedo, depth = self._rgb[::-1].copy(), linear_depth(self._z[::-1])  # rows run upwards
         if self._walls is not None:
             paint_walls(self._walls, albedo, depth, world_from_camera, self._focal_px)
         return albedo, depth
@@ -85,18 +82,11 @@ class Renderer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _set_projection(self) -> None:
-        for camera in self._scene.camera:  # MuJoCo averages its two cameras
-            camera.frustum_near, camera.frustum_far = self._near, self._far
-            camera.frustum_center, camera.frustum_width = 0.0, self._near * self._tan[0]
-            camera.frustum_top, camera.frustum_bottom = self._near * self._tan[1], -self._near * self._tan[1]
-            camera.orthographic = 0
-
-    def _set_pose(self, world_from_camera: Array) -> None:
+    def _set(self, **values: Any) -> None:
+        """Sets attributes of both cameras of the scene, which MuJoCo averages."""
         for camera in self._scene.camera:
-            camera.pos[:] = world_from_camera[:3, 3]
-            camera.forward[:] = world_from_camera[:3, 2]
-            camera.up[:] = -world_from_camera[:3, 1]
+            for name, value in values.items():
+                setattr(camera, name, value)
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
         """Shows only the tiles of the mask `visible` (n,)."""
@@ -145,10 +135,10 @@ def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Ar
     return np.all(farthest >= 0, axis=1)
 
 
-def linear_depth(z_buffer: NDArray[np.float32], near_m: np.float32, far_m: np.float32) -> NDArray[np.float32]:
+def linear_depth(z_buffer: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns the depth [m] from OpenGL's reversed depth buffer (1 at near, 0 at far); inf where nothing is drawn.
 
     With z the value in the buffer, 1 / depth = z (1/near - 1/far) + 1/far.
     """
-    inverse = z_buffer * np.float32(1 / near_m - 1 / far_m) + np.float32(1 / far_m)
+    inverse = z_buffer * np.float32(1 / _NEAR - 1 / _FAR) + np.float32(1 / _FAR)
     return np.where(z_buffer > 0, np.reciprocal(inverse), np.float32(np.inf))
