@@ -13,31 +13,21 @@ from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.noise import fractal_field
 from twin.terrains.terrain import Terrain, texture_shape
 from twin.terrains.textures import TextureSource, generate_texture
-from twin.terrains.wall_texture import walls_of
+from twin.terrains.walls import walls_of
 
 Heights = NDArray[np.float32]
 MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  #: limit of the slope (rise over run) of a reef, see `_limit_slope`
 
 
 def generate(
-    kind: str,
-    size_m: tuple[float, float],
-    relief_m: float,
-    base_m: float,
-    grid_m: float,
-    texture: TextureSource,
+    kind: str, size_m: tuple[float, float], relief_m: float, base_m: float, grid_m: float, texture: TextureSource,
     seed: int | np.random.SeedSequence,
-) -> Terrain:
-    """Generates a terrain centred at the origin, with heights from base_m to base_m + relief_m.
+) -> Terrain:  # fmt: skip
+    """Returns a terrain of a kind of KINDS, centred at the origin, with heights from base_m to base_m + relief_m.
 
-    A terrain of kind "flat", or without relief, has the height base_m everywhere.
+    A terrain of kind "flat", or without relief, has the height base_m everywhere. The arguments are those of
+    `generate_from`.
 
-    Args:
-        kind: a key of KINDS.
-        size_m: extent along x and y; rounded up to whole cells.
-        relief_m: difference between the greatest and the least height.
-        texture: side of a texel, cover and texture of walls of the floor; its files are not used.
-        seed: seed of the heights and the texture.
     Raises:
         TwinError: the kind or the cover is unknown, or the terrain is too large for memory.
     """
@@ -53,19 +43,16 @@ def generate(
 
 def generate_from(
     heights: Callable[[NDArray[np.float64], NDArray[np.float64], np.random.Generator], NDArray[np.floating]],
-    size_m: tuple[float, float],
-    grid_m: float,
-    texture: TextureSource,
-    cover: str,
+    size_m: tuple[float, float], grid_m: float, texture: TextureSource, cover: str,
     seed: int | np.random.SeedSequence,
-) -> Terrain:
+) -> Terrain:  # fmt: skip
     """Returns a terrain centred at the origin, with heights from a function and a generated texture.
 
     Args:
         heights: function that returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the grid nodes [m], given
             a random generator.
         size_m: extent along x and y; rounded up to whole cells.
-        texture: side of a texel; its files are not used.
+        texture: side of a texel and texture of walls; its files are not used.
         cover: a key of `ground_cover.COVERS`.
         seed: seed of the heights and the texture.
     Raises:
@@ -91,7 +78,6 @@ def scale_to_relief(heights: Heights, relief_m: float, base_m: float) -> Heights
 
 
 def _flat(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Returns heights (ny, nx) of zero."""
     return np.zeros(shape, np.float32)
 
 
@@ -140,11 +126,7 @@ def _staircase(level: Heights) -> Heights:
 
 
 def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.random.Generator) -> Heights:
-    """Generates domes with steep, lobed flanks.
-
-    There is one dome per 3 square metres (at least three), with a radius of 0.25 to 0.9 m. The height far from all
-    domes is -relief_m.
-    """
+    """Generates domes with steep, lobed flanks, one per 3 square metres (at least three); far from them, -relief_m."""
     result = np.full(shape, -relief_m, np.float32)
     ny, nx = shape
     lobes = fractal_field(shape, 0.5 / grid_m, 0.6, rng)
@@ -165,10 +147,7 @@ def _bommies(shape: tuple[int, int], grid_m: float, relief_m: float, rng: np.ran
 
 
 def _limit_slope(height: Heights, relief_m: float, grid_m: float) -> Heights:
-    """Smooths heights (ny, nx), at most 12 times, until the 99.5th percentile of the slope is at most MAX_SLOPE.
-
-    The slope is computed after scaling the heights to the relief `relief_m`; the result is not scaled.
-    """
+    """Smooths heights, at most 12 times, until the 99.5th percentile of the slope is MAX_SLOPE at the given relief."""
     sigma_px = 0.5
     for _ in range(12):
         north, east = np.gradient(scale_to_relief(height, relief_m, 0.0), grid_m)
@@ -179,10 +158,4 @@ def _limit_slope(height: Heights, relief_m: float, grid_m: float) -> Heights:
     return height
 
 
-KINDS: dict[str, Callable[[tuple[int, int], float, float, np.random.Generator], Heights]] = {
-    "flat": _flat,
-    "ripples": _ripples,
-    "fractal": _fractal,
-    "reef": _reef,
-    "cliffs": _cliffs,
-}
+KINDS = {"flat": _flat, "ripples": _ripples, "fractal": _fractal, "reef": _reef, "cliffs": _cliffs}

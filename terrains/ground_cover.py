@@ -6,37 +6,28 @@ stones with dark gaps, cracks, polyps, blades, burrows or shells.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.kernels import kernel
-from twin.terrains.lattice_noise import Table, cells, fractal_noise, lattice_table, value_noise
+from twin.terrains.noise import cells, fractal_noise, lattice_table, value_noise
 
 GRAINS, STONES, CRACKS, POLYPS, BLADES, BURROWS, SHELLS = range(7)
 Colour = tuple[int, int, int]
 
 
-@dataclass(frozen=True)
-class Cover:
-    """Material of a floor.
+class Cover(NamedTuple):
+    """Material of a floor."""
 
-    Args:
-        dark, medium, bright: albedo as 8-bit RGB at the ends and in the middle of the ramp.
-        structure: one of GRAINS to SHELLS.
-        size_m: distance between the elements of the structure.
-        strength: change along the ramp where the value of the structure (`_structure`) is 1, as a fraction of the ramp.
-        noise: change along the ramp as the pink noise increases from 0 to 255, as a fraction of the ramp.
-    """
-
-    dark: Colour
+    dark: Colour  #: albedo as 8-bit RGB at the ends and in the middle of the ramp
     medium: Colour
     bright: Colour
-    structure: int
-    size_m: float
-    strength: float
-    noise: float
+    structure: int  #: one of GRAINS to SHELLS
+    size_m: float  #: distance between the elements of the structure
+    strength: float  #: change along the ramp where the value of the structure is 1, as a fraction of the ramp
+    noise: float  #: change along the ramp as the pink noise increases from 0 to 255, as a fraction of the ramp
 
 
 SAND = Cover((112, 99, 76), (178, 163, 132), (232, 222, 200), SHELLS, 0.11, 0.45, 1.05)
@@ -61,53 +52,34 @@ COVERS = {
 }
 #: Cover of each kind of floor if the scenario does not choose one.
 DEFAULT_COVERS = {
-    "flat": "sand",
-    "ripples": "sand",
-    "fractal": "rock",
-    "reef": "reef",
-    "cliffs": "reef",
-    "file": "reef",
-}
-_TONES = 256
+    "flat": "sand", "ripples": "sand", "fractal": "rock", "reef": "reef", "cliffs": "reef", "file": "reef",
+}  # fmt: skip
 EDGE_M = 0.12  #: size of the largest lobes of the border between two materials [m]
 
 
 def paint(
     material: NDArray[np.uint8], tone: NDArray[np.uint8], texel_m: float, cover: str, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Returns the colours (rows, cols, 3) uint8 of a floor.
+    """Returns the colours (rows, cols, 3) uint8 of a floor with the materials of `cover`, a key of COVERS.
 
     Args:
         material: (rows, cols) level that selects the material: its quarters belong to the four materials of the cover,
             with gradual transitions between them.
         tone: (rows, cols) pink noise with mean 128, see `noise.pink_noise`.
-        cover: a key of COVERS.
     """
     covers = COVERS[cover]
-    ramps = np.stack([_ramp(c) for c in covers])
+    bands = [np.array([c.dark, c.medium, c.bright]).T for c in covers]
+    tones = np.linspace(0.0, 1.0, 256)
+    ramps = np.array([[np.interp(tones, (0.0, 0.5, 1.0), band) for band in ramp] for ramp in bands], np.float32)
     structure = np.array([c.structure for c in covers], np.int64)
     numbers = np.array([[c.size_m, c.strength, c.noise] for c in covers])
+    ramps = np.ascontiguousarray(ramps.swapaxes(1, 2))
     return _paint(material, tone, texel_m, ramps, structure, numbers, lattice_table(rng))
 
 
-def _ramp(cover: Cover) -> NDArray[np.float32]:
-    """Returns the ramp of a material: 256 colours (256, 3) from dark to bright, 0 to 255."""
-    tones = np.linspace(0.0, 1.0, _TONES)
-    bands = zip(cover.dark, cover.medium, cover.bright, strict=True)
-    return np.stack([np.interp(tones, (0.0, 0.5, 1.0), band) for band in bands], axis=1).astype(np.float32)
-
-
 @kernel
-def _paint(
-    material: NDArray[np.uint8],
-    tone: NDArray[np.uint8],
-    texel_m: float,
-    ramps: NDArray[np.float32],
-    structure: NDArray[np.int64],
-    numbers: NDArray[np.float64],
-    table: Table,
-) -> NDArray[np.uint8]:  # pragma: no cover (compiled)
-    """Returns the colours (rows, cols, 3); for the arguments see `paint` and `Cover`."""
+def _paint(material, tone, texel_m, ramps, structure, numbers, table):
+    """Returns the colours (rows, cols, 3) with ramps (4, 256, 3), structures (4,), and `numbers` (4, 3) of `Cover`."""
     rows, cols = material.shape
     alike = [bool(np.all(ramps[k] == ramps[k + 1])) for k in range(3)]
     colour = np.empty((rows, cols, 3), np.uint8)
@@ -136,7 +108,7 @@ def _paint(
 
 
 @kernel
-def _structure(kind: int, x: float, y: float, size: float, table: Table) -> float:  # pragma: no cover (compiled)
+def _structure(kind, x, y, size, table):
     """Returns the change along the ramp, about -1 to 1, due to a structure at the point (x, y) [m]."""
     if kind == GRAINS:
         return fractal_noise(x / size, y / size, 3, table, 0)
@@ -169,7 +141,7 @@ def _structure(kind: int, x: float, y: float, size: float, table: Table) -> floa
 
 
 @kernel
-def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (compiled)
+def _blades(x, y, table):
     """Returns the change along the ramp at (x, y) due to crossing blades of seagrass in three layers, dark in between.
 
     x and y are in units of the width of a blade.
@@ -187,6 +159,6 @@ def _blades(x: float, y: float, table: Table) -> float:  # pragma: no cover (com
 
 
 @kernel
-def _soft(inside: float, width: float) -> float:  # pragma: no cover (compiled)
+def _soft(inside, width):
     """Returns 0 outside and 1 inside a spot, from the distance `inside` its edge and the `width` of the soft edge."""
     return min(max(inside / width + 0.5, 0.0), 1.0)

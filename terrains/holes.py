@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from twin.errors import TwinError
-from twin.terrains.file_header import HEIGHT_FIELD
+from twin.terrains.file_header import height_error
 
 #: Values that programs write in cells without a height.
 _NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 65535.0)
@@ -21,10 +21,7 @@ _LEAST_GAP, _MOST_RANGES = 100.0, 10.0
 def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> None:
     """Raises TwinError if the least or the greatest value is so far from all others that it can only mark holes.
 
-    Args:
-        values: values as stored in the file, NaN or infinite in the holes that it declares.
-        file: the file, for the message.
-        remedy: how to declare the value, which replaces "{}".
+    Values are NaN or infinite in the holes that the file declares; `remedy` says how to declare the value "{}".
     """
     finite = values[np.isfinite(values)]
     for value in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
@@ -33,10 +30,9 @@ def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: s
             continue
         low, high = heights.min(), heights.max()
         if max(low - value, value - high) > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
-            raise TwinError(
-                HEIGHT_FIELD, f"{file.name!r} has the value {value:g} in {np.count_nonzero(finite == value)} cells,"
-                f" far from all others ({low:g} to {high:g}), and does not declare it as nodata",
-                remedy.format(f"{value:g}"),
+            raise height_error(
+                file, f"has the value {value:g} in {np.count_nonzero(finite == value)} cells, far from all others"
+                f" ({low:g} to {high:g}), and does not declare it as nodata", remedy.format(f"{value:g}"),
             )  # fmt: skip
 
 
@@ -45,23 +41,15 @@ def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]
     holes = ~np.isfinite(height_m)
     if not holes.any():
         return height_m, 0
-    from scipy import ndimage  # imported here: it takes 0.1 s, and most terrains have no holes
-
     nearest = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
     assert nearest is not None
     return height_m[tuple(nearest)], int(holes.sum())
 
 
 def known_nodes(given: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
-    """Returns the nodes (ny, nx) with a height or in a small hole; None if these are all nodes.
-
-    Args:
-        given: (ny, nx) nodes with a height; at least one.
-    """
+    """Returns the nodes (ny, nx) with a height (`given`, at least one) or in a small hole; None if all nodes are."""
     if given.all():
         return None
-    from scipy import ndimage
-
     labelled, n = ndimage.label(~given, np.ones((3, 3)))  # pyright: ignore
     holes, distance = np.asarray(labelled, np.int64), np.asarray(ndimage.distance_transform_edt(~given))
     small = np.append(False, np.asarray(ndimage.maximum(distance, holes, np.arange(1, n + 1))) <= _SMALL)

@@ -1,4 +1,8 @@
-"""Random fields with detail at every scale: sums of octaves of noise."""
+"""Noise with detail at every scale: random fields, and functions of position for loops over texels.
+
+The functions of position (value, fractal and cellular noise) take a lattice of random numbers, shifted for each
+`layer`, and are periodic with LATTICE lattice spacings. Cellular noise: Worley 1996, A cellular texture basis function.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +10,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.kernels import kernel
+
+LATTICE = 512
+_MASK = LATTICE - 1
+
 
 def fractal_field(
     shape: tuple[int, int], coarsest_px: float, gain: float, rng: np.random.Generator
 ) -> NDArray[np.float32]:
-    """Generates an approximate fractional Brownian surface as a sum of octaves of interpolated random values.
+    """Returns an approximate fractional Brownian surface (rows, cols), with zero mean and unit standard deviation.
 
-    The random values of octave k are coarsest_px / 2^k cells apart, at least one cell; its amplitude is gain^k.
-
-    Args:
-        shape: (rows, cols) of the field.
-        coarsest_px: distance between the random values of the coarsest octave [cells]; below 2, it is 2.
-        gain: amplitude ratio of successive octaves, 2^-H for a Hurst exponent H.
-    Returns:
-        (rows, cols) float32 field with zero mean and unit standard deviation.
+    It is a sum of octaves of interpolated random values. Those of octave k are coarsest_px / 2^k cells apart, between 1
+    and at least 2 cells; the amplitude of the octave is gain^k, with the gain 2^-H for a Hurst exponent H.
     """
     total = np.zeros(shape, np.float32)
     amplitude, scale_px = 1.0, float(max(coarsest_px, 2.0))
@@ -40,18 +43,10 @@ def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: floa
 
 
 def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Generates 8-bit pink noise.
+    """Returns 8-bit pink noise (rows, cols) with a mean of about 128.
 
-    The random values of every octave have the same standard deviation, so an image of a floor with this texture shows
-    detail at any distance. Starting with the coarsest octave, the field is repeatedly doubled in size and the next
-    octave is added.
-
-    Args:
-        shape: (rows, cols) of the result.
-        octaves: number of octaves; the finest one has one random value per cell of the result.
-        contrast: standard deviation of the random values of an octave, before interpolation [grey levels].
-    Returns:
-        (rows, cols) uint8 with a mean of about 128.
+    The random values of every octave have the standard deviation `contrast` [grey levels] before interpolation, so an
+    image of a floor with this texture shows detail at any distance; the finest octave has one value per cell.
     """
     sizes = [tuple(-(-n // 2**k) for n in shape) for k in range(octaves)][::-1]
     value = np.full(sizes[0], 128, np.uint8)
@@ -61,3 +56,63 @@ def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.ra
         noise = np.frombuffer(rng.bytes(rows * cols), np.uint8).reshape(rows, cols)
         value = cv2.addWeighted(value, 1.0, noise, weight, -128 * weight)
     return np.asarray(value, np.uint8)
+
+
+def lattice_table(rng: np.random.Generator) -> NDArray[np.float32]:
+    """Returns the random numbers (LATTICE, LATTICE), 0 to 1, of a lattice for `value_noise` and what is based on it."""
+    return rng.random((LATTICE, LATTICE), np.float32)
+
+
+@kernel
+def value_noise(x, y, table, layer):
+    """Returns smooth noise, 0 to 1: the numbers at the points of the lattice, interpolated between the points."""
+    i, j = int(np.floor(x)), int(np.floor(y))
+    u, v = x - i, y - j
+    u, v = u * u * (3.0 - 2.0 * u), v * v * (3.0 - 2.0 * v)
+    r0, c0 = (i + 61 * layer) & _MASK, (j + 113 * layer) & _MASK
+    r1, c1 = (r0 + 1) & _MASK, (c0 + 1) & _MASK
+    a, b = table[r0, c0], table[r1, c0]
+    c, d = table[r0, c1], table[r1, c1]
+    return (1.0 - v) * (a + u * (b - a)) + v * (c + u * (d - c))
+
+
+@kernel(inline="always")
+def fractal_noise(x, y, octaves, table, layer):
+    """Returns a sum of octaves of value noise, about -1 to 1 with a mean of about 0.
+
+    Each octave has half the amplitude and wavelength of the one before; (x, y) are in lattice spacings of the first.
+    """
+    # numba compiles a function once for each value of an `int` constant in a call, but not of an `np.int64`
+    return _octaves(x, y, np.int64(octaves), table, np.int64(layer))  # pyright: ignore[reportArgumentType]
+
+
+@kernel
+def _octaves(x, y, octaves, table, layer):
+    """Compiled loop of `fractal_noise`."""
+    total, amplitude = 0.0, 1.0
+    for octave in range(octaves):
+        total += amplitude * (2.0 * value_noise(x, y, table, layer + 7 * octave) - 1.0)
+        x, y, amplitude = 2.0 * x, 2.0 * y, 0.5 * amplitude
+    return total
+
+
+@kernel
+def cells(x, y, table, layer):
+    """Returns the distances to the nearest and second nearest point of cellular noise, and the nearest's own number.
+
+    Each square of the lattice contains one point, at a random place; distances are in lattice spacings, the random
+    number of a point is 0 to 1.
+    """
+    nearest, second, row, col = 9.0, 9.0, 0, 0
+    i0, j0 = int(np.floor(x)) - 1, int(np.floor(y)) - 1
+    for i in range(i0, i0 + 3):
+        for j in range(j0, j0 + 3):
+            r, c = (i + 61 * layer) & _MASK, (j + 113 * layer) & _MASK
+            dx = i + table[r, c] - x
+            dy = j + table[(r + 200) & _MASK, c] - y
+            squared = dx * dx + dy * dy
+            if squared < nearest:
+                nearest, second, row, col = squared, nearest, r, c
+            elif squared < second:
+                second = squared
+    return np.sqrt(nearest), np.sqrt(second), table[row, (col + 300) & _MASK]

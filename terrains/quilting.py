@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from twin.kernels import kernel
 
+Image = NDArray[np.uint8]
+
 BLOCK_FRACTION = 5  #: shorter side of the photo divided by the side of a block
 OVERLAP_FRACTION = 4  #: side of a block divided by the overlap of neighbouring blocks
 CANDIDATES = 60  #: random places of the photo that are compared for each block
@@ -21,20 +23,12 @@ LIGHTING_ROWS = 128  #: rows of a photo that are divided by this variation at a 
 MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
 
 
-def even_lighting(photo: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Removes slow variations of brightness from a photo of a floor; the mean brightness stays about the same.
+def even_lighting(photo: Image) -> Image:
+    """Returns a photo (h, w, 3) of a floor without slow variations of its brightness, the mean of R, G and B.
 
-    A polynomial of degree 2 in row and column is fitted by least squares to the brightness, the mean of R, G and B. The
-    photo is multiplied by the mean brightness and divided by this polynomial, or by 5 % of the mean where the
-    polynomial is less. A black photo is returned unchanged.
-
-    In a large photo, the polynomial is fitted to about LIGHTING_SAMPLES pixels on a regular grid. In addition to photo
-    and result, memory is needed for these pixels and for a few blocks of LIGHTING_ROWS rows.
-
-    Args:
-        photo: (h, w, 3) uint8 RGB.
-    Returns:
-        (h, w, 3) uint8.
+    A polynomial of degree 2 in row and column is fitted to the brightness of about LIGHTING_SAMPLES pixels. The photo
+    is multiplied by the mean brightness and divided by this polynomial, or by 5 % of the mean where it is less. A
+    black photo is returned unchanged.
     """
     step = max(1, round(np.sqrt(photo.shape[0] * photo.shape[1] / LIGHTING_SAMPLES)))
     v, u = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in photo.shape[:2])
@@ -58,17 +52,11 @@ def _terms(v: NDArray[np.float32], u: NDArray[np.float32]) -> tuple[NDArray[np.f
     return np.ones((1, 1), np.float32), u, v, u * u, u * v, v * v
 
 
-def quilt(photo: NDArray[np.uint8], shape: tuple[int, int], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Makes a texture of any size from blocks of a photo, with the scale of the photo.
+def quilt(photo: Image, shape: tuple[int, int], rng: np.random.Generator) -> Image:
+    """Returns a texture (rows, cols, 3) made of blocks of a photo (h, w, 3), with the scale of the photo.
 
-    A texture that has at most the rows and columns of the photo is its upper left part.
-
-    Args:
-        photo: (h, w, 3) uint8 RGB; h, w >= BLOCK_FRACTION * MIN_BLOCK_PX.
-        shape: (rows, cols) of the texture.
-        rng: random generator of the places in the photo that blocks are taken from.
-    Returns:
-        (rows, cols, 3) uint8 RGB.
+    A texture that has at most the rows and columns of the photo is its upper left part. The photo has at least
+    BLOCK_FRACTION * MIN_BLOCK_PX rows and columns.
     """
     rows, cols = shape
     if rows <= photo.shape[0] and cols <= photo.shape[1]:
@@ -80,81 +68,51 @@ def quilt(photo: NDArray[np.uint8], shape: tuple[int, int], rng: np.random.Gener
     texture = np.zeros((n_rows * step + overlap, n_cols * step + overlap, 3), np.uint8)
     places = rng.integers(0, 2**31, (n_rows, n_cols, CANDIDATES, 2)).astype(np.int64)
     places %= np.array([photo.shape[0] - side + 1, photo.shape[1] - side + 1])
-    _lay(texture, np.ascontiguousarray(photo), side, overlap, places, rng.random((n_rows, n_cols)))
+    photo, draws = np.ascontiguousarray(photo), rng.random((n_rows, n_cols))
+    for i, j in np.ndindex(n_rows, n_cols):
+        target = texture[i * step : i * step + side, j * step : j * step + side]
+        difference = _differences(target, photo, places[i, j], overlap, i > 0, j > 0)
+        agreeing = np.flatnonzero(difference <= difference.min() * TOLERANCE)
+        r, c = places[i, j, agreeing[int(draws[i, j] * len(agreeing))]]
+        _join(target, photo[r : r + side, c : c + side], overlap, i > 0, j > 0)
     return np.ascontiguousarray(texture[:rows, :cols])
 
 
 @kernel
-def _lay(
-    texture: NDArray[np.uint8],
-    photo: NDArray[np.uint8],
-    side: int,
-    overlap: int,
-    places: NDArray[np.int64],
-    draws: NDArray[np.float64],
-) -> None:  # pragma: no cover (compiled)
-    """Fills a texture with blocks, in rows from the north-west corner."""
-    step = side - overlap
-    n_rows, n_cols, n_places = places.shape[:3]
-    difference = np.empty(n_places, np.float64)
-    for i in range(n_rows):
-        for j in range(n_cols):
-            target = texture[i * step : i * step + side, j * step : j * step + side]
-            for k in range(n_places):
-                r, c = places[i, j, k]
-                difference[k] = _difference(target, photo[r : r + side, c : c + side], overlap, i > 0, j > 0)
-            limit = difference.min() * TOLERANCE
-            wanted = int(draws[i, j] * (difference <= limit).sum())
-            chosen = 0
-            for k in range(n_places):
-                if difference[k] <= limit:
-                    if wanted == 0:
-                        chosen = k
-                        break
-                    wanted -= 1
-            r, c = places[i, j, chosen]
-            _join(target, photo[r : r + side, c : c + side], overlap, i > 0, j > 0)
-
-
-@kernel
-def _difference(
-    target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
-) -> float:  # pragma: no cover (compiled)
-    """Returns the sum of squared differences of block and target in the overlaps with the blocks above and to the left.
+def _differences(target, photo, places, overlap, above, left):
+    """Returns the sums of squared differences of target and blocks in the overlaps with the blocks above and left.
 
     Only every second pixel of every second row is used.
     """
-    side, total = target.shape[0], 0.0
-    if above:
-        for r in range(0, overlap, 2):
+    side, totals = target.shape[0], np.zeros(len(places))
+    for k in range(len(places)):
+        block, total = photo[places[k, 0] : places[k, 0] + side, places[k, 1] : places[k, 1] + side], 0.0
+        for r in range(0, overlap if above else 0, 2):
             for c in range(0, side, 2):
                 total += _squared(target[r, c], block[r, c])
-    if left:
         for r in range(overlap if above else 0, side, 2):
-            for c in range(0, overlap, 2):
+            for c in range(0, overlap if left else 0, 2):
                 total += _squared(target[r, c], block[r, c])
-    return total
+        totals[k] = total
+    return totals
 
 
 @kernel
-def _squared(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:  # pragma: no cover (compiled)
+def _squared(a, b):
     """Returns the squared distance of two colours."""
     d0, d1, d2 = float(a[0]) - b[0], float(a[1]) - b[1], float(a[2]) - b[2]
     return d0 * d0 + d1 * d1 + d2 * d2
 
 
 @kernel
-def _join(
-    target: NDArray[np.uint8], block: NDArray[np.uint8], overlap: int, above: bool, left: bool
-) -> None:  # pragma: no cover (compiled)
+def _join(target, block, overlap, above, left):
     """Copies the part of a block (side, side, 3) below and right of the cuts through its overlaps onto the target.
 
     A cut is the path of least difference through the overlap with the block above or to the left. Block and target are
     blended over a width of 3 px across the cuts.
     """
     side = target.shape[0]
-    upper, west = np.full(side, -2.0), np.full(side, -2.0)
-    cost = np.empty((side, overlap))
+    upper, west, cost = np.full(side, -2.0), np.full(side, -2.0), np.empty((side, overlap))
     if above:
         for c in range(side):
             for r in range(overlap):
@@ -173,18 +131,15 @@ def _join(
 
 
 @kernel
-def _cheapest_path(cost: NDArray[np.float64]) -> NDArray[np.float64]:  # pragma: no cover (compiled)
+def _cheapest_path(cost):
     """Returns the connected path through all rows of costs (n, m) with the least sum: its column (n,) in each row."""
     n, m = cost.shape
-    total = cost.copy()
+    total, path = cost.copy(), np.empty(n)
     for i in range(1, n):
         for j in range(m):
             total[i, j] += total[i - 1, max(j - 1, 0) : min(j + 2, m)].min()
-    path = np.empty(n)
-    j = int(np.argmin(total[n - 1]))
-    path[n - 1] = j
-    for i in range(n - 2, -1, -1):
-        low = max(j - 1, 0)
-        j = low + int(np.argmin(total[i, low : min(j + 2, m)]))
-        path[i] = j
+    low, high = 0, m
+    for i in range(n - 1, -1, -1):
+        j = low + int(np.argmin(total[i, low:high]))
+        path[i], low, high = j, max(j - 1, 0), min(j + 2, m)
     return path

@@ -3,22 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
-from twin.terrains.walls import Walls
 
 #: Limits set by memory: the model for rendering takes about 400 bytes per node and 9 bytes per texel.
 MAX_NODES = 6_000_000
 MAX_TEXELS = 250_000_000
 
 
+class Walls(NamedTuple):
+    """Texture of the walls of a floor, and its weights (module `walls`).
+
+    A weight belongs to a corner of a cell of the height grid and is interpolated bilinearly within the cell. Its sign
+    is that of the normal, so that opposite walls differ: where it is positive, the columns of the texture run along +y
+    (projection along x) or +x (projection along y) from the south-west corner of the floor; where it is negative, they
+    run in the same direction from right to left.
+    """
+
+    #: (ny - 1, nx - 1) int32 index in `weights` of each cell, row 0 = south; -1 where all weights are 0
+    number: NDArray[np.int32]
+    #: (n, 2, 2, 2) float32 weights at the corners of a cell: south and north, west and east, projection along x and y;
+    #: the rest to 1 is the weight of the texture of the floor
+    weights: NDArray[np.float32]
+    texture: NDArray[np.uint8]  #: (h, w, 3) uint8 RGB albedo; rows run down from the highest to the lowest point
+    length_m: float  #: length of the texture along its columns, the longer side of the floor
+    low_m: float  #: heights of the lower and the upper edge of the texture
+    high_m: float
+
+
 @dataclass(frozen=True)
 class Terrain:
     """Seafloor over a rectangle with its south-west corner at (west_m, south_m); x east, y north, z up [m].
+
+    The height is linear on the two triangles of each cell, split along the diagonal from node (r, c) to (r + 1, c + 1).
 
     Args:
         height_m: (ny, nx) float32 heights of the grid nodes; row 0 = SOUTH, column 0 = west. The outermost nodes lie on
@@ -55,75 +77,61 @@ class Terrain:
 
     @property
     def east_m(self) -> float:
-        """Returns x of the eastern edge [m]."""
         return self.west_m + self.size_m[0]
 
     @property
     def north_m(self) -> float:
-        """Returns y of the northern edge [m]."""
         return self.south_m + self.size_m[1]
 
     @property
     def lowest_m(self) -> float:
-        """Returns the least height [m]."""
         return float(self.height_m.min())
 
     @property
     def highest_m(self) -> float:
-        """Returns the greatest height [m]."""
         return float(self.height_m.max())
 
     @property
     def hole_notes(self) -> list[str]:
-        """Returns a sentence on the nodes without a height in the source, in a list; empty if there are none."""
+        """Returns the sentences about the nodes without a height in the source."""
         n, n_unknown = self.height_m.size, 0 if self.known is None else int((~self.known).sum())
         n_small = self.n_filled - n_unknown
-        unknown = f"{n_unknown} of {n} cells of the floor ({100 * n_unknown / n:.3g} %) have no height: they are"
+        unknown = (
+            f"{n_unknown} of {n} cells of the floor ({100 * n_unknown / n:.3g} %) have no height: they are"
+            " neither planned over nor judged, and drawn with the nearest height."
+        )
         small = f"{n_small} cells of the floor, in small holes, have the nearest height."
-        return [
-            *([f"{unknown} neither planned over nor judged, and drawn with the nearest height."] if n_unknown else []),
-            *([small] if n_small else []),
-        ]
+        return [note for note, count in ((unknown, n_unknown), (small, n_small)) if count]
 
     def in_hole(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point (x, y) lies in a cell with an unknown node; false outside the terrain."""
-        x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        r, c, _, _, inside = self._cells(x_m, y_m)
         if self.known is None:
-            return np.zeros(x.shape, np.bool_)
-        col, row = (x - self.west_m) / self.spacing_m, (y - self.south_m) / self.spacing_m
-        ny, nx = self.known.shape
-        inside = (col >= 0) & (col <= nx - 1) & (row >= 0) & (row <= ny - 1)
-        c, r = (np.clip(np.nan_to_num(k), 0, n - 2).astype(np.int64) for k, n in ((col, nx), (row, ny)))
+            return np.zeros(inside.shape, np.bool_)
         whole = self.known[1:, 1:] & self.known[1:, :-1] & self.known[:-1, 1:] & self.known[:-1, :-1]
         return inside & ~whole[r, c]
 
     def height_at(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
-        """Returns the height of the floor at points (x, y) [m]; NaN outside the terrain.
-
-        The height is linear on the two triangles of each cell, split along the diagonal from node (r, c) to
-        (r + 1, c + 1). Rendering and ray intersection use the same surface.
-
-        Args:
-            x_m, y_m: coordinates of any shape, the same for both.
-        """
-        ny, nx = self.height_m.shape
-        col = (np.asarray(x_m, dtype=np.float64) - self.west_m) / self.spacing_m
-        row = (np.asarray(y_m, dtype=np.float64) - self.south_m) / self.spacing_m
-        inside = (col >= 0) & (col <= nx - 1) & (row >= 0) & (row <= ny - 1)
-        c = np.clip(np.nan_to_num(col), 0, nx - 2).astype(np.int64)
-        r = np.clip(np.nan_to_num(row), 0, ny - 2).astype(np.int64)
-        u, v = col - c, row - r
+        """Returns the height of the floor at points (x, y) of any shape [m]; NaN outside the terrain."""
+        r, c, u, v, inside = self._cells(x_m, y_m)
         h00, h01, h10, h11 = (self.height_m[r + i, c + j].astype(np.float64) for i in (0, 1) for j in (0, 1))
         south_east = h00 + u * (h01 - h00) + v * (h11 - h01)
         north_west = h00 + v * (h10 - h00) + u * (h11 - h10)
         return np.where(inside, np.where(u >= v, south_east, north_west), np.nan)
 
+    def _cells(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[NDArray[np.generic], ...]:
+        """Returns row and column of the cells of points, their positions east and north in them; whether inside."""
+        ny, nx = self.height_m.shape
+        x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
+        col, row = (x - self.west_m) / self.spacing_m, (y - self.south_m) / self.spacing_m
+        inside = (col >= 0) & (col <= nx - 1) & (row >= 0) & (row <= ny - 1)
+        c, r = (np.clip(np.nan_to_num(k), 0, n - 2).astype(np.int64) for k, n in ((col, nx), (row, ny)))
+        return r, c, col - c, row - r, inside
+
 
 def texture_shape(height_shape: tuple[int, ...], spacing_m: float, texture_px_m: float) -> tuple[int, int]:
-    """Returns the rows and columns of a texture that covers all cells of a height grid; at least 2 x 2.
+    """Returns the rows and columns of a texture that covers a height grid (ny, nx); at least 2 x 2.
 
-    Args:
-        height_shape: (ny, nx) of the height grid.
     Raises:
         TwinError: more than MAX_NODES nodes or MAX_TEXELS texels.
     """

@@ -194,10 +194,11 @@ def test_a_step_of_one_cell_is_a_wall_and_the_level_ground_beside_it_is_not() ->
     height[:, 5:] = 0.3
     found = wall_weights(height, 0.05)
     assert found is not None
-    assert np.all(found.number[:, 4] >= 0)
-    assert np.all(np.delete(found.number, 4, axis=1) == -1)
-    np.testing.assert_allclose(found.weights[..., 0], -1.0, atol=0.01)  # the normal points to -x
-    assert np.all(found.weights[..., 1] == 0)
+    number, weights = found
+    assert np.all(number[:, 4] >= 0)
+    assert np.all(np.delete(number, 4, axis=1) == -1)
+    np.testing.assert_allclose(weights[..., 0], -1.0, atol=0.01)  # the normal points to -x
+    assert np.all(weights[..., 1] == 0)
 
 
 def test_weights_are_continuous_on_a_smooth_floor() -> None:
@@ -205,11 +206,12 @@ def test_weights_are_continuous_on_a_smooth_floor() -> None:
     y, x = np.mgrid[0:3:121j, 0:3:121j]
     found = wall_weights(bumps(x, y).astype(np.float32), 0.025)
     assert found is not None
-    west, east = found.number[:, :-1], found.number[:, 1:]
+    number, weights = found
+    west, east = number[:, :-1], number[:, 1:]
     both = (west >= 0) & (east >= 0)
-    jump = np.abs(found.weights[west[both]][:, :, 1] - found.weights[east[both]][:, :, 0])
+    jump = np.abs(weights[west[both]][:, :, 1] - weights[east[both]][:, :, 0])
     assert both.sum() > 1000 and np.percentile(jump, 99) < 1e-6
-    assert np.all(np.abs(found.weights).sum(axis=3) <= 1 + 1e-6)
+    assert np.all(np.abs(weights).sum(axis=3) <= 1 + 1e-6)
 
 
 def test_cells_that_an_orthophoto_covers_keep_its_texture() -> None:
@@ -221,7 +223,7 @@ def test_cells_that_an_orthophoto_covers_keep_its_texture() -> None:
     assert found is not None
     expected = np.ones((10, 10), np.bool_)
     expected[6:, 2:] = False  # row 6 is covered in part
-    assert np.array_equal(found.number >= 0, expected)
+    assert np.array_equal(found[0] >= 0, expected)
 
 
 def test_the_result_does_not_depend_on_the_number_of_bands(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,15 +16,15 @@ from rasterio.warp import transform
 
 from twin.core.georeference import Georeference
 from twin.core.raster_files import open_raster
-from twin.errors import TwinError
-from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_height_count
+from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, height_error
 from twin.terrains.holes import check_no_undeclared_holes
-from twin.terrains.vertical import VerticalAxis, cf_direction, unit_length_m
+from twin.terrains.vertical_axis import VerticalAxis, cf_direction, unit_length_m
+
+Part = dict[str, Any] | None  #: horizontal or vertical part of a CRS as PROJJSON; None: the CRS has no such part
 
 _LEAST_CELL, _MOST_CELL, _MOST_COORDINATE = 1e-4, 1e5, 1e9  # of a plausible grid, in units of its CRS
-#: Tags of a raster band that may name the quantity of its values, e.g. depth.
+#: Tags of a raster band and of a file that may name the quantity of the values, e.g. depth.
 _BAND_TAGS = ("long_name", "standard_name")
-#: Tags of a file that may name the quantity of its values.
 _FILE_TAGS = ("TIFFTAG_IMAGEDESCRIPTION", "TIFFTAG_DOCUMENTNAME", "title")
 #: Largest |ground scale - 1| of a grid whose distances are used as they are: 0.001 in a UTM zone.
 _MAX_SCALE_ERROR = 0.005
@@ -36,59 +36,49 @@ def read_geotiff(
 ) -> tuple[NDArray[np.float64], float, VerticalAxis, Georeference | None]:
     """Reads a GeoTIFF with one band of heights, and possibly an alpha band, which is 0 where there is no height.
 
-    Args:
-        file: the GeoTIFF.
-        height_spacing_m: grid spacing if the file has no coordinates.
     Returns:
-        Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m]; vertical axis; position of
-        the centre of the raster in its CRS, None if the file has no coordinates.
+        Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m], `height_spacing_m` if the
+        file has no coordinates; vertical axis; position of the centre of the raster in its CRS, None without
+        coordinates.
     Raises:
         TwinError: the file cannot be read, is an image or too large, or its grid or the unit of its heights is not
             supported.
     """
     with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS) as source:
-        return _read(source, height_spacing_m, file)
-
-
-def _read(source: rasterio.DatasetReader, height_spacing_m: float, file: Path) -> tuple[Any, ...]:
-    """Returns heights, grid spacing, vertical axis and georeference of an open raster, as `read_geotiff` does."""
-    if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
-        bands = f"{source.count} band(s) of {source.dtypes[0]}"
-        raise TwinError(HEIGHT_FIELD, f"{file.name!r} is an image, not heights: {bands}", HEIGHT_FORMATS)
-    check_height_count(source.width, source.height, file)
-    horizontal, vertical = crs_parts(source.crs)
-    axis = _vertical_axis(source, horizontal, vertical, file)
-    georeference, spacing_m = None, height_spacing_m
-    if not source.transform.is_identity:
-        _check_grid(source, file)
-        _check_ground_scale(source, file)
-        factor = _axis_unit_m(horizontal)
-        spacing_m = float(source.transform.a * factor)
-        east, north = _centre(source)
-        wkt = _output_crs(source.crs, horizontal, vertical)
-        georeference = Georeference(east, north, 0.0, wkt, factor, axis.datum)
-    return _values(source, file), spacing_m, axis, georeference
+        if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
+            raise height_error(file, f"is an image, not heights: {source.count} band(s) of {source.dtypes[0]}")
+        check_count(source.width, source.height, file, HEIGHT_FIELD)
+        horizontal, vertical = _crs_parts(source.crs)
+        axis = _vertical_axis(source, horizontal, vertical, file)
+        georeference, spacing_m = None, height_spacing_m
+        if not source.transform.is_identity:
+            _check_grid(source, file)
+            factor = _axis_unit_m(horizontal)
+            _check_ground_scale(source, factor, file)
+            spacing_m = float(source.transform.a * factor)
+            wkt = _output_crs(source.crs, horizontal, vertical)
+            georeference = Georeference(*_centre(source), 0.0, wkt, factor, axis.datum)
+        return _values(source, file), spacing_m, axis, georeference
 
 
 def _values(source: rasterio.DatasetReader, file: Path) -> NDArray[np.float64]:
     """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes."""
     scale, offset = source.scales[0], source.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
-        raise TwinError(HEIGHT_FIELD, f"{file.name!r} has the band scale {scale:g} and offset {offset:g}",
-                        "a finite scale other than 0, a finite offset")  # fmt: skip
-    band = source.read(1, masked=True)
-    values = np.ma.filled(band.astype(np.float64), np.nan)
+        problem = f"has the band scale {scale:g} and offset {offset:g}"
+        raise height_error(file, problem, "a finite scale other than 0, a finite offset")
+    values = np.ma.filled(source.read(1, masked=True).astype(np.float64), np.nan)
     if source.count == 2:
         alpha = source.read(2)
         if source.colorinterp[1] != ColorInterp.alpha and not np.isin(alpha, [0, alpha.max()]).all():
-            raise TwinError(HEIGHT_FIELD, f"{file.name!r} has a second band that is not a mask", HEIGHT_FORMATS)
+            raise height_error(file, "has a second band that is not a mask")
         values[~(alpha > 0)] = np.nan
     check_no_undeclared_holes(values, file, "gdal_edit.py -a_nodata {} " + file.name)
     return values * scale + offset
 
 
-def crs_parts(crs: CRS | None) -> tuple[dict[str, Any] | None, dict[str, Any] | None]:
-    """Returns the horizontal and the vertical part of a CRS as PROJJSON; None for a missing part."""
+def _crs_parts(crs: CRS | None) -> tuple[Part, Part]:
+    """Returns the horizontal and the vertical part of a CRS."""
     if crs is None:
         return None, None
     tree = crs.to_dict(projjson=True)
@@ -98,15 +88,13 @@ def crs_parts(crs: CRS | None) -> tuple[dict[str, Any] | None, dict[str, Any] | 
     return next((part for part in parts if part["type"] != "VerticalCRS"), None), vertical
 
 
-def _axis_unit_m(crs: dict[str, Any] | None) -> float:
+def _axis_unit_m(crs: Part) -> float:
     """Returns the length of the unit of the first axis of a CRS [m]; 1 for metres and without a CRS."""
     unit = crs["coordinate_system"]["axis"][0].get("unit", "metre") if crs is not None else "metre"
     return float(unit["conversion_factor"]) if isinstance(unit, dict) else 1.0
 
 
-def _vertical_axis(
-    source: rasterio.DatasetReader, horizontal: dict[str, Any] | None, vertical: dict[str, Any] | None, file: Path
-) -> VerticalAxis:
+def _vertical_axis(source: rasterio.DatasetReader, horizontal: Part, vertical: Part, file: Path) -> VerticalAxis:
     """Returns the vertical axis that the vertical CRS, the band's unit and the tags describe.
 
     The unit of the band takes precedence over that of the vertical CRS; without either, heights are in metres.
@@ -116,10 +104,8 @@ def _vertical_axis(
     direction = vertical["coordinate_system"]["axis"][0]["direction"] if vertical is not None else None
     unit = source.units[0] or tags.get("units", "")
     if not unit and vertical is None and (unit_m := _axis_unit_m(horizontal)) != 1.0 and not _in_degrees(source):
-        raise TwinError(
-            HEIGHT_FIELD, f"{file.name!r} has a CRS in units of {unit_m:.7g} m, and no unit of its heights",
-            f"a unit of the band, e.g. by gdal_edit.py -units ft {file.name} or -units m",
-        )  # fmt: skip
+        remedy = f"a unit of the band, e.g. by gdal_edit.py -units ft {file.name} or -units m"
+        raise height_error(file, f"has a CRS in units of {unit_m:.7g} m, and no unit of its heights", remedy)
     return VerticalAxis(
         direction if direction in ("up", "down") else cf_direction(tags),
         unit_length_m(unit, file) if unit else _axis_unit_m(vertical),
@@ -130,7 +116,7 @@ def _vertical_axis(
     )
 
 
-def _output_crs(crs: CRS | None, horizontal: dict[str, Any] | None, vertical: dict[str, Any] | None) -> str | None:
+def _output_crs(crs: CRS | None, horizontal: Part, vertical: Part) -> str | None:
     """Returns the CRS of the output rasters as WKT; None if the file has no horizontal CRS.
 
     Output elevations are in metres, positive upwards. The CRS is that of the file; its vertical part is dropped if it
@@ -138,57 +124,49 @@ def _output_crs(crs: CRS | None, horizontal: dict[str, Any] | None, vertical: di
     """
     if crs is None or horizontal is None:
         return None
-    if vertical is None:
-        return crs.to_wkt()
-    upward = vertical["coordinate_system"]["axis"][0]["direction"] == "up"
-    if upward and _axis_unit_m(vertical) == 1.0:
-        return crs.to_wkt()
-    return CRS.from_user_input(json.dumps(horizontal)).to_wkt()
+    upward = vertical is None or vertical["coordinate_system"]["axis"][0]["direction"] == "up"
+    kept = upward and _axis_unit_m(vertical) == 1.0
+    return (crs if kept else CRS.from_user_input(json.dumps(horizontal))).to_wkt()
 
 
 def _check_grid(source: rasterio.DatasetReader, file: Path) -> None:
     """Raises TwinError if the grid is in degrees, is not north up, or its cells are not square."""
     t = source.transform
     if _in_degrees(source):
-        raise TwinError(
-            HEIGHT_FIELD, f"{file.name!r} is in degrees", "a projected or local grid in metres, e.g. by "
-            f"gdalwarp -t_srs EPSG:{_utm_epsg(*_centre(source))} -tr CELL_M CELL_M {file.name} projected.tif",
-        )  # fmt: skip
+        remedy = f"gdalwarp -t_srs EPSG:{_utm_epsg(*_centre(source))} -tr CELL_M CELL_M {file.name} projected.tif"
+        raise height_error(file, "is in degrees", f"a projected or local grid in metres, e.g. by {remedy}")
     if max(abs(t.b), abs(t.d)) > 1e-6 * abs(t.a) or t.a <= 0 or t.e >= 0 or abs(t.a + t.e) > 1e-3 * t.a:
-        raise TwinError(
-            HEIGHT_FIELD, f"{file.name!r} is rotated, or its cells are not square",
-            f"north up, square cells, e.g. by gdalwarp -tr CELL_M CELL_M {file.name} square.tif",
-        )  # fmt: skip
+        remedy = f"north up, square cells, e.g. by gdalwarp -tr CELL_M CELL_M {file.name} square.tif"
+        raise height_error(file, "is rotated, or its cells are not square", remedy)
     if not _LEAST_CELL <= t.a <= _MOST_CELL or max(abs(c) for c in _centre(source)) > _MOST_COORDINATE:
-        problem = f"{file.name!r} has cells of {t.a:g} at {_centre(source)}"
         allowed = f"cells of {_LEAST_CELL:g} to {_MOST_CELL:g} within {_MOST_COORDINATE:g} of the origin"
-        raise TwinError(HEIGHT_FIELD, problem, allowed)
+        raise height_error(file, f"has cells of {t.a:g} at {_centre(source)}", allowed)
 
 
 def _in_degrees(source: rasterio.DatasetReader) -> bool:
     return source.crs is not None and source.crs.is_geographic
 
 
-def _check_ground_scale(source: rasterio.DatasetReader, file: Path) -> None:
+def _check_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: Path) -> None:
     """Raises TwinError if a metre of a projected CRS is not a metre on the ground, e.g. in Web Mercator (EPSG:3857)."""
     if source.crs is None or not source.crs.is_projected:
         return
-    scale, longitude, latitude = _ground_scale(source)
+    scale, longitude, latitude = _ground_scale(source, unit_m)
     if np.abs(scale - 1).max() > _MAX_SCALE_ERROR:
-        raise TwinError(
-            HEIGHT_FIELD, f"{file.name!r} is in a CRS with the ground scale {np.sqrt(scale.prod()):.3f} (m on the"
-            " ground / m in the CRS) there", "a CRS with true distances, e.g. by "
-            f"gdalwarp -t_srs EPSG:{_utm_epsg(longitude, latitude)} -tr CELL_M CELL_M {file.name} projected.tif",
+        remedy = f"gdalwarp -t_srs EPSG:{_utm_epsg(longitude, latitude)} -tr CELL_M CELL_M {file.name} projected.tif"
+        raise height_error(
+            file, f"is in a CRS with the ground scale {np.sqrt(scale.prod()):.3f} (m on the ground / m in the CRS)"
+            " there", f"a CRS with true distances, e.g. by {remedy}",
         )  # fmt: skip
 
 
-def _ground_scale(source: rasterio.DatasetReader) -> tuple[NDArray[np.float64], float, float]:
+def _ground_scale(source: rasterio.DatasetReader, unit_m: float) -> tuple[NDArray[np.float64], float, float]:
     """Returns distances on the ellipsoid / distances in the CRS at the centre, along easting and northing (2,).
 
     They are 1 if the centre is outside the domain of the CRS. Also returns longitude and latitude of the centre [deg].
     """
     east, north = _centre(source)
-    step = 100.0 / _axis_unit_m(crs_parts(source.crs)[0])
+    step = 100.0 / unit_m
     xs, ys = [east, east + step, east], [north, north, north + step]
     longitude, latitude = (np.array(part) for part in transform(source.crs, "OGC:CRS84", xs, ys)[:2])
     if not np.isfinite([longitude, latitude]).all():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import TwinError
+from twin.terrains.file_header import height_error
 
 Direction = Literal["up", "down"]
 
@@ -33,32 +34,21 @@ _CF_DEPTHS = ("depth", "sea_floor_depth")
 
 
 class VerticalAxis(NamedTuple):
-    """Vertical axis of the values of a file, as the file describes it.
+    """Vertical axis of the values of a file, as the file describes it."""
 
-    Args:
-        direction: direction of the axis of the vertical CRS or of the CF attributes; None if the file has neither.
-        metres_per_unit: length of the unit; 1 if the file does not name one.
-        band_name: description, long name or standard name of the band, the first that is given; "" if none is.
-        texts: file name, names and tags that may name the quantity of the values.
-        datum: name of the vertical CRS; "" if there is none.
-        in_crs: whether the file names a CRS. There, a sea floor has no positive elevations.
-    """
-
-    direction: Direction | None = None
-    metres_per_unit: float = 1.0
-    band_name: str = ""
-    texts: tuple[str, ...] = ()
-    datum: str = ""
-    in_crs: bool = False
+    direction: Direction | None = None  #: of the axis of the vertical CRS or of the CF attributes; None without either
+    metres_per_unit: float = 1.0  #: length of the unit; 1 if the file does not name one
+    band_name: str = ""  #: description, long name or standard name of the band, the first that is given
+    texts: tuple[str, ...] = ()  #: file name, names and tags that may name the quantity of the values
+    datum: str = ""  #: name of the vertical CRS; "" if there is none
+    in_crs: bool = False  #: whether the file names a CRS; there, a sea floor has no positive elevations
 
 
 def unit_length_m(name: str, file: Path) -> float:
     """Returns the length [m] of a unit by its name. Raises TwinError if the unit is unknown."""
     length_m = UNITS_M.get(name.strip().lower().replace("_", " "), UNITS_M.get(name.strip().lower()))
     if length_m is None:
-        raise TwinError(
-            "terrain.height_file", f"{file.name!r} has heights in the unknown unit {name!r}", "metres, feet or fathoms"
-        )
+        raise height_error(file, f"has heights in the unknown unit {name!r}", "metres, feet or fathoms")
     return length_m
 
 
@@ -75,9 +65,7 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
 
     Args:
         values: (rows, cols) values of the file, NaN or infinite in holes, but not everywhere.
-        axis: vertical axis as the file describes it.
         asked: `terrain.z` of the scenario, which takes precedence; None: determined from the file.
-        file: the file, for the error message.
     Raises:
         TwinError: the file does not make clear which way its values increase.
     """

@@ -16,7 +16,10 @@ from rasterio.warp import transform_bounds
 from twin.core.georeference import Georeference
 from twin.core.raster_files import open_raster
 from twin.errors import TwinError
-from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_texel_count, eight_bits
+from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits
+
+Image = NDArray[np.uint8]
+Bounds = tuple[float, float, float, float]  #: west, south, east, north in a CRS
 
 _FORMATS = "GeoTIFF with one grey band, or three of colour, of 8 or 16 bits; an alpha band or mask is respected"
 _NO_PALETTE = "a GeoTIFF with bands of colour: gdal_translate -expand rgb writes one"
@@ -26,7 +29,7 @@ _MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than th
 
 
 def lay_orthophoto(
-    texture: NDArray[np.uint8], file: Path, extent_m: tuple[float, float], georeference: Georeference | None
+    texture: Image, file: Path, extent_m: tuple[float, float], georeference: Georeference | None
 ) -> NDArray[np.bool_]:
     """Replaces the texture of a floor by an orthophoto wherever the orthophoto has valid pixels.
 
@@ -44,49 +47,49 @@ def lay_orthophoto(
             invalid or too large, has no coordinates, or does not overlap the DEM.
     """
     if georeference is None:
-        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} cannot be placed: the DEM has no coordinates",
-                        "terrain.texture_file, or a GeoTIFF with coordinates as terrain.height_file")  # fmt: skip
-    grid = _texel_grid(texture.shape[:2], extent_m, georeference)
+        raise _error(file, "cannot be placed: the DEM has no coordinates",
+                     "terrain.texture_file, or a GeoTIFF with coordinates as terrain.height_file")  # fmt: skip
+    rows, cols = texture.shape[:2]
+    west, north = georeference.from_scene(-extent_m[0] / 2, extent_m[1] / 2)
+    width, height = (
+        extent / georeference.metres_per_unit / n for extent, n in zip(extent_m, (cols, rows), strict=True)
+    )
+    grid = Affine(width, 0.0, float(west), 0.0, -height, float(north))  # easting and northing of (column, row)
     with open_raster(file, ORTHOPHOTO_FIELD, _FORMATS) as source:
         if source.transform.is_identity:
-            raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has no coordinates",
-                            "a GeoTIFF with coordinates; terrain.texture_file for a plain image")  # fmt: skip
-        colour, covered = _read(source, file, grid, texture.shape[:2], georeference)
+            raise _error(file, "has no coordinates",
+                         "a GeoTIFF with coordinates; terrain.texture_file for a plain image")  # fmt: skip
+        colour, covered = _read(source, file, grid, (rows, cols), georeference)
     texture[covered] = colour[covered]
     return covered
 
 
-def _texel_grid(shape: tuple[int, ...], extent_m: tuple[float, float], georeference: Georeference) -> Affine:
-    """Returns the affine transformation from (column, row) of the texture to easting and northing in the CRS."""
-    west, north = georeference.from_scene(-extent_m[0] / 2, extent_m[1] / 2)
-    unit_m = georeference.metres_per_unit
-    width, height = extent_m[0] / unit_m / shape[1], extent_m[1] / unit_m / shape[0]
-    return Affine(width, 0.0, float(west), 0.0, -height, float(north))
+def _error(file: Path, problem: str, allowed: str) -> TwinError:
+    return TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} {problem}", allowed)
 
 
 def _read(
-    source: rasterio.DatasetReader,
-    file: Path,
-    grid: Affine,
-    shape: tuple[int, ...],
-    georeference: Georeference,
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    source: rasterio.DatasetReader, file: Path, grid: Affine, shape: tuple[int, int], georeference: Georeference
+) -> tuple[Image, NDArray[np.bool_]]:
     """Returns the colours (rows, cols, 3) of an orthophoto at the texels, and whether it covers each texel."""
     bands = _colour_bands(source, file)
     floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
     if source.crs is not None and floor_crs is None:
-        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} is in {_name(source.crs)}, but the DEM names no CRS",
-                        "a DEM with a CRS, or an orthophoto without one in the coordinates of the DEM")  # fmt: skip
+        name = source.crs.to_string() if source.crs.to_epsg() else "a CRS of its own"
+        raise _error(file, f"is in {name}, but the DEM names no CRS",
+                     "a DEM with a CRS, or an orthophoto without one in the coordinates of the DEM")  # fmt: skip
     target = floor_crs or CRS.from_epsg(3857)  # without any CRS: both are taken to be in this one
-    _check_overlap(source, file, target, array_bounds(shape[0], shape[1], grid))
-    _check_resolution(source, file, target, grid)
+    bounds = _bounds(source, target)
+    _check_overlap(file, bounds, array_bounds(*shape, grid))
+    finer = grid.a / ((bounds[2] - bounds[0]) / source.width)  # pixels along the side of a texel
+    if finer > _MAX_SHARP:
+        check_count(source.width, source.height, file, ORTHOPHOTO_FIELD)
     with WarpedVRT(
         source, src_crs=source.crs or target, crs=target, transform=grid, width=shape[1], height=shape[0],
-        resampling=Resampling.average if _finer(source, target, grid) > 1.5 else Resampling.bilinear,
+        resampling=Resampling.average if finer > 1.5 else Resampling.bilinear,
         add_alpha=ColorInterp.alpha not in source.colorinterp,
     ) as warped:  # fmt: skip
-        values = warped.read(bands)
-        covered = warped.dataset_mask() > 0
+        values, covered = warped.read(bands), warped.dataset_mask() > 0
     if values.dtype == np.uint16:
         values = eight_bits(values, _brightest(source, bands))
     colour = np.moveaxis(values.astype(np.uint8), 0, 2)
@@ -107,51 +110,30 @@ def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:
     Three bands that are not marked as red, green and blue are taken to be red, green and blue in the order of the file.
     """
     if ColorInterp.palette in source.colorinterp:
-        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} has a palette in place of colours", _NO_PALETTE)
+        raise _error(file, "has a palette in place of colours", _NO_PALETTE)
     kind_of = {k: interp for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha}
     kinds = {source.dtypes[k - 1] for k in kind_of}
     if not kinds <= {"uint8", "uint16"} or len(kinds) != 1 or len(kind_of) not in (1, 3):
         found = f"{source.count} band(s) of {', '.join(sorted(set(source.dtypes)))}"
-        raise TwinError(ORTHOPHOTO_FIELD, f"{file.name!r} is not an orthophoto: {found}", _FORMATS)
+        raise _error(file, f"is not an orthophoto: {found}", _FORMATS)
     if set(kind_of.values()) == set(_COLOURS):
         return sorted(kind_of, key=lambda k: _COLOURS.index(kind_of[k]))
     return list(kind_of)
 
 
-def _check_overlap(
-    source: rasterio.DatasetReader, file: Path, target: CRS, floor: tuple[float, float, float, float]
-) -> None:
-    """Raises TwinError if an orthophoto does not overlap the floor (west, south, east, north) in the target CRS."""
-    west, south, east, north = _bounds(source, target)
-    if west < floor[2] and east > floor[0] and south < floor[3] and north > floor[1]:
-        return
-    raise TwinError(
-        ORTHOPHOTO_FIELD,
-        f"{file.name!r} does not overlap the DEM: it covers E {west:.1f} to {east:.1f}, N {south:.1f} to {north:.1f}",
-        f"one that overlaps E {floor[0]:.1f} to {floor[2]:.1f}, N {floor[1]:.1f} to {floor[3]:.1f}",
-    )
+def _check_overlap(file: Path, bounds: Bounds, floor: Bounds) -> None:
+    """Raises TwinError if an orthophoto does not overlap the floor."""
+    west, south, east, north = bounds
+    if not (west < floor[2] and east > floor[0] and south < floor[3] and north > floor[1]):
+        raise _error(
+            file, f"does not overlap the DEM: it covers E {west:.1f} to {east:.1f}, N {south:.1f} to {north:.1f}",
+            f"one that overlaps E {floor[0]:.1f} to {floor[2]:.1f}, N {floor[1]:.1f} to {floor[3]:.1f}",
+        )  # fmt: skip
 
 
-def _check_resolution(source: rasterio.DatasetReader, file: Path, target: CRS, grid: Affine) -> None:
-    """Raises TwinError if an orthophoto has too many pixels and is over _MAX_SHARP times finer than the texels."""
-    if _finer(source, target, grid) > _MAX_SHARP:
-        check_texel_count(source.width, source.height, file, ORTHOPHOTO_FIELD)
-
-
-def _finer(source: rasterio.DatasetReader, target: CRS, grid: Affine) -> float:
-    """Returns the number of pixels of an orthophoto along the side of one texel."""
-    west, _, east, _ = _bounds(source, target)
-    return grid.a / ((east - west) / source.width)
-
-
-def _bounds(source: rasterio.DatasetReader, target: CRS) -> tuple[float, float, float, float]:
+def _bounds(source: rasterio.DatasetReader, target: CRS) -> Bounds:
     """Returns west, south, east and north of an orthophoto in the target CRS; its rows may run either way."""
     left, bottom, right, top = source.bounds
     west, east = sorted((left, right))
     south, north = sorted((bottom, top))
     return transform_bounds(source.crs or target, target, west, south, east, north)
-
-
-def _name(crs: CRS) -> str:
-    """Returns the EPSG code of a CRS, e.g. "EPSG:32755"; "a CRS of its own" if it has none."""
-    return crs.to_string() if crs.to_epsg() else "a CRS of its own"
