@@ -99,12 +99,12 @@ def answer_of(name, folder):
         result = run(name, folder)
     except ScenarioError as error:
         return 2, [line.replace(f"{folder}/", "") for line in error.lines]
-    text = [wording.headline(result.analysis.study, result.analysis), *wording.answer_lines(result.analysis)]
+    text = [wording.headline(result.analysis), *wording.answer_lines(result.analysis)]
     return study_command.exit_status(result), [line.replace(f"{folder}/", "") for line in text]
 
 
 if __name__ == "__main__":
-    runner.write_report = lambda study, analysis, page: None
+    runner.write_report = lambda analysis, page: None
     print("| study | exit status | answer |\n|---|---|---|")
     for name in ODD_STUDIES:
         with tempfile.TemporaryDirectory() as folder:

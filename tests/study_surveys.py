@@ -2,8 +2,7 @@
 
 import numpy as np
 
-from twin.engines.engine import Outcome
-from twin.engines.worker import describe_exception
+from twin.engines.worker import Outcome, describe_exception
 from twin.studies.flight import row_of
 from twin.studies.study_file import load_study
 

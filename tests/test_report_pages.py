@@ -104,7 +104,7 @@ def study(folder):
     for one in surveys(done, folder):
         row, error_m = fly(one), 1e-3 * (1 + one.sample)
         log.add(row | {name: row["map.le90_m"] and error_m for name in json.loads(SHOWN_METRICS)[1:]})
-    write_report(done, StudyAnalysis(log.table(set(survey_keys(done))), done), folder / "study.html")
+    write_report(StudyAnalysis(log.table(set(survey_keys(done))), done), folder / "study.html")
     return folder / "study.html"
 
 

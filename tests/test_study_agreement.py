@@ -5,10 +5,10 @@ import pytest
 from study_surveys import study_of
 
 from twin.errors import ScenarioError
-from twin.studies.agreement import HEADER, agreement, table, values_of_pairs, write_document
+from twin.studies.agreement import HEADER, agreement, table, values_of_pairs
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import row_of
-from twin.studies.report import summary
+from twin.studies.report import summary, write_agreement
 from twin.studies.results_log import ResultsLog
 from twin.studies.surveys import surveys
 
@@ -87,12 +87,12 @@ def test_values_are_compared_only_if_both_surveys_reached_their_end(tmp_path):
 
 def test_the_document_has_the_verdict_the_command_and_the_figure(tmp_path):
     analysis = analyse(tmp_path, 0.5)
-    write_document(analysis, tmp_path)
+    write_agreement(analysis, tmp_path)
     text = (tmp_path / "agreement.md").read_text()
     assert "FAIL: 40 pairs" in text and "`twin study study` flies 40 pairs" in text
     sampling = analysis.study.sampling.model_copy(update={"seeds": 2})
     analysis.study = analysis.study.model_copy(update={"sampling": sampling})
-    write_document(analysis, tmp_path)
+    write_agreement(analysis, tmp_path)
     assert "`twin study study` flies 80 pairs" in (tmp_path / "agreement.md").read_text()
     assert all(" | ".join(row) in text for row in (HEADER, *table(agreement(analysis))))
     assert (tmp_path / "agreement.png").read_bytes().startswith(b"\x89PNG")

@@ -44,7 +44,7 @@ def test_the_report_of_a_study_names_the_reason_of_degraded_surveys(study, tmp_p
     analysis = analyse(study, tmp_path, half_degraded)
     assert {r.reason for r in analysis.failure_reasons if r.status == "degraded"} == {"the stereo residuals are … px"}
     monkeypatch.setattr("twin.studies.figures.draw_all", lambda *_: {}, raising=False)
-    write_report(study, analysis, tmp_path / "study.html")
+    write_report(analysis, tmp_path / "study.html")
     assert re.search(r">degraded</td><td[^>]*>6</td>", (tmp_path / "study.html").read_text())
 
 
@@ -76,7 +76,7 @@ def test_the_row_of_a_survey_has_its_status(study, tmp_path, monkeypatch, status
 
 def test_a_sentence_as_a_warning_ends_with_one_full_stop(study, tmp_path):
     warned = analyse(study, tmp_path, lambda s: fly(s) | {"warning": "The surrogate extrapolates: too turbid."})
-    assert wording.headline(study, warned).endswith("12 of 12 surveys: The surrogate extrapolates: too turbid.")
+    assert wording.headline(warned).endswith("12 of 12 surveys: The surrogate extrapolates: too turbid.")
 
 
 def test_every_map_statistic_of_a_study_is_reported_with_completeness(study, tmp_path):

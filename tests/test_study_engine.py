@@ -101,9 +101,9 @@ def test_a_pipe_is_closed_only_once_when_the_pool_is_closed_during_a_task():
 
         worker._pipe._close = close_slowly
         pool.close()
-        reply, attempts = running.result(timeout=20)
-    assert (reply.kind, attempts, len(closed)) == ("killed", 1, 1)
-    assert pool.run(study_tasks.square, 3, TaskLimits())[0].reason == "the worker pool is closed"
+        outcome = running.result(timeout=20)
+    assert (outcome.failure, outcome.attempts, len(closed)) == ("worker process was killed by SIGKILL", 1, 1)
+    assert pool.run(study_tasks.square, 3, TaskLimits()).failure == "the worker pool is closed"
 
 
 def test_an_unreachable_scheduler_is_reported(monkeypatch):

@@ -10,7 +10,7 @@ from twin.studies.report import summary
 @pytest.fixture(autouse=True)
 def _no_report(monkeypatch):
     """Leaves out the report, which takes longer than everything else."""
-    monkeypatch.setattr(runner, "write_report", lambda study, analysis, page: None)
+    monkeypatch.setattr(runner, "write_report", lambda analysis, page: None)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from study_surveys import study_of
 
-from twin.engines.engine import Outcome
+from twin.engines.worker import Outcome
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
@@ -84,7 +84,7 @@ class Calls:
 def test_rendered_surveys_have_scenario_and_seed_of_their_surrogate_surveys_and_are_reused(tmp_path):
     study, analysis = analysed(tmp_path)
     engine = Calls(lambda survey: row_with(survey, 0.0199))
-    checked = check(study, analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
+    checked = check(analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
     originals = {survey.key: survey for survey in surveys(study, tmp_path)}
     for survey in engine.flown:
         assert survey.scenario.imaging.fidelity == "rendered"
@@ -95,7 +95,7 @@ def test_rendered_surveys_have_scenario_and_seed_of_their_surrogate_surveys_and_
     assert int(checked.surrogate.sum()) == 3  # errors of 19, 19.5 and 18 mm
     assert summary(checked)["same_verdict"] == 3
     again = Calls(lambda survey: row_with(survey, 0.0199))
-    assert check(study, analysis, 6, tmp_path, Fleet(again, StudyProgress())).rendered.all()
+    assert check(analysis, 6, tmp_path, Fleet(again, StudyProgress())).rendered.all()
     assert again.flown == []
 
 
@@ -108,14 +108,14 @@ def test_a_study_with_refused_samples_is_checked(tmp_path):
     for survey in surveys(study, tmp_path, without=refused):
         log.add(row_with(survey, 0.019))
     engine = Calls(lambda survey: row_with(survey, 0.0199))
-    checked = check(study, StudyAnalysis(log.table(), study), 12, tmp_path, Fleet(engine, StudyProgress()))
+    checked = check(StudyAnalysis(log.table(), study), 12, tmp_path, Fleet(engine, StudyProgress()))
     assert len(checked.rendered) == len(engine.flown) == 12 - len(refused)
 
 
 def test_a_check_whose_rendered_surveys_all_failed_says_so(tmp_path):
     study, analysis = analysed(tmp_path)
     engine = Calls(lambda survey: row_of(survey, "failed", "disk full"))
-    checked = check(study, analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
+    checked = check(analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
     assert checked.exit_status == 1 and "6 rendered surveys were refused or failed" in checked.sentence()
 
 
@@ -130,11 +130,11 @@ class Interrupted(Calls):
 def test_an_interrupted_check_is_marked_as_incomplete_with_the_exit_status_of_ctrl_c(tmp_path):
     study, analysis = analysed(tmp_path)
     engine = Interrupted(lambda survey: row_with(survey, 0.0199))
-    checked = check(study, analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
+    checked = check(analysis, 6, tmp_path, Fleet(engine, StudyProgress()))
     assert len(checked.rendered) == 2 and checked.exit_status == 130
     assert summary(checked)["interrupted"] and "interrupted and is incomplete" in checked.sentence()
     again = Calls(lambda survey: row_with(survey, 0.0199))
-    finished = check(study, analysis, 6, tmp_path, Fleet(again, StudyProgress()))
+    finished = check(analysis, 6, tmp_path, Fleet(again, StudyProgress()))
     assert len(again.flown) == 4 and not finished.interrupted and "incomplete" not in finished.sentence()
 
 
@@ -142,7 +142,7 @@ def test_a_study_without_limits_has_nothing_to_check_and_does_not_fail(tmp_path)
     study, log = study_of(tmp_path, STUDY[: STUDY.index("[require]")]), ResultsLog(tmp_path)
     for survey in surveys(study, tmp_path):
         log.add(row_of(survey, "complete", "") | {"map.le90_m": 0.01})
-    checked = check(study, StudyAnalysis(log.table(), study), 6, tmp_path, Fleet(Calls(None), StudyProgress()))
+    checked = check(StudyAnalysis(log.table(), study), 6, tmp_path, Fleet(Calls(None), StudyProgress()))
     assert checked.exit_status == 0 and "the study has no limit" in checked.sentence()
 
 

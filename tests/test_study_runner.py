@@ -9,7 +9,7 @@ from study_surveys import STUDY, SerialEngine, study_of
 
 from twin.app import study_command
 from twin.app.study_command import open_engine
-from twin.engines.engine import Outcome
+from twin.engines.worker import Outcome
 from twin.errors import ScenarioError, TwinError
 from twin.studies import runner, wording
 from twin.studies.flight import flatten, has_passed
@@ -20,7 +20,7 @@ from twin.studies.results_log import ResultsLog
 @pytest.fixture(autouse=True)
 def _no_figures(monkeypatch):
     """Replaces the report, which takes longer than everything else."""
-    monkeypatch.setattr(runner, "write_report", lambda study, analysis, page: page.write_text("report"))
+    monkeypatch.setattr(runner, "write_report", lambda analysis, page: page.write_text("report"))
 
 
 @pytest.fixture

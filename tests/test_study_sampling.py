@@ -8,7 +8,6 @@ from study_surveys import STUDY, study_of
 
 from twin.studies.distribution import Distribution
 from twin.studies.runner import refusal_notice
-from twin.studies.study_file import n_planned_surveys
 from twin.studies.surveys import design_points, samples, seeds_of_sample
 
 PROBABILITIES = (np.arange(2000) + 0.5) / 2000
@@ -92,7 +91,7 @@ def test_a_grid_is_combined_with_every_design_point(tmp_path):
 def test_the_number_of_planned_surveys_is_that_of_the_surveys(method, vary, tmp_path):
     text = f'scenario = "reef"\n{vary}\n[sampling]\nmethod = "{method}"\nseeds = 3\nsamples = {4 if vary else 1}'
     study = study_of(tmp_path, text)
-    assert n_planned_surveys(study) == 3 * len(list(samples(study)))
+    assert study.n_surveys == 3 * len(list(samples(study)))
 
 
 def test_a_single_refused_sample_is_reported_in_the_singular():

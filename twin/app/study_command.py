@@ -96,7 +96,7 @@ def run(file: str, options: StudyOptions) -> int:
         result = run_study(study, folder, options.resume, Fleet(engine, progress))
         checked = None
         if options.verify and not result.interrupted:
-            checked = rendered_check.check(study, result.analysis, options.verify, folder, Fleet(engine, progress))
+            checked = rendered_check.check(result.analysis, options.verify, folder, Fleet(engine, progress))
     for error in result.write_errors:
         console.print_error(f"{folder}: {error}; free some disk space and continue with --resume")
     if options.as_json:
@@ -168,7 +168,7 @@ def _folder(options: StudyOptions, command: str, study: Study) -> Path:
 
 def _print_result(study: Study, result: StudyResult) -> None:
     analysis = result.analysis
-    print(wording.headline(study, analysis))
+    print(wording.headline(analysis))
     for line in wording.answer_lines(analysis):
         print(f"- {line}")
     rows = [
@@ -184,7 +184,7 @@ def _print_result(study: Study, result: StudyResult) -> None:
         console.print_table(agreement.verdict_line(compared), agreement.table(compared))
     if analysis.refusal_reasons:
         reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
-        samples = wording.sample_count(len(analysis.refused_samples))
+        samples = wording.counted(len(analysis.refused_samples), "sample")
         console.print_table(f"{samples} cannot be flown: surveys, reason", reasons)
     for warning, count in analysis.warning_counts.items():
         print(f"Warning in {count} of {int((~analysis.duplicate).sum())} surveys: {warning}")

@@ -12,8 +12,7 @@ from typing import Any
 import dask.config
 from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed, get_worker
 
-from twin.engines.engine import Outcome, Result, Task
-from twin.engines.worker import Reply, TaskLimits, WorkerPool, describe_exception
+from twin.engines.worker import Outcome, Result, Task, TaskLimits, WorkerPool, describe_exception
 from twin.errors import TwinError
 
 _CONNECT_TIMEOUT_S = 20
@@ -25,11 +24,7 @@ _MAX_LOST_WORKERS = 3  # in SLURM jobs, a task fails if more Dask workers than t
 
 @contextmanager
 def connect_scheduler(address: str) -> Iterator[DaskEngine]:
-    """Yields an engine that runs tasks on the workers of a running Dask scheduler.
-
-    Raises:
-        TwinError: the scheduler does not respond.
-    """
+    """Yields an engine that runs tasks on a running Dask scheduler; raises TwinError if that does not respond."""
     try:
         client = Client(address, timeout=_CONNECT_TIMEOUT_S)
     except (OSError, ValueError) as error:
@@ -41,11 +36,7 @@ def connect_scheduler(address: str) -> Iterator[DaskEngine]:
 
 @contextmanager
 def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
-    """Yields an engine that runs tasks on a new Dask cluster of `jobs` SLURM jobs.
-
-    Raises:
-        TwinError: dask-jobqueue is not installed.
-    """
+    """Yields an engine that runs tasks on `jobs` new SLURM jobs; raises TwinError if dask-jobqueue is missing."""
     with dask.config.set({"distributed.scheduler.allowed-failures": _MAX_LOST_WORKERS}):
         with _slurm_cluster(jobs) as cluster, Client(cluster) as client:
             yield DaskEngine(client)
@@ -69,6 +60,7 @@ class DaskEngine:
 
     def __init__(self, client: Client):
         self.client = client
+        self._queued, self._updated_s = 0, -math.inf
         client.register_plugin(_WorkerPoolPlugin())
 
     def run_many(
@@ -79,20 +71,28 @@ class DaskEngine:
         Raises:
             TwinError: the connection to the scheduler was lost.
         """
-        waiting, running, queue_size = iter(tasks), {}, _QueueSize(self.client)
+        waiting, running = iter(tasks), {}
         arriving = as_completed(with_results=True, raise_errors=False)
 
-        def submit(count: int) -> None:
-            for task in islice(waiting, count):
+        def submit() -> None:
+            for task in islice(waiting, max(0, self._queue_size() - len(running))):
                 future = self.client.submit(_run_task, function, task, limits, pure=False)
                 running[future.key] = task
                 arriving.add(future)
 
-        submit(queue_size())
+        submit()
         for future, result in arriving:
             yield _outcome(running.pop(future.key), future, result)
             future.release()
-            submit(max(0, queue_size() - len(running)))
+            submit()
+
+    def _queue_size(self) -> int:
+        """Returns the number of tasks to keep submitted; it follows the size of the cluster."""
+        if time.monotonic() - self._updated_s > _REFRESH_S:
+            threads: Any = self.client.nthreads()
+            self._queued = max(_MIN_QUEUED, _QUEUED_PER_THREAD * sum(threads.values()))
+            self._updated_s = time.monotonic()
+        return self._queued
 
 
 class _WorkerPoolPlugin(WorkerPlugin):
@@ -107,33 +107,15 @@ class _WorkerPoolPlugin(WorkerPlugin):
         self.pool.close()
 
 
-def _run_task(function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
-    """Runs a task in the worker pool of this Dask worker; see `WorkerPool.run`."""
+def _run_task(function: Callable[[Task], Result], task: Task, limits: TaskLimits) -> Outcome[Task, Result]:
+    """Runs a task in the worker pool of this Dask worker."""
     plugin: Any = get_worker().plugins[_WorkerPoolPlugin.name]
     return plugin.pool.run(function, task, limits)
 
 
-class _QueueSize:
-    """Callable that returns the number of tasks to keep submitted.
-
-    It caches this number for `_REFRESH_S` seconds, because a network call is needed to get the size of the cluster.
-    """
-
-    def __init__(self, client: Client):
-        self.client, self.tasks, self.updated_s = client, 0, -math.inf
-
-    def __call__(self) -> int:
-        if time.monotonic() - self.updated_s > _REFRESH_S:
-            threads: Any = self.client.nthreads()
-            self.tasks = max(_MIN_QUEUED, _QUEUED_PER_THREAD * sum(threads.values()))
-            self.updated_s = time.monotonic()
-        return self.tasks
-
-
 def _outcome(task: Any, future: Future, result: Any) -> Outcome:
     if future.status == "finished":
-        reply, attempts = result
-        return Outcome(task, reply.value, reply.reason, attempts)
+        return result
     if future.status != "error":
         raise TwinError("--scheduler", "the connection was lost", "a running scheduler; continue with --resume")
     error: Any = result[1] if isinstance(result, tuple) else future.exception()

@@ -6,21 +6,9 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from itertools import islice
-from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+from typing import Any, Protocol
 
-from twin.engines.worker import TaskLimits, WorkerPool
-
-Task = TypeVar("Task")
-Result = TypeVar("Result")
-
-
-class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task."""
-
-    task: Task  #: the task
-    result: Result | None  #: result of the function; None if the task failed
-    failure: str  #: reason of the failure; "" if the task did not fail
-    attempts: int  #: number of attempts
+from twin.engines.worker import Outcome, Result, Task, TaskLimits, WorkerPool
 
 
 class Engine(Protocol):
@@ -32,22 +20,16 @@ class Engine(Protocol):
         """Runs `function` on every task and yields the outcomes in order of completion.
 
         A task fails if it raises an exception, runs longer than `limits.timeout_s`, or loses its process more than
-        `limits.retries` times. A failed task does not affect the others.
-
-        Args:
-            function: function of one task. The workers must be able to import it by name, as well as the classes of
-                the tasks and results.
+        `limits.retries` times. A failed task does not affect the others. The workers must be able to import the
+        function by name, as well as the classes of the tasks and results.
         """
         ...
 
 
 class LocalEngine:
-    """Engine that runs tasks in worker processes on this machine, each pinned to a CPU core.
+    """Engine that runs tasks in `jobs` worker processes on this machine, each pinned to a CPU core.
 
     One thread per worker process waits for its results.
-
-    Args:
-        jobs: largest number of worker processes.
     """
 
     def __init__(self, jobs: int):
@@ -58,17 +40,16 @@ class LocalEngine:
         self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
     ) -> Iterator[Outcome[Task, Result]]:
         """Runs `function` on every task; see `Engine.run_many`."""
-        waiting, running = iter(tasks), dict[Future[Any], Any]()
+        waiting, running = iter(tasks), set[Future[Any]]()
         with ThreadPoolExecutor(self.jobs) as threads:
             try:
                 while True:
                     for task in islice(waiting, 2 * self.jobs - len(running)):
-                        running[threads.submit(self.pool.run, function, task, limits)] = task
+                        running.add(threads.submit(self.pool.run, function, task, limits))
                     if not running:
                         return
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
-                        reply, attempts = future.result()
-                        yield Outcome(running.pop(future), reply.value, reply.reason, attempts)
+                    done, running = wait(running, return_when=FIRST_COMPLETED)
+                    yield from (future.result() for future in done)
             finally:
                 if running:  # interrupted: a thread ends only after its worker has been killed
                     self.pool.close()

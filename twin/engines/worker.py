@@ -19,7 +19,10 @@ import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Generic, Literal, NamedTuple, TypeVar
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
 
 #: Environment of a worker: one thread per library, as there is one worker per core. With LP_NUM_THREADS=0, Mesa renders
 #: in the calling thread.
@@ -37,6 +40,15 @@ class TaskLimits(NamedTuple):
 
     timeout_s: float = 3600.0
     retries: int = 2
+
+
+class Outcome(NamedTuple, Generic[Task, Result]):
+    """Outcome of one task."""
+
+    task: Task
+    result: Result | None  #: result of the function; None if the task failed
+    failure: str  #: reason of the failure; "" if the task did not fail
+    attempts: int
 
 
 class Reply(NamedTuple):
@@ -68,10 +80,7 @@ class Worker:
         child_end.close()
 
     def run(self, request: bytes, timeout_s: float) -> Reply:
-        """Sends a pickled (function, task) to the process and returns its reply.
-
-        Kills the process if it does not reply within `timeout_s`; the reply then has the kind "timeout".
-        """
+        """Sends a pickled (function, task) to the process, which it kills after the timeout; returns the reply."""
         try:
             self._pipe.send_bytes(request)
             if self._pipe.poll(timeout_s):
@@ -115,7 +124,7 @@ class WorkerPool:
         self._lock, self._closed = threading.Lock(), False
 
     def close(self) -> None:
-        """Kills all workers; concurrent calls of `run` return a reply of kind "killed"."""
+        """Kills all workers; concurrent calls of `run` return a failure."""
         with self._lock:
             self._closed = True
             idle, self._idle = self._idle, []
@@ -125,8 +134,8 @@ class WorkerPool:
         for worker in busy:
             worker.kill()  # its own thread closes the pipe: closing it twice could close a file of another thread
 
-    def run(self, function: Callable[[Any], Any], task: Any, limits: TaskLimits) -> tuple[Reply, int]:
-        """Runs a task on an idle or a new worker and returns its reply and the number of attempts.
+    def run(self, function: Callable[[Task], Result], task: Task, limits: TaskLimits) -> Outcome[Task, Result]:
+        """Runs a task on an idle or a new worker.
 
         The task is retried, at most `limits.retries` times, if its process ends or is killed, but not after an
         exception or a timeout.
@@ -137,7 +146,7 @@ class WorkerPool:
             attempts += 1
             reply = self._run_once(request, limits.timeout_s)
             if reply.kind != "killed" or attempts > limits.retries or self._closed:
-                return reply, attempts
+                return Outcome(task, reply.value, reply.reason, attempts)
 
     def _run_once(self, request: bytes, timeout_s: float) -> Reply:
         with self._lock:
@@ -169,8 +178,7 @@ def describe_exception(error: BaseException) -> str:
 def main(pipe: int, core: int | None) -> None:
     """Main loop of the worker process: answers each pickled (function, task) with a `Reply`, until the pipe closes.
 
-    Args:
-        core: CPU core to which the process is pinned; None: not pinned.
+    The process is pinned to the CPU core, if one is given.
     """
     if core is not None:
         os.sched_setaffinity(0, {core})

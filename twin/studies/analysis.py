@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -14,40 +15,37 @@ from numpy.typing import NDArray
 from twin.judge.map_error import with_completeness
 from twin.judge.require import more_is_better
 from twin.studies import statistics
-from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values, rounded
-from twin.studies.statistics import Array, Interval, SobolIndex
+from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values, range_text
+from twin.studies.statistics import UNDEFINED, Array, Interval, SobolIndex
 from twin.studies.study_file import Study
-from twin.studies.surveys import axis_names
 
 _MAX_REASONS = 12
 _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
+Mask = NDArray[np.bool_]
 
 
 class MetricSummary(NamedTuple):
-    """Distribution of a metric over the surveys: median, 95th or 5th percentile, and required limit.
-
-    `surveys` is the number of surveys in these statistics (`StudyAnalysis.included`); `bound` is the 95th percentile,
-    or the 5th percentile if larger values of the metric are better; `limit` is None if the metric has no requirement.
-    """
+    """Distribution of a metric over the surveys."""
 
     name: str
-    surveys: int
+    surveys: int  #: number of surveys in these statistics; see `StudyAnalysis.included`
     median: Interval
-    bound: Interval
-    limit: float | None
+    bound: Interval  #: 95th percentile, or 5th percentile if larger values of the metric are better
+    limit: float | None  #: None if the metric has no requirement
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key.
-
-    `correlation` is their rank correlation, NaN if the values of the key are not numbers. `explained` is the fraction
-    of the variance of the metric's ranks that the key explains (`statistics.explained_variance`).
-    """
+    """Dependence of a metric on a key."""
 
     key: str
     metric: str
-    correlation: Interval
-    explained: float
+    correlation: Interval  #: rank correlation; NaN if the values of the key are not numbers
+    explained: float  #: fraction of the variance of the metric's ranks; see `statistics.explained_variance`
+
+    @property
+    def strength(self) -> float:
+        """Returns the larger of |correlation| and the square root of the explained variance; 0 if undefined."""
+        return float(np.nanmax([abs(self.correlation.value), self.explained**0.5, 0.0]))
 
 
 class FailureReason(NamedTuple):
@@ -95,14 +93,21 @@ class StudyAnalysis:
         self.limits = self._limits()
         names = with_completeness([*self.limits, *study.show])
         self.metrics = [name for name in names if self._has_values(name)]
-        self.passed = self._passed()
+        met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
+        self.passed: Mask = np.logical_and.reduce([self.complete, *met])  # completed and met every requirement
 
     def _texts(self, name: str) -> NDArray:
         """Returns a column of the table as texts (n,), "" where a survey has no value or if there is no column."""
         column = self.rows[name].to_pylist() if name in self.rows.column_names else [None] * self.rows.num_rows
         return np.array(["" if value is None else str(value) for value in column], dtype=object)
 
-    def _duplicates(self, counted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def numbers(self, name: str) -> Array:
+        """Returns a numeric column of the table (n,), with NaN where a survey has no value or if there is no column."""
+        if name not in self.rows.column_names:
+            return np.full(self.rows.num_rows, np.nan)
+        return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
+
+    def _duplicates(self, counted: Mask) -> Mask:
         """Returns the mask (n,) of the surveys in `counted` (n,) with the scenario and seed of an earlier one in it."""
         hashes, seeds = self._texts("scenario_hash"), self.numbers("seed")
         seen: set[tuple[str, float]] = set()
@@ -113,18 +118,17 @@ class StudyAnalysis:
             seen.add(identity)
         return duplicate
 
-    def numbers(self, name: str) -> Array:
-        """Returns a numeric column of the table (n,), with NaN where a survey has no value or if there is no column."""
-        if name not in self.rows.column_names:
-            return np.full(self.rows.num_rows, np.nan)
-        return np.array([np.nan if v is None else float(v) for v in self.rows[name].to_pylist()])
+    def _limits(self) -> dict[str, float]:
+        columns = [re.fullmatch(r"require\.(.+)\.limit", column) for column in self.rows.column_names]
+        limits = {match[1]: self.numbers(match[0]) for match in columns if match}
+        return {name: float(np.nanmax(v)) if np.isfinite(v).any() else np.nan for name, v in limits.items()}
 
     def _has_values(self, metric: str) -> bool:
         """Returns whether the metric is in the table, and is required or has a finite value in some survey."""
         required = metric in self.limits and metric in self.rows.column_names
         return required or bool(np.isfinite(self.numbers(metric)).any())
 
-    def included(self, metric: str) -> NDArray[np.bool_]:
+    def included(self, metric: str) -> Mask:
         """Returns the mask (n,) of the surveys that are included in the statistics of a metric.
 
         These are the complete surveys with a finite value of the metric. The statistics of image quality metrics
@@ -132,19 +136,6 @@ class StudyAnalysis:
         """
         flown = self.evaluated if metric.startswith("vision.") else self.complete
         return flown & np.isfinite(self.numbers(metric))
-
-    def _limits(self) -> dict[str, float]:
-        limits = {}
-        for column in self.rows.column_names:
-            if match := re.fullmatch(r"require\.(.+)\.limit", column):
-                values = self.numbers(column)
-                limits[match[1]] = float(np.nanmax(values)) if np.isfinite(values).any() else np.nan
-        return limits
-
-    def _passed(self) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the surveys that were completed and met every requirement, without duplicates."""
-        met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
-        return np.logical_and.reduce([self.complete, *met])
 
     @cached_property
     def cluster_name(self) -> str:
@@ -159,13 +150,10 @@ class StudyAnalysis:
 
     @cached_property
     def pass_probability(self) -> Interval:
-        """Returns the fraction of the evaluated surveys that passed, with its confidence interval.
-
-        The interval allows for the unknown results of the `unmodelled` surveys, see `statistics.wilson_interval`.
-        """
+        """Returns the fraction of the evaluated surveys that passed; unknown results widen its confidence interval."""
         return self.proportion(self.counted)
 
-    def proportion(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Interval:
+    def proportion(self, chosen: Mask | NDArray[np.int64]) -> Interval:
         """Returns the pass probability of the chosen surveys (a mask or row numbers), which are all in `counted`."""
         return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unmodelled[chosen])
 
@@ -186,16 +174,12 @@ class StudyAnalysis:
 
     def key_numbers(self, key: str) -> Array | None:
         """Returns the value of a key in each survey (n,), or None if the values are not numbers."""
-        column = self.rows[f"vary.{key}"]
-        if pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
-            return self.numbers(f"vary.{key}")
-        return None
+        column = self.rows[f"vary.{key}"].type
+        is_number = pa.types.is_floating(column) or pa.types.is_integer(column)
+        return self.numbers(f"vary.{key}") if is_number else None
 
-    def key_groups(self, key: str, chosen: NDArray[np.bool_]) -> tuple[NDArray[np.int64], list[str]]:
-        """Groups surveys by the value of a key; see `statistics.group_indices` for numbers.
-
-        Args:
-            chosen: (n,) mask of the surveys to group.
+    def key_groups(self, key: str, chosen: Mask) -> tuple[NDArray[np.int64], list[str]]:
+        """Groups the surveys of the mask `chosen` (n,) by the value of a key; see `statistics.group_indices`.
 
         Returns:
             The group index of each chosen survey, and the name of each group: its value or its range of values.
@@ -205,7 +189,7 @@ class StudyAnalysis:
             names, index = np.unique(self._texts(f"vary.{key}")[chosen].astype(str), return_inverse=True)
             return index, [str(name) for name in names]
         groups = statistics.group_indices(values[chosen])
-        return groups, [_range_text(values[chosen][groups == k]) for k in np.unique(groups)]
+        return groups, [range_text(values[chosen][groups == k]) for k in np.unique(groups)]
 
     @cached_property
     def metric_summaries(self) -> list[MetricSummary]:
@@ -213,29 +197,22 @@ class StudyAnalysis:
         return [self._metric_summary(name) for name in self.metrics]
 
     def _metric_summary(self, name: str) -> MetricSummary:
-        values, included = self.numbers(name), self.included(name)
-        data, clusters = values[included], self.clusters[included]
+        included = self.included(name)
+        data, clusters = self.numbers(name)[included], self.clusters[included]
         percent = 5.0 if more_is_better(name) else 95.0
-        return MetricSummary(
-            name,
-            len(data),
-            statistics.bootstrap_interval(data, statistics.median, clusters),
-            statistics.bootstrap_interval(data, lambda v: statistics.percentile(v, percent), clusters),
-            self.limits.get(name),
-        )
+        median = statistics.bootstrap_interval(data, statistics.median, clusters)
+        bound = statistics.bootstrap_interval(data, lambda v: statistics.percentile(v, percent), clusters)
+        return MetricSummary(name, len(data), median, bound, self.limits.get(name))
 
     @cached_property
     def sensitivities(self) -> list[Sensitivity]:
         """Returns the sensitivity of each metric to each key, metric by metric, the strongest first."""
-        unsorted = [self._sensitivity(key, metric) for metric in self.metrics for key in self.keys]
-        order = {metric: k for k, metric in enumerate(self.metrics)}
-        return sorted(unsorted, key=lambda s: (order[s.metric], -_strength(s)))
+        of_metrics = ([self._sensitivity(key, metric) for key in self.keys] for metric in self.metrics)
+        return [one for of_keys in of_metrics for one in sorted(of_keys, key=lambda s: -s.strength)]
 
     def _sensitivity(self, key: str, metric: str) -> Sensitivity:
-        y, included = self.numbers(metric), self.included(metric)
-        x = self.key_numbers(key)
-        undefined = Interval(np.nan, np.nan, np.nan)
-        correlation = undefined if x is None else statistics.rank_correlation(x[included], y[included])
+        x, y, included = self.key_numbers(key), self.numbers(metric), self.included(metric)
+        correlation = UNDEFINED if x is None else statistics.rank_correlation(x[included], y[included])
         groups, _ = self.key_groups(key, included)
         return Sensitivity(key, metric, correlation, statistics.explained_variance(groups, y[included]))
 
@@ -245,9 +222,10 @@ class StudyAnalysis:
 
         A metric is left out if it is constant, or if a survey of the design is not complete or has no value of it.
         """
-        axes = axis_names(self.study)
-        usable = self.study.sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1
-        if not usable or len(np.unique(self.numbers("sample"))) != (self.study.sampling.samples or 0) * (len(axes) + 2):
+        sampling, keys = self.study.sampling, self.study.axes(listed=False)
+        axes = [name if isinstance(name, str) else " + ".join(name) for name in keys]
+        usable = sampling.method == "saltelli" and self.rows.num_rows > 0 and len(axes) > 1
+        if not usable or len(np.unique(self.numbers("sample"))) != (sampling.samples or 0) * (len(axes) + 2):
             return {}
         means = {metric: self._mean_of_samples(metric) for metric in self.metrics}
         return {
@@ -282,38 +260,31 @@ class StudyAnalysis:
         if x is None:
             return answers_of_values(self._texts(f"vary.{key}")[chosen].astype(str), record)
         is_listed = distribution is None or distribution.kind in ("choice", "grid")
-        if len(np.unique(x[chosen])) == 1 or (is_listed and len(np.unique(x[chosen])) <= _MAX_LISTED):
+        n_different = len(np.unique(x[chosen]))
+        if n_different == 1 or (is_listed and n_different <= _MAX_LISTED):
             return answers_of_values(x[chosen], record)
         return answers_of_ranges(x[chosen], record)
 
     @cached_property
     def refused_samples(self) -> list[RefusedSample]:
         """Returns the samples with refused surveys, in ascending order of their numbers."""
-        listed: dict[int, RefusedSample] = {}
-        sample = self.numbers("sample")
-        for k in np.flatnonzero(self.refused):
-            number = int(sample[k])
-            values = {key: self.rows[f"vary.{key}"][int(k)].as_py() for key in self.keys}
-            earlier = listed.get(number, RefusedSample(number, 0, values, self.reason[k]))
-            listed[number] = earlier._replace(surveys=earlier.surveys + 1)
-        return [listed[number] for number in sorted(listed)]
+        rows = np.flatnonzero(self.refused)
+        numbers, first, counts = np.unique(self.numbers("sample")[rows], return_index=True, return_counts=True)
+        values = [{key: self.rows[f"vary.{key}"][int(k)].as_py() for key in self.keys} for k in rows[first]]
+        fields = zip(numbers.astype(int).tolist(), counts.tolist(), values, self.reason[rows[first]], strict=True)
+        return [RefusedSample(*one) for one in fields]
 
     @cached_property
     def refusal_reasons(self) -> list[FailureReason]:
-        """Returns the reasons why surveys were refused, at most 12, the most frequent first.
-
-        Reasons that differ only in numbers count as one, with the text of the first.
-        """
+        """Returns the reasons why surveys were refused, at most 12, the most frequent first; see `count_similar`."""
         counts = count_similar(self.reason[self.refused])
         return [FailureReason("refused", reason, count) for reason, count in counts.items()][:_MAX_REASONS]
 
     @cached_property
     def failure_reasons(self) -> list[FailureReason]:
         """Returns the reasons why surveys did not pass, with numbers masked: at most 12, the most frequent first."""
-        counts: dict[tuple[str, str], int] = {}
-        for k in np.flatnonzero(~self.passed & ~self.refused & ~self.duplicate):
-            reason = mask_numbers(self.reason[k]) or "requirement not met: " + " and ".join(self._missed_limits(int(k)))
-            counts[self.status[k], reason] = counts.get((self.status[k], reason), 0) + 1
+        rows = np.flatnonzero(~self.passed & ~self.refused & ~self.duplicate)
+        counts = Counter((self.status[k], mask_numbers(self.reason[k]) or self._missed_limits(int(k))) for k in rows)
         reasons = [FailureReason(*key, count) for key, count in counts.items()]
         return sorted(reasons, key=lambda r: (-r.surveys, r.reason))[:_MAX_REASONS]
 
@@ -322,8 +293,9 @@ class StudyAnalysis:
         """Returns the number of surveys with each warning, the most frequent first; see `count_similar`."""
         return count_similar(self.warning[(self.warning != "") & ~self.duplicate])
 
-    def _missed_limits(self, row: int) -> list[str]:
-        return [name for name in self.limits if self.numbers(f"require.{name}.passed")[row] != 1]
+    def _missed_limits(self, row: int) -> str:
+        missed = [name for name in self.limits if self.numbers(f"require.{name}.passed")[row] != 1]
+        return "requirement not met: " + " and ".join(missed)
 
 
 def mask_numbers(reason: str) -> str:
@@ -337,18 +309,4 @@ def mask_numbers(reason: str) -> str:
 def count_similar(texts: Iterable[str]) -> dict[str, int]:
     """Returns {text: count}, the most frequent first; texts that differ only in numbers count as the first of them."""
     first: dict[str, str] = {}
-    counts: dict[str, int] = {}
-    for text in texts:
-        shown = first.setdefault(mask_numbers(text), text)
-        counts[shown] = counts.get(shown, 0) + 1
-    return dict(sorted(counts.items(), key=lambda item: -item[1]))
-
-
-def _strength(sensitivity: Sensitivity) -> float:
-    strengths = [abs(sensitivity.correlation.value), sensitivity.explained**0.5]
-    return max([strength for strength in strengths if np.isfinite(strength)], default=0.0)
-
-
-def _range_text(values: Array) -> str:
-    low, high = float(values.min()), float(values.max())
-    return rounded(low) if low == high else f"{rounded(low)} to {rounded(high)}"
+    return dict(Counter(first.setdefault(mask_numbers(text), text) for text in texts).most_common())

@@ -58,10 +58,7 @@ class PassRecord(NamedTuple):
         return np.zeros(len(self.passed), np.bool_) if self.unknown is None else self.unknown
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
-        """Returns the answer for the surveys that the mask `chosen` (n,) selects, of which there is at least one.
-
-        `label`, `low` and `high` are the fields of the answer.
-        """
+        """Returns the answer for the surveys that the mask `chosen` (n,) selects, of which there is at least one."""
         clusters, unknown = self.clusters[chosen], self._unknown[chosen]
         passed = self.passed[chosen] & ~unknown
         verdict: Verdict = "undecided"
@@ -95,18 +92,11 @@ class PassRecord(NamedTuple):
 
 
 def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
-    """Returns the verdict on the pass probability for each distinct value of a key with listed values.
-
-    Args:
-        names: (n,) value of the key in each survey, numbers or text.
-    """
+    """Returns the verdict on the pass probability for each distinct value of a key: `names` (n,), numbers or text."""
     values = np.asarray(names)
-    numeric = np.issubdtype(values.dtype, np.number)
-    answers = []
-    for value in np.unique(values):
-        number = float(value) if numeric else np.nan
-        answers.append(record.answer(values == value, f"{value:.4g}" if numeric else str(value), number, number))
-    return answers
+    if np.issubdtype(values.dtype, np.number):
+        return [record.answer(values == value, f"{value:.4g}", value, value) for value in np.unique(values).tolist()]
+    return [record.answer(values == value, str(value)) for value in np.unique(values)]
 
 
 def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
@@ -131,7 +121,7 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     def of_run(first: int, last: int) -> Answer:
         chosen = (bins >= first) & (bins <= last)
         low, high = float(x[chosen].min()), float(x[chosen].max())
-        return searched.answer(chosen, f"{rounded(low)} to {rounded(high)}" if high > low else f"{low:.4g}", low, high)
+        return searched.answer(chosen, range_text(x[chosen]) if high > low else f"{low:.4g}", low, high)
 
     runs = {(i, j): of_run(i, j) for i in range(n_bins) for j in range(i, n_bins)}
     return [runs[run] for run in _decided_runs(runs, 0, n_bins - 1, record.required)]
@@ -152,13 +142,9 @@ def value_bins(x: Array) -> NDArray[np.int64]:
 
 
 def pass_bins(x: Array, outcomes: ArrayLike) -> NDArray[np.int64]:
-    """Returns the bin of each survey (n,), numbered in ascending order of its value: `value_bins`, divided further.
+    """Returns the bin of each survey (n,), numbered in ascending order of its value x (n,): `value_bins`, divided.
 
-    Bins are also divided where the fractions of the outcomes change, so that no bin mixes two pass probabilities.
-
-    Args:
-        x: (n,) value of the key in each survey.
-        outcomes: (n,) outcome of each survey: 0, 1 or 2.
+    Bins are divided where the fractions of the outcomes (n,) change, so that no bin mixes two pass probabilities.
     """
     order, bins = np.argsort(x, kind="stable"), value_bins(x)
     changes = _changes(x[order], np.asarray(outcomes)[order, None] == np.arange(3))
@@ -221,3 +207,9 @@ def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], re
 def rounded(value: float) -> str:
     """Returns a number with three significant digits, or all digits before the decimal point, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
+def range_text(values: Array) -> str:
+    """Returns the smallest and the largest of some numbers (n,) as text, e.g. "1.6 to 1.9"."""
+    low, high = rounded(float(values.min())), rounded(float(values.max()))
+    return low if values.min() == values.max() else f"{low} to {high}"

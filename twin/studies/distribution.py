@@ -40,14 +40,15 @@ class Distribution(Section):
 
     @model_validator(mode="after")
     def _valid_parameters(self) -> Distribution:
-        rule = _RULES.get(self.kind)
-        if rule is not None and not rule[1](*self.values):
-            raise PydanticCustomError("order", rule[0])
+        if self.kind in _LAWS:
+            rule, is_valid, _ = _LAWS[self.kind]
+            if not is_valid(*self.values):
+                raise PydanticCustomError("order", rule)
         return self
 
     @property
     def kind(self) -> str:
-        """Returns the kind of distribution: the name of the only field that is not None, e.g. "uniform"."""
+        """Returns the name of the only field that is not None, e.g. "uniform"."""
         return next(name for name in KINDS if getattr(self, name) is not None)
 
     @property
@@ -62,19 +63,14 @@ class Distribution(Section):
 
     def quantiles(self, probability: Array) -> list[Any]:
         """Returns the quantiles at probabilities (n,), 0 to 1; the values of a choice or grid are equally probable."""
-        if self.kind in ("choice", "grid"):
-            return [self.values[k] for k in equal_bins(probability, len(self.values))]
-        return [float(value) for value in _QUANTILES[self.kind](clip_probability(probability), *self.values)]
+        if self.kind not in _LAWS:
+            return equally_probable(self.values, probability)
+        inside = np.clip(probability, 1e-12, 1 - 1e-12)  # where the quantiles of normal distributions are finite
+        return [float(value) for value in _LAWS[self.kind][2](inside, *self.values)]
 
 
 _EXAMPLE = "{ uniform = [0.5, 2.0] }"
 KINDS = tuple(Distribution.model_fields)
-_RULES = {
-    "uniform": ("low < high", lambda low, high: low < high),
-    "log_uniform": ("0 < low < high", lambda low, high: 0 < low < high),
-    "normal": ("standard deviation > 0", lambda _, sigma: sigma > 0),
-    "truncated_normal": ("standard deviation > 0, low < high", lambda _, sigma, low, high: sigma > 0 and low < high),
-}
 
 
 def _truncated_normal(probability: Array, mean: float, sigma: float, low: float, high: float) -> Array:
@@ -84,19 +80,28 @@ def _truncated_normal(probability: Array, mean: float, sigma: float, low: float,
     return np.clip(stats.truncnorm.ppf(probability, *bounds, loc=mean, scale=sigma), low, high)
 
 
-_QUANTILES = {
-    "uniform": lambda p, low, high: low + (high - low) * p,
-    "log_uniform": lambda p, low, high: np.exp(np.log(low) + np.log(high / low) * p),
-    "normal": lambda p, mean, sigma: mean + sigma * ndtri(p),
-    "truncated_normal": _truncated_normal,
+#: For each continuous distribution: the rule for its parameters, as text and as a function; its quantiles.
+_LAWS: dict[str, tuple[Any, Any, Any]] = {
+    "uniform": ("low < high", lambda low, high: low < high, lambda p, low, high: low + (high - low) * p),
+    "log_uniform": (
+        "0 < low < high",
+        lambda low, high: 0 < low < high,
+        lambda p, low, high: np.exp(np.log(low) + np.log(high / low) * p),
+    ),
+    "normal": (
+        "standard deviation > 0",
+        lambda _, sigma: sigma > 0,
+        lambda p, mean, sigma: mean + sigma * ndtri(p),
+    ),
+    "truncated_normal": (
+        "standard deviation > 0, low < high",
+        lambda _, sigma, low, high: sigma > 0 and low < high,
+        _truncated_normal,
+    ),
 }
 
 
-def clip_probability(probability: Array) -> Array:
-    """Returns probabilities clipped to [1e-12, 1 - 1e-12], so that the quantiles of normal distributions are finite."""
-    return np.clip(probability, 1e-12, 1 - 1e-12)
-
-
-def equal_bins(probability: Array, count: int) -> NDArray[np.int64]:
-    """Returns the index of the bin that contains each probability, for `count` equal bins of [0, 1]."""
-    return np.minimum((probability * count).astype(np.int64), count - 1)
+def equally_probable(values: tuple[Any, ...], probability: Array) -> list[Any]:
+    """Returns the value at each probability (n,), 0 to 1, if all values are equally probable."""
+    index = np.minimum((probability * len(values)).astype(np.int64), len(values) - 1)
+    return [values[k] for k in index]

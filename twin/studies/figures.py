@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import matplotlib
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 from twin.report.figures import WIDTH_IN, log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent
-from twin.studies import statistics
-from twin.studies.analysis import MetricSummary, Sensitivity, StudyAnalysis
+from twin.studies import agreement, statistics
+from twin.studies.analysis import Mask, MetricSummary, Sensitivity, StudyAnalysis
 from twin.studies.statistics import Array, Interval
 from twin.studies.wording import metric_name, metric_value
 
@@ -25,18 +24,21 @@ PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["l
 _MAX_POINTS = 3000
 
 
-def draw_all(analysis: StudyAnalysis, further: Mapping[str, Callable[[StudyAnalysis], Figure]]) -> dict[str, str]:
-    """Returns the figures for which the study has data, and `further` ones, as {figure name: data URI}."""
-    drawings: dict[str, Callable[[], Figure | None]] = {
-        "pass_probability": lambda: pass_probability(analysis),
-        "histograms": lambda: metric_histograms(analysis, analysis.metric_summaries),
-        "sensitivity": lambda: sensitivity(analysis.sensitivities),
-        "key_histograms": lambda: key_histograms(analysis),
-    } | {f"metric.{metric}": lambda metric=metric: metric_by_key(analysis, metric) for metric in analysis.metrics}
-    drawings |= {name: lambda draw=draw: draw(analysis) for name, draw in further.items()}
+def draw_all(analysis: StudyAnalysis, compared: bool) -> dict[str, str]:
+    """Returns the figures for which the study has data, as {figure name: data URI}.
+
+    `compared` is whether the study has pairs of rendered and surrogate surveys.
+    """
     with matplotlib.rc_context(FIGURE_STYLE):
-        figures = {name: draw() for name, draw in drawings.items()}
-        return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
+        drawn = {
+            "pass_probability": pass_probability(analysis),
+            "histograms": metric_histograms(analysis, analysis.metric_summaries),
+            "sensitivity": sensitivity(analysis.sensitivities),
+            "key_histograms": key_histograms(analysis),
+            **{f"metric.{metric}": metric_by_key(analysis, metric) for metric in analysis.metrics},
+            "agreement": agreement_of_pairs(analysis) if compared else None,
+        }
+        return {name: to_data_uri(figure) for name, figure in drawn.items() if figure is not None}
 
 
 def make_panels(count: int, columns: int = 3, row_in: float = 2.7) -> tuple[Figure, list[Axes]]:
@@ -50,6 +52,30 @@ def make_panels(count: int, columns: int = 3, row_in: float = 2.7) -> tuple[Figu
     return figure, axes[:count]
 
 
+def value_axis(axis: Any, values: Array, ticks: int | None = None) -> bool:
+    """Makes an axis logarithmic if that suits the values, else limits its ticks; returns whether it is logarithmic.
+
+    It suits values that are all positive, of which the largest exceeds the smallest by a factor of 8.
+    """
+    is_log = bool(values.min(initial=np.inf) > 0 and values.max(initial=0) > 8 * values.min(initial=np.inf))
+    if is_log:
+        log_axis(axis)
+    elif ticks:
+        axis.set_major_locator(MaxNLocator(ticks))
+    return is_log
+
+
+def metric_axis(axis: Any, metric: str) -> None:
+    """Formats the ticks of an axis in the unit of the metric."""
+    axis.set_major_formatter(lambda value, _: metric_value(metric, value))
+    axis.set_tick_params(labelsize=8)
+
+
+def axis_label(metric: str) -> str:
+    """Returns the name of a metric, wrapped to the width of one plot."""
+    return textwrap.fill(metric_name(metric), 26)
+
+
 def pass_probability(analysis: StudyAnalysis) -> Figure | None:
     """Plots the pass probability against each varied key; returns None if no key varies or no survey was evaluated."""
     if not analysis.keys or not analysis.evaluated.any():
@@ -57,10 +83,9 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
     figure, panels = make_panels(len(analysis.keys))
     rows = np.flatnonzero(analysis.counted)
     for key, axes in zip(analysis.keys, panels, strict=True):
-        groups, names = analysis.key_groups(key, analysis.counted)
+        groups, x = _grouped(axes, analysis, key, analysis.counted)
         proportions = [analysis.proportion(rows[groups == k]) for k in np.unique(groups)]
-        x = _key_axis(axes, analysis.key_numbers(key), analysis.counted, groups, names)
-        _error_bars(axes, x, proportions, COLOURS["online"])
+        _error_bars(axes, x, proportions)
         axes.axhline(analysis.pass_probability.value, color=COLOURS["reference"], linestyle="--", linewidth=1)
         _shade_answers(axes, analysis, key)
         axes.set(ylim=(-0.03, 1.03), xlabel=key)
@@ -81,40 +106,25 @@ def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
             axes.axvspan(low, high, color=colour, alpha=0.18, linewidth=6 if low == high else 0)
 
 
-def _key_axis(axes: Axes, values: Array | None, chosen: NDArray[np.bool_], groups: NDArray, names: list[str]) -> Array:
-    """Formats the x axis for a key and returns the x position of each group of surveys."""
+def _grouped(axes: Axes, analysis: StudyAnalysis, key: str, chosen: Mask) -> tuple[NDArray[np.int64], Array]:
+    """Formats the x axis for a key; returns the group of each chosen survey and the x position of each group."""
+    values, (groups, names) = analysis.key_numbers(key), analysis.key_groups(key, chosen)
     if values is None:
-        rotation = 25 if max(len(name) for name in names) > 8 else 0
-        axes.set_xticks(range(len(names)), names, rotation=rotation)
+        axes.set_xticks(range(len(names)), names, rotation=25 if max(len(name) for name in names) > 8 else 0)
         axes.set_xlim(-0.5, len(names) - 0.5)
-        return np.arange(len(names), dtype=float)
-    if spans_decades(values):
-        log_axis(axes.xaxis)
-    else:
-        axes.xaxis.set_major_locator(MaxNLocator(6))
-    axes.set_xlim(*_axis_range(values[chosen], spans_decades(values)))
-    return np.array([np.median(values[chosen][groups == k]) for k in np.unique(groups)])
-
-
-def _axis_range(values: Array, log: bool) -> tuple[float, float]:
-    """Returns the limits of an axis, logarithmic or linear, that shows the values with a margin."""
-    low, high = float(values.min()), float(values.max())
-    if log:
-        return low / 1.15, high * 1.15
+        return groups, np.arange(len(names), dtype=float)
+    is_log = value_axis(axes.xaxis, values, ticks=6)
+    low, high = float(values[chosen].min()), float(values[chosen].max())
     margin = 0.05 * (high - low) or 0.05 * abs(high) or 1.0
-    return low - margin, high + margin
+    axes.set_xlim(*((low / 1.15, high * 1.15) if is_log else (low - margin, high + margin)))
+    return groups, np.array([np.median(values[chosen][groups == k]) for k in np.unique(groups)])
 
 
-def spans_decades(values: Array) -> bool:
-    """Returns whether a logarithmic axis suits the values: all are positive, and largest / smallest exceeds 8."""
-    return bool(values.min(initial=np.inf) > 0 and values.max(initial=0) > 8 * values.min(initial=np.inf))
-
-
-def _error_bars(axes: Axes, x: Array, intervals: list[Interval], colour: str) -> None:
-    y = np.array([i.value for i in intervals])
-    bars = np.array([[i.value - i.low, i.high - i.value] for i in intervals]).T
+def _error_bars(axes: Axes, x: Array, intervals: list[Interval]) -> None:
+    y, low, high = np.array(intervals).T
+    bars = np.array([y - low, high - y])
     bars = np.where(np.isfinite(bars), np.maximum(bars, 0), 0)
-    axes.errorbar(x, y, bars, fmt="o-", color=colour, markersize=4, capsize=2.5, linewidth=1.2, zorder=4)
+    axes.errorbar(x, y, bars, fmt="o-", color=COLOURS["online"], markersize=4, capsize=2.5, linewidth=1.2, zorder=4)
 
 
 def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
@@ -127,46 +137,30 @@ def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -
         return None
     figure, panels = make_panels(len(summaries))
     for summary, axes in zip(summaries, panels, strict=True):
-        values = analysis.numbers(summary.name)
-        values = values[analysis.included(summary.name)]
-        log = spans_decades(values)
-        edges = _bin_edges(values, log)
-        axes.hist(values, list(edges), color=COLOURS["online"], alpha=0.75)
-        if log:
-            log_axis(axes.xaxis)
-        else:
-            axes.xaxis.set_major_locator(MaxNLocator(4))
-        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+        values = analysis.numbers(summary.name)[analysis.included(summary.name)]
+        _histogram(axes, [values], values, ticks=4, color=COLOURS["online"], alpha=0.75)
         if np.isfinite(summary.median.low):
             axes.axvspan(summary.median.low, summary.median.high, color=PASSED, alpha=0.25, linewidth=0)
         axes.axvline(summary.median.value, color=PASSED, label="median")
         axes.axvline(summary.bound.value, color=NOT_PASSED, linestyle=":", label="95 % bound")
         if summary.limit is not None:
             axes.axvline(summary.limit, color=LIMIT, linestyle="--", label="limit")
-        unit_axis(axes.xaxis, summary.name)
+        metric_axis(axes.xaxis, summary.name)
         axes.set_xlabel(axis_label(summary.name))
     panels[0].set_ylabel("surveys")
     panels[0].legend(fontsize=8)
     return figure
 
 
-def _bin_edges(values: Array, log: bool) -> Array:
+def _histogram(axes: Axes, samples: list[Array], values: Array, ticks: int | None = None, **style: Any) -> None:
+    """Plots a stacked histogram of samples, in bins over the range of all values (n,)."""
+    is_log = value_axis(axes.xaxis, values, ticks)
     count = int(np.clip(2 * len(values) ** (1 / 3), 5, 40))
     low, high = float(values.min()), float(values.max())
-    if log:
-        return np.geomspace(low, high, count + 1)
-    return np.linspace(low, high if high > low else low + 1e-9 + abs(low) * 1e-3, count + 1)
-
-
-def axis_label(metric: str) -> str:
-    """Returns the name of a metric, wrapped to the width of one plot."""
-    return textwrap.fill(metric_name(metric), 26)
-
-
-def unit_axis(axis: Any, metric: str) -> None:
-    """Formats the ticks of an axis in the unit of the metric."""
-    axis.set_major_formatter(lambda value, _: metric_value(metric, value))
-    axis.set_tick_params(labelsize=8)
+    high = high if high > low else low + 1e-9 + abs(low) * 1e-3
+    edges = np.geomspace(low, high, count + 1) if is_log else np.linspace(low, high, count + 1)
+    axes.hist(samples, list(edges), stacked=True, **style)
+    axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
 
 
 def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
@@ -178,29 +172,24 @@ def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
     if not analysis.keys or included.sum() < 2:
         return None
     figure, panels = make_panels(len(analysis.keys))
+    y, clusters = y[included], analysis.clusters[included]
     for key, axes in zip(analysis.keys, panels, strict=True):
-        values = analysis.key_numbers(key)
-        groups, names = analysis.key_groups(key, included)
-        group_x = _key_axis(axes, values, included, groups, names)
-        jitter = np.random.default_rng(0)
+        values, jitter = analysis.key_numbers(key), np.random.default_rng(0)
+        groups, group_x = _grouped(axes, analysis, key, included)
         x = groups + jitter.uniform(-0.15, 0.15, len(groups)) if values is None else values[included]
-        _dots(axes, x, y[included], analysis.passed[included], jitter)
-        clusters = analysis.clusters[included]
-        medians = [
-            statistics.bootstrap_interval(y[included][groups == k], statistics.median, clusters[groups == k])
-            for k in np.unique(groups)
-        ]
-        _error_bars(axes, group_x, medians, COLOURS["online"])
+        _dots(axes, x, y, analysis.passed[included], jitter)
+        of_groups = (groups == k for k in np.unique(groups))
+        medians = [statistics.bootstrap_interval(y[one], statistics.median, clusters[one]) for one in of_groups]
+        _error_bars(axes, group_x, medians)
         if (limit := analysis.limits.get(metric)) is not None:
             axes.axhline(limit, color=LIMIT, linestyle="--", linewidth=1)
-        if spans_decades(y[included]):
-            log_axis(axes.yaxis)
-        unit_axis(axes.yaxis, metric)
+        value_axis(axes.yaxis, y)
+        metric_axis(axes.yaxis, metric)
         axes.set_xlabel(key)
     return figure
 
 
-def _dots(axes: Axes, x: Array, y: Array, passed: NDArray[np.bool_], rng: np.random.Generator) -> None:
+def _dots(axes: Axes, x: Array, y: Array, passed: Mask, rng: np.random.Generator) -> None:
     """Plots surveys as dots whose colour shows whether they passed; of more than 3000, a random subset of 3000."""
     shown = rng.permutation(len(x))[:_MAX_POINTS]
     for mask, colour in ((passed, POINTS), (~passed, NOT_PASSED)):
@@ -214,10 +203,9 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
     Returns None if no correlation is defined.
     """
     shown = [s for s in sensitivities if np.isfinite(s.correlation.value)]
-    metrics = list(dict.fromkeys(s.metric for s in shown))
+    metrics, keys = list(dict.fromkeys(s.metric for s in shown)), list(dict.fromkeys(s.key for s in shown))
     if not shown:
         return None
-    keys = list(dict.fromkeys(s.key for s in shown))
     figure, panels = make_panels(len(metrics), row_in=0.9 + 0.36 * len(keys))
     left = panels[0].get_position().x0
     for metric, axes in zip(metrics, panels, strict=True):
@@ -239,21 +227,44 @@ def key_histograms(analysis: StudyAnalysis) -> Figure | None:
     Returns None if no key is numeric or one of the two sets is empty.
     """
     good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
-    keys = [key for key in analysis.keys if analysis.key_numbers(key) is not None]
-    if not keys or not good.any() or not bad.any():
+    numeric = {key: x for key in analysis.keys if (x := analysis.key_numbers(key)) is not None}
+    if not numeric or not good.any() or not bad.any():
         return None
-    figure, panels = make_panels(len(keys))
-    for key, axes in zip(keys, panels, strict=True):
-        values = analysis.key_numbers(key)
-        assert values is not None
-        log = spans_decades(values[analysis.evaluated])
-        edges = _bin_edges(values[analysis.evaluated], log)
-        both, colours = [values[good], values[bad]], [PASSED, NOT_PASSED]
-        axes.hist(both, list(edges), stacked=True, color=colours, label=["passed", "not passed"], alpha=0.85)
-        if log:
-            log_axis(axes.xaxis)
-        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
+    figure, panels = make_panels(len(numeric))
+    style = {"color": [PASSED, NOT_PASSED], "label": ["passed", "not passed"], "alpha": 0.85}
+    for (key, x), axes in zip(numeric.items(), panels, strict=True):
+        _histogram(axes, [x[good], x[bad]], x[analysis.evaluated], **style)
         axes.set_xlabel(key)
     panels[0].set_ylabel("surveys")
     panels[0].legend(fontsize=8)
     return figure
+
+
+def agreement_of_pairs(analysis: StudyAnalysis) -> Figure:
+    """Plots the surrogate against the rendered values of each compared metric."""
+    figure, panels = make_panels(len(analysis.study.compare))
+    for metric, axes in zip(analysis.study.compare, panels, strict=True):
+        _draw_pairs(axes, *agreement.values_of_pairs(analysis, metric))
+        if axes.lines:
+            axes.set_title(textwrap.fill(metric_name(metric), 30), fontsize=8)
+    return figure
+
+
+def _draw_pairs(axes: Axes, rendered: Array, surrogate: Array) -> None:
+    """Plots surrogate against rendered values (n,), with the line of equal values and the limits on the medians."""
+    finite = np.concatenate([rendered, surrogate])
+    finite = finite[np.isfinite(finite)]
+    if len(finite) == 0:
+        return
+    low, high = float(finite.min()), float(finite.max())
+    logarithmic = low > 0 and high > 5 * low
+    margin = 0.05 * ((high - low) or 1.0)
+    start, edge = (low / 1.3, high * 1.3) if logarithmic else (low - margin, high + margin)
+    line, limit = np.linspace(start, edge, 50), 1 + agreement.MEDIAN_LIMIT
+    axes.fill_between(line, line / limit, line * limit, color=COLOURS["reference"], alpha=0.25, linewidth=0)
+    axes.plot(line, line, color=COLOURS["reference"])
+    x, y = (np.minimum(values, edge) for values in (rendered, surrogate))
+    axes.plot(x, y, "o", markersize=3.5, color=COLOURS["online"], alpha=0.7)
+    for axis in (axes.xaxis, axes.yaxis) if logarithmic else ():
+        log_axis(axis)
+    axes.set(xlim=(start, edge), ylim=(start, edge), xlabel="rendered", ylabel="surrogate")

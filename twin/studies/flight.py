@@ -14,10 +14,13 @@ from twin.errors import ScenarioError, TwinError, UnmodelledError
 from twin.studies.surveys import Sample, Survey
 
 Row = dict[str, Any]
-#: Files of a run folder that are kept, by the value of the study's `keep`; "all" keeps every file, "none" no file.
-KEPT_FILES = {"metrics": ("metrics.json",), "report": ("metrics.json", "report.html", "scenario.resolved.toml")}
-#: Argument `outputs` of `survey.run` for each value of the study's `keep`: files that would be deleted are not written.
-OUTPUTS = {"none": None, "metrics": None, "report": ("report",), "all": ("report", "recording")}
+#: For each value of `keep`: the argument `outputs` of `survey.run`, and the files that are kept; None: all of them.
+KEPT: dict[str, tuple[tuple[str, ...] | None, tuple[str, ...] | None]] = {
+    "none": (None, ()),
+    "metrics": (None, ("metrics.json",)),
+    "report": (("report",), ("metrics.json", "report.html", "scenario.resolved.toml")),
+    "all": (("report", "recording"), None),
+}
 
 
 def fly(survey: Survey) -> Row:
@@ -37,7 +40,7 @@ def fly(survey: Survey) -> Row:
         shutil.rmtree(leftover, ignore_errors=True)  # files of an attempt that was killed
     scratch = survey.folder.with_name(f".{survey.folder.name}.{uuid4().hex[:8]}")
     try:
-        metrics = single_survey.run(survey.scenario, scratch, outputs=OUTPUTS[survey.keep]).metrics
+        metrics = single_survey.run(survey.scenario, scratch, outputs=KEPT[survey.keep][0]).metrics
         _move_kept_files(scratch, survey)
     except ScenarioError as error:
         unmodelled = {"unmodelled": True} if isinstance(error, UnmodelledError) else {}
@@ -51,14 +54,14 @@ def fly(survey: Survey) -> Row:
 
 
 def _move_kept_files(scratch: Path, survey: Survey) -> None:
-    """Deletes the files that `survey.keep` excludes and renames the folder `scratch` to its final name."""
+    """Deletes the files that are not kept and renames the folder `scratch` to its final name."""
     shutil.rmtree(survey.folder, ignore_errors=True)
-    if survey.keep == "none":
+    kept = KEPT[survey.keep][1]
+    if kept == ():
         return
-    if survey.keep != "all":
-        for entry in scratch.iterdir():
-            if entry.name not in KEPT_FILES[survey.keep]:
-                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+    for entry in scratch.iterdir():
+        if kept is not None and entry.name not in kept:
+            shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
     scratch.replace(survey.folder)
 
 
@@ -77,19 +80,18 @@ def row_of(survey: Survey, status: str, reason: str) -> Row:
             "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
             computer failed.
     """
-    identity = {"sample": survey.sample, "seed": survey.seed, "scenario_hash": survey.scenario_hash}
-    identity["fidelity"] = survey.scenario.imaging.fidelity
-    return identity | {"status": status, "reason": reason} | _varied(survey.values)
+    identity = {"scenario_hash": survey.scenario_hash, "fidelity": survey.scenario.imaging.fidelity}
+    return _row(survey.key, identity, status, reason, survey.values)
 
 
 def refused_row(sample: Sample, seed: int, reason: str) -> Row:
     """Returns the row of a survey whose scenario is not valid; its scenario hash is empty."""
-    identity = {"sample": sample.number, "seed": seed, "scenario_hash": "", "status": "refused", "reason": reason}
-    return identity | _varied(sample.values)
+    return _row((sample.number, seed), {"scenario_hash": ""}, "refused", reason, sample.values)
 
 
-def _varied(values: Mapping[str, Any]) -> Row:
-    return {f"vary.{key}": value for key, value in values.items()}
+def _row(key: tuple[int, int], identity: Row, status: str, reason: str, values: Mapping[str, Any]) -> Row:
+    row = {"sample": key[0], "seed": key[1], **identity, "status": status, "reason": reason}
+    return row | {f"vary.{name}": value for name, value in values.items()}
 
 
 def has_passed(row: Row) -> bool:
@@ -103,15 +105,10 @@ def flatten(metrics: Mapping[str, Any]) -> Row:
 
     Names of measured run times begin with "timing.". Top-level values, such as the status, are left out.
     """
-    row: Row = {}
-    for section, value in metrics.items():
-        if section == "tracks":
-            for track in value:
-                for name, entry in track.items():
-                    prefix = "timing." if name == "ga_ms" else ""
-                    row[f"{prefix}tracks.{track['track']}.{name}"] = entry
-        elif isinstance(value, Mapping):
-            row.update(_leaves(value, section + "."))
+    row = dict(_leaves({name: section for name, section in metrics.items() if isinstance(section, Mapping)}, ""))
+    for track in metrics.get("tracks", ()):
+        for name, value in track.items():
+            row[f"{'timing.' if name == 'ga_ms' else ''}tracks.{track['track']}.{name}"] = value
     return row
 
 

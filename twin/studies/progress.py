@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -25,9 +26,14 @@ class StudyProgress:
     """
 
     def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
-        self.total = self.done = self.passed = self.failed = self.refused = self.unmodelled = 0
+        self.total, self.ended = 0, Counter[str]()
         self.bar, self.print_surveys = bar, print_surveys
         self._task: Any = bar.add_task("", total=None, note="starting workers") if bar else None
+
+    @property
+    def done(self) -> int:
+        """Returns the number of surveys that have ended."""
+        return self.ended["all"]
 
     def begin(self, total: int) -> None:
         """Sets the number of surveys that this run flies in total."""
@@ -43,15 +49,11 @@ class StudyProgress:
 
     def add(self, row: Row) -> None:
         """Counts a survey that has ended, and updates the display."""
-        self.done += 1
-        self.passed += has_passed(row)
-        self.failed += row["status"] == "failed"
-        self.refused += row["status"] == "refused"
-        self.unmodelled += bool(row.get("unmodelled"))
-        if self.print_surveys and self.bar:
-            self.bar.console.print(survey_line(row), markup=False, highlight=False)
-        elif self.print_surveys:
-            print(f"{self.done}/{self.total} {survey_line(row)}; {self}", file=sys.stderr, flush=True)
+        self.ended.update(["all", row["status"]])
+        self.ended.update(passed=has_passed(row), unmodelled=bool(row.get("unmodelled")))
+        if self.print_surveys:
+            line = survey_line(row)
+            self.print_line(line if self.bar else f"{self.done}/{self.total} {line}; {self}")
         self._update_bar()
 
     def _update_bar(self) -> None:
@@ -59,12 +61,11 @@ class StudyProgress:
             self.bar.update(self._task, total=self.total, completed=self.done, note=str(self))
 
     def __str__(self) -> str:
-        evaluated = self.done - self.failed - self.refused
-        counts = {"failed": self.failed, "refused": self.refused}
-        failures = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        failures = ", ".join(f"{n} {status}" for status in ("failed", "refused") if (n := self.ended[status]))
+        evaluated = self.done - self.ended["failed"] - self.ended["refused"]
         if not evaluated:
             return failures
-        estimate = wilson_interval(self.passed, evaluated, unknown=self.unmodelled)
+        estimate = wilson_interval(self.ended["passed"], evaluated, unknown=self.ended["unmodelled"])
         passing = f"{100 * estimate.value:.0f} % pass ({100 * estimate.low:.0f} to {100 * estimate.high:.0f} %)"
         return f"{passing}, {failures}" if failures else passing
 

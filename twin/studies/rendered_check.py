@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from twin.judge.require import more_is_better
 from twin.studies import wording
-from twin.studies.analysis import StudyAnalysis
+from twin.studies.analysis import Mask, StudyAnalysis
 from twin.studies.flight import has_passed
+from twin.studies.results_log import key_of
 from twin.studies.runner import Fleet, check_results, open_folder
 from twin.studies.statistics import Array, Interval, wilson_interval
-from twin.studies.study_file import Study
 from twin.studies.surveys import Survey, samples, surveys
 
 FOLDER = "rendered"  #: subfolder of the results folder
@@ -26,8 +26,8 @@ FOLDER = "rendered"  #: subfolder of the results folder
 class RenderedCheck(NamedTuple):
     """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds."""
 
-    rendered: NDArray[np.bool_]  #: (n,) whether each rendered survey was completed and met every requirement
-    surrogate: NDArray[np.bool_]  #: (n,) whether each of the surrogate surveys was completed and met every requirement
+    rendered: Mask  #: (n,) whether each rendered survey was completed and met every requirement
+    surrogate: Mask  #: (n,) whether each of the surrogate surveys was completed and met every requirement
     interrupted: bool = False  #: whether Ctrl-C ended the check, so that some of the rendered surveys are missing
     has_limits: bool = True  #: whether the study has a limit, so that there are verdicts to check
     n_lost: int = 0  #: number of rendered surveys that were refused or failed, and therefore have no verdict
@@ -75,8 +75,8 @@ class RenderedCheck(NamedTuple):
         )
 
 
-def check(study: Study, analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> RenderedCheck:
-    """Flies rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
+def check(analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> RenderedCheck:
+    """Flies n rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
 
     Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
 
@@ -88,18 +88,19 @@ def check(study: Study, analysis: StudyAnalysis, n: int, folder: Path, fleet: Fl
             connection.
         OSError: the results cannot be written.
     """
-    nearest = nearest_surveys(analysis, n)
+    study, nearest = analysis.study, nearest_surveys(analysis, n)
     keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
     others = {sample.number for sample in samples(study)} - {number for number, _ in keys}  # some may be refused
-    found = (survey for survey in surveys(study, folder, without=others) if survey.key in keys)
-    chosen = {survey.key: _rendered(survey, folder / FOLDER) for survey in found}
+    found = surveys(study, folder / FOLDER, without=others)
+    chosen = {survey.key: _rendered(survey) for survey in found if survey.key in keys}
     with open_folder(folder / FOLDER, True) as log:
-        check_results(log, ((key, survey.scenario_hash) for key, survey in chosen.items()))
+        check_results(log, {key: survey.scenario_hash for key, survey in chosen.items()})
         done = log.done()
-        fleet.progress.begin(fleet.progress.done + len(set(keys) - done))
-        completed = fleet.fly(study, (chosen[key] for key in keys if key not in done), log.add)
+        missing = [key for key in keys if key not in done]
+        fleet.progress.begin(fleet.progress.done + len(missing))
+        completed = fleet.fly(study, (chosen[key] for key in missing), log.add)
         log.flush()
-    rows = {(row["sample"], row["seed"]): row for row in log.rows()}
+    rows = {key_of(row): row for row in log.rows()}
     flown = [k for k, key in enumerate(keys) if key in rows and rows[key]["status"] not in ("refused", "failed")]
     passed = np.array([has_passed(rows[keys[k]]) for k in flown], bool)
     n_lost = sum(key in rows for key in keys) - len(flown)
@@ -128,9 +129,9 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     """
     is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
     chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
-    values = {name: analysis.numbers(name)[chosen] for name in analysis.limits}
-    if not values:
+    if not analysis.limits:
         return np.zeros(0, np.int64)
+    values = {name: analysis.numbers(name)[chosen] for name in analysis.limits}
     excess = [_excess(values[name], limit) * (1 - 2 * more_is_better(name)) for name, limit in analysis.limits.items()]
     finite = np.isfinite(list(values.values())).all(axis=0)
     distance = np.abs(np.max(excess, axis=0))[finite]
@@ -144,9 +145,8 @@ def _excess(values: Array, limit: float) -> Array:
     return rank - np.searchsorted(ascending, limit, "right")
 
 
-def _rendered(survey: Survey, folder: Path) -> Survey:
-    """Returns the rendered survey with the scenario and seed of a surrogate survey, and a run folder in `folder`."""
+def _rendered(survey: Survey) -> Survey:
+    """Returns the rendered survey with the scenario and seed of a surrogate survey."""
     imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
     scenario = survey.scenario.model_copy(update={"imaging": imaging})
-    run_folder = folder / "runs" / survey.folder.name
-    return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint(), folder=run_folder)
+    return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint())

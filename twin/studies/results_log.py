@@ -5,7 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
@@ -17,6 +17,7 @@ import pyarrow.parquet as pq
 from twin.studies.flight import Row
 
 JOURNAL_FILE = "optuna.journal"  #: in the folder of a search, beside the log: its candidates
+_IDENTITY = ("sample", "seed", "status", "reason", "unmodelled", "warning", "fidelity", "scenario_hash")
 _CHUNK = 1000  # rows converted to columns at a time: 100,000 rows as dictionaries would take gigabytes
 
 
@@ -37,11 +38,7 @@ class ResultsLog:
             self.flush()
 
     def flush(self) -> None:
-        """Writes the rows that are still in memory.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+        """Writes the rows that are still in memory; raises OSError if the file cannot be written."""
         if not self._unwritten:
             return
         with self.file.open("a+b", buffering=0) as file:
@@ -67,18 +64,15 @@ class ResultsLog:
 
     def done(self) -> set[tuple[int, int]]:
         """Returns (sample, seed) of every survey whose last row does not have the status "failed"."""
-        status = {(row["sample"], row["seed"]): row["status"] for row in self.rows()}
+        status = {key_of(row): row["status"] for row in self.rows()}
         return {key for key, last in status.items() if last != "failed"}
 
     def table(self, wanted: Container[tuple[int, int]] | None = None) -> pa.Table:
-        """Returns the last row of each survey as a table, sorted by sample and seed.
+        """Returns the last row of each of the `wanted` surveys (None: of all) as a table, sorted by sample and seed.
 
         The table does not depend on the order in which the rows were written.
-
-        Args:
-            wanted: (sample, seed) of the surveys to include; None for all.
         """
-        last = {(row["sample"], row["seed"]): number for number, row in enumerate(self.rows())}
+        last = {key_of(row): number for number, row in enumerate(self.rows())}
         included = {number for key, number in last.items() if wanted is None or key in wanted}
 
         def included_rows() -> Iterator[Row]:
@@ -94,7 +88,12 @@ class ResultsLog:
         if not chunks:
             return pa.table({})
         whole = pa.concat_tables(chunks).sort_by([("sample", "ascending"), ("seed", "ascending")])
-        return whole.select(_sorted_columns(whole.column_names)).combine_chunks()
+        return whole.select(sorted(whole.column_names, key=_column_order)).combine_chunks()
+
+
+def key_of(row: Row) -> tuple[int, int]:
+    """Returns (sample, seed) of the survey of a row."""
+    return row["sample"], row["seed"]
 
 
 def _line_end(file: IO[bytes], end: int) -> bytes:
@@ -106,37 +105,25 @@ def _line_end(file: IO[bytes], end: int) -> bytes:
 
 
 def write_parquet(rows: pa.Table, file: Path) -> None:
-    """Writes a table to a Parquet file atomically.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
+    """Writes a table to a Parquet file atomically; raises OSError if the file cannot be written."""
     part = file.with_name(f".{file.name}.part")
     pq.write_table(rows, part)
     part.replace(file)
 
 
-def _sorted_columns(names: Iterable[str]) -> list[str]:
-    """Returns the names of the columns in four sections: identity, varied keys, metrics, timing."""
-    identity = ("sample", "seed", "status", "reason", "unmodelled", "warning", "fidelity", "scenario_hash")
-    sections = {"vary": 1, "timing": 3}
-
-    def sort_key(name: str) -> tuple[int, int, str]:
-        if name in identity:
-            return 0, identity.index(name), name
-        return sections.get(name.partition(".")[0], 2), 0, name
-
-    return sorted(names, key=sort_key)
+def _column_order(name: str) -> tuple[int, int, str]:
+    """Returns the sort key of a column: identity, varied keys, metrics, timing."""
+    if name in _IDENTITY:
+        return 0, _IDENTITY.index(name), name
+    return {"vary": 1, "timing": 3}.get(name.partition(".")[0], 2), 0, name
 
 
 def _type(value: Any) -> pa.DataType:
     """Returns the column type of a value; lists and dictionaries are stored as JSON text."""
     if value is None:
         return pa.null()
-    for kind, column in ((bool, pa.bool_()), (int, pa.int64()), (float, pa.float64())):
-        if isinstance(value, kind):
-            return column
-    return pa.string()
+    kinds = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+    return kinds.get(type(value), pa.string())
 
 
 def _common_type(one: pa.DataType, other: pa.DataType) -> pa.DataType:

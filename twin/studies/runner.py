@@ -4,21 +4,20 @@ from __future__ import annotations
 
 import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
-from twin.engines.engine import Engine, Outcome
-from twin.engines.worker import TaskLimits
+from twin.engines.engine import Engine
+from twin.engines.worker import Outcome, TaskLimits
 from twin.errors import TwinError
-from twin.studies.agreement import write_document
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import Row, fly, refused_row, row_of
 from twin.studies.progress import StudyProgress
-from twin.studies.report import write_report
-from twin.studies.results_log import JOURNAL_FILE, ResultsLog, write_parquet
+from twin.studies.report import write_agreement, write_report
+from twin.studies.results_log import JOURNAL_FILE, ResultsLog, key_of, write_parquet
 from twin.studies.study_file import Study
 from twin.studies.surveys import Survey, refusals, samples, seeds_of_sample, survey_keys, surveys
 
@@ -44,8 +43,8 @@ class StudyResult(NamedTuple):
 class Fleet(NamedTuple):
     """Workers that fly surveys in parallel."""
 
-    engine: Engine  #: runs the surveys
-    progress: StudyProgress  #: display of the progress
+    engine: Engine
+    progress: StudyProgress
     function: Callable[[Survey], Row] = fly  #: flies one survey; must be importable by name on the workers
 
     def fly(self, study: Study, missing: Iterable[Survey], add_row: Callable[[Row], None]) -> bool:
@@ -93,8 +92,8 @@ def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyRe
         write_errors = _write_errors(
             log.flush,
             lambda: write_parquet(analysis.rows, folder / "results.parquet"),
-            lambda: write_report(study, analysis, page),
-            lambda: write_document(analysis, folder),
+            lambda: write_report(analysis, page),
+            lambda: write_agreement(analysis, folder),
         )
         return StudyResult(analysis, page, write_errors, interrupted, throughput)
 
@@ -105,26 +104,18 @@ def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLo
     Raises:
         TwinError: the log has the results of another study.
     """
-    check_results(log, _identities(study, folder, refused))
+    hashes = {survey.key: survey.scenario_hash for survey in surveys(study, folder, without=refused)}
+    refusals_of = [sample for sample in samples(study) if sample.number in refused]
+    rows = [refused_row(one, seed, refused[one.number]) for one in refusals_of for seed in seeds_of_sample(study, one)]
+    hashes |= {key_of(row): "" for row in rows}
+    check_results(log, hashes)
     done = log.done()
-    if done and done.isdisjoint(survey_keys(study)):
+    if done and done.isdisjoint(hashes):
         raise _another_study(log)
-    for row in _refused_rows(study, refused):
-        if (row["sample"], row["seed"]) not in done:
+    for row in rows:
+        if key_of(row) not in done:
             log.add(row)
     return (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
-
-
-def _identities(study: Study, folder: Path, refused: dict[int, str]) -> Iterator[tuple[tuple[int, int], str]]:
-    """Yields ((sample, seed), scenario hash) of every survey; the hash is empty for the surveys of a refused sample."""
-    yield from ((survey.key, survey.scenario_hash) for survey in surveys(study, folder, without=refused))
-    yield from (((row["sample"], row["seed"]), "") for row in _refused_rows(study, refused))
-
-
-def _refused_rows(study: Study, refused: dict[int, str]) -> Iterator[Row]:
-    for sample in samples(study) if refused else ():
-        if sample.number in refused:
-            yield from (refused_row(sample, seed, refused[sample.number]) for seed in seeds_of_sample(study, sample))
 
 
 def refusal_notice(refused: dict[int, str]) -> str:
@@ -167,16 +158,11 @@ def _is_results_folder(names: set[str], log: ResultsLog, search: bool) -> bool:
     return log.file.name in names and (has_journal == search or (search and not any(log.rows())))
 
 
-def check_results(log: ResultsLog, planned: Iterable[tuple[tuple[int, int], str]]) -> None:
-    """Raises TwinError if the log has a row of another scenario.
-
-    Args:
-        planned: ((sample, seed), scenario hash) of each survey of the study.
-    """
-    hashes = {(row["sample"], row["seed"]): row["scenario_hash"] for row in log.rows()}
-    for key, scenario_hash in planned if hashes else ():
-        if hashes.get(key, scenario_hash) != scenario_hash:
-            raise _another_study(log)
+def check_results(log: ResultsLog, planned: Mapping[tuple[int, int], str]) -> None:
+    """Raises TwinError if the log has a row of another scenario than planned: {(sample, seed): scenario hash}."""
+    flown = {key_of(row): row["scenario_hash"] for row in log.rows()}
+    if any(planned.get(key, scenario_hash) != scenario_hash for key, scenario_hash in flown.items()):
+        raise _another_study(log)
 
 
 def _another_study(log: ResultsLog) -> TwinError:

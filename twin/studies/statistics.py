@@ -26,16 +26,17 @@ class Interval(NamedTuple):
     high: float
 
 
+UNDEFINED = Interval(np.nan, np.nan, np.nan)
+
+
 def wilson_interval(successes: float, n: float, level: float = LEVEL, unknown: int = 0) -> Interval:
     """Returns the proportion of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
     The bounds are (p + z^2 / (2 n) +- z sqrt(p (1 - p) / n + z^2 / (4 n^2))) / (1 + z^2 / n), with the proportion p
     and the normal quantile z of (1 + level) / 2. Without trials, the proportion is NaN and the interval is 0 to 1.
 
-    Args:
-        level: confidence level, 0 to 1.
-        unknown: number of further trials whose outcome is unknown: they count as failures at the lower bound and as
-            successes at the upper bound.
+    `unknown` further trials, whose outcome is unknown, count as failures at the lower and as successes at the upper
+    bound.
     """
     if unknown:
         worst, best = (wilson_interval(successes + k, n + unknown, level) for k in (0, unknown))
@@ -63,7 +64,6 @@ def clustered_proportion(
         passed: (n,) whether each survey passed.
         clusters: (n,) cluster label of each survey: the number of its sample, or its seed.
         unknown: (n,) whether the result of each survey is unknown; see `wilson_interval`.
-        level: confidence level, 0 to 1.
     """
     success = np.asarray(passed, dtype=float)
     if len(success) == 0:
@@ -77,12 +77,7 @@ def clustered_proportion(
 
 
 def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:
-    """Returns the effective number of surveys for a proportion, at most their number; see `clustered_proportion`.
-
-    Args:
-        passed: (n,) whether each survey passed.
-        clusters: (n,) cluster label of each survey.
-    """
+    """Returns the effective number of surveys for a proportion, at most their number; see `clustered_proportion`."""
     success = np.asarray(passed, dtype=float)
     labels, index = np.unique(np.asarray(clusters), return_inverse=True)
     n, k = len(success), len(labels)
@@ -99,15 +94,7 @@ def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, l
 
     For n effective surveys and an observed proportion p, the interval contains r if (p - r)^2 <= z^2 r (1 - r) / n,
     where z is the normal quantile of (1 + level) / 2. If p stays the same, n = z^2 r (1 - r) / (p - r)^2 effective
-    surveys are therefore needed.
-
-    Args:
-        passed: (n,) whether each survey passed.
-        clusters: (n,) cluster label of each survey.
-        required: required proportion r, 0 to 1.
-
-    Returns:
-        The number of surveys, at least 1; infinite if p equals r, if r is 1, or if no survey is given.
+    surveys are therefore needed. The result is at least 1, and infinite if p equals r, if r is 1, or without surveys.
     """
     success = np.asarray(passed, dtype=float)
     difference = float(success.mean()) - required if len(success) else 0.0
@@ -124,18 +111,18 @@ def bootstrap_interval(
 ) -> Interval:
     """Returns a statistic of the data with its percentile bootstrap interval; whole clusters are resampled.
 
+    It is NaN without data. The bounds are NaN if there are fewer than five clusters, or if both bounds are equal: data
+    without variation do not show how much further data would vary.
+
     Args:
         values: (n,) data.
+        statistic: function of data (..., n).
         clusters: (n,) label of the cluster of each value; None if the values are independent.
-
-    Returns:
-        The statistic with its interval; NaN without data. The bounds are NaN if there are fewer than five clusters, or
-        if both bounds are equal: data without variation do not show how much further data would vary.
     """
     data = np.asarray(values, dtype=float)
     table = _by_cluster(data, np.arange(len(data)) if clusters is None else np.asarray(clusters))
     if len(table) == 0:
-        return Interval(np.nan, np.nan, np.nan)
+        return UNDEFINED
     value = float(statistic(table.reshape(-1)))
     if len(table) < _MIN_CLUSTERS:
         return Interval(value, np.nan, np.nan)
@@ -182,7 +169,7 @@ def rank_correlation(x: ArrayLike, y: ArrayLike) -> Interval:
     """
     a, b = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if len(a) < 5 or np.ptp(a) == 0 or np.ptp(b) == 0:
-        return Interval(np.nan, np.nan, np.nan)
+        return UNDEFINED
     result: Any = stats.spearmanr(a, b)
     r = float(result.statistic)
     z = float(stats.norm.ppf(0.5 + LEVEL / 2)) * np.sqrt((1 + r**2 / 2) / (len(a) - 3))
@@ -197,10 +184,6 @@ def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
     1 - (within / (n - k)) / (total / (n - 1)) for n values in k groups, where `within` is the sum of squared deviations
     of the ranks from their group means, and `total` the sum of squared deviations from the overall mean.
     It is at least 0, and NaN if there are fewer than five values per group on average, only one group, or a constant y.
-
-    Args:
-        groups: (n,) group of each value.
-        y: (n,) values.
     """
     ranks = stats.rankdata(y)
     n, k = len(ranks), len(np.unique(groups))
@@ -250,9 +233,6 @@ def group_indices(x: ArrayLike) -> NDArray[np.int64]:
 
     If there are at most 12 distinct values, and fewer than n, each distinct value is a group. Otherwise, the numbers
     are divided into 2 to 10 bins of about equal count; equal numbers may be in different bins.
-
-    Args:
-        x: (n,) numbers.
     """
     values = np.asarray(x, dtype=float)
     distinct, index = np.unique(values, return_inverse=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,13 +15,12 @@ from twin.judge.metrics import empty_metrics
 from twin.judge.require import SIGNED, check_metric_names
 from twin.scenario.file import find_scene, load_scenario, read_toml, shown, validated
 from twin.scenario.model import Section, Source
-from twin.studies.distribution import KINDS, Distribution
+from twin.studies.distribution import KINDS, Array, Distribution, equally_probable
 
 SamplingMethod = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KeepLevel = Literal["all", "report", "metrics", "none"]
 #: Largest number of surveys of a study; limited because all scenarios are validated before the first survey is flown.
 MAX_SURVEYS = 100_000
-_OBJECTIVES = "tune.objectives"
 FIDELITIES = {"rendered", "surrogate"}  #: values of imaging.fidelity in a study with `compare`
 DEFAULT_METRICS = (
     "trajectory.final.ate_rmse_m", "map.le90_area_m", "map.completeness_area", "map.le90_m", "map.completeness",
@@ -36,6 +35,20 @@ class JointValues(Section):
     rows: Annotated[tuple[tuple[Any, ...], ...], Field(min_length=1)] = Field(
         description="one value per key in each row; all rows have equal probability"
     )
+
+    @property
+    def values(self) -> tuple[tuple[Any, ...], ...]:
+        """Returns the rows, as `Distribution.values`."""
+        return self.rows
+
+    @property
+    def is_sampled(self) -> bool:
+        """Returns True, as `Distribution.is_sampled`."""
+        return True
+
+    def quantiles(self, probability: Array) -> list[tuple[Any, ...]]:
+        """Returns the row at each probability (n,), 0 to 1."""
+        return equally_probable(self.rows, probability)
 
 
 class SamplingConfig(Section):
@@ -159,13 +172,22 @@ class Study(Section):
         """Returns every key that varies, alone or jointly with others."""
         return [*self.vary, *(key for table in self.together for key in table.keys)]
 
+    def axes(self, listed: bool) -> dict[str | tuple[str, ...], Distribution | JointValues]:
+        """Returns the varied keys, or jointly varied ones, whose values are listed as a grid, or else are sampled."""
+        is_grid, joint = self.sampling.method == "grid", {table.keys: table for table in self.together}
+        laws: dict[Any, Any] = {**self.vary, **joint}
+        return {keys: law for keys, law in laws.items() if (is_grid or not law.is_sampled) == listed}
+
+    @property
+    def n_surveys(self) -> int:
+        """Returns the number of surveys, without enumerating them."""
+        plan, n_axes = self.sampling, len(self.axes(listed=False))
+        points = (plan.samples or 1) * (n_axes + 2 if plan.method == "saltelli" and n_axes else 1)
+        return points * math.prod(len(law.values) for law in self.axes(listed=True).values()) * plan.seeds
+
     @property
     def scenario_file(self) -> Path:
-        """Returns the path of the scenario file whose keys the study varies.
-
-        Raises:
-            ScenarioError: there is no such file.
-        """
+        """Returns the path of the scenario file whose keys the study varies; raises ScenarioError if there is none."""
         relative = self.source.path.parent / self.scenario
         return find_scene(relative if is_file(relative) else self.scenario)
 
@@ -177,17 +199,18 @@ def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
         ScenarioError: a file does not exist or is not valid; lists the errors of the study file or, if it has none,
             those of the scenario file, each as `FILE:LINE: key: problem (allowed: ...)`.
     """
-    file = find_study(path)
+    file = _find_study(path)
     tree, lines = read_toml(file)
     source = Source(path=file, lines=lines, allow_plugins=allow_plugins)
     for node, section in ((tree, "vary"), (tree, "set"), (tree.get("tune"), "search")):
         if isinstance(node, dict) and isinstance(node.get(section), dict):
-            node[section] = dict(flatten_keys(node[section]))
+            node[section] = dict(_flat_keys(node[section]))
     study = validated(tree, Study, source)
     study._source = source
     if study.name is None:
         study = study.model_copy(update={"name": file.stem})
-    errors = [source.describe(error) for error in _errors(study)]
+    rules = (*_key_rules(study), *_sampling_rules(study), *_metric_rules(study), *_goal_rules(study))
+    errors = [source.describe(TwinError(*error)) for is_broken, *error in rules if is_broken]
     if errors:
         raise ScenarioError(errors)
     # reports the errors of the scenario itself with its own line numbers
@@ -195,12 +218,8 @@ def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     return study
 
 
-def find_study(path: str | Path) -> Path:
-    """Returns the path of a study file.
-
-    Raises:
-        ScenarioError: there is neither such a file nor such a name.
-    """
+def _find_study(path: str | Path) -> Path:
+    """Returns the path of a study file; raises ScenarioError if there is neither such a file nor such a name."""
     from twin import scenes
 
     folder = Path(scenes.__file__).parent / "studies"
@@ -211,115 +230,95 @@ def find_study(path: str | Path) -> Path:
     raise ScenarioError([f"{shown(str(path))}: no such study (allowed: a file, or one of {names})"])
 
 
-def flatten_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flat_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
-            yield from flatten_keys(value, f"{prefix}{key}.")
+            yield from _flat_keys(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
 
 
-def _errors(study: Study) -> Iterable[TwinError]:
-    """Yields the errors that pydantic's validation of single fields does not find."""
-    for errors in (_key_errors, _table_errors, _sampling_errors, _metric_errors):
-        yield from errors(study)
+def named_keys(study: Study) -> Iterator[tuple[str, str]]:
+    """Yields (dotted name in the study file, key of the scenario) for every key that is set, varied or searched."""
+    yield from ((f"{table}.{key}", key) for table in ("set", "vary") for key in getattr(study, table))
+    yield from ((f"together.{k}.keys", key) for k, table in enumerate(study.together) for key in table.keys)
+    yield from ((f"tune.search.{key}", key) for key in (study.tune.search if study.tune else ()))
+
+
+#: A rule that the validation of single fields does not check: whether it is broken; field, problem, allowed values.
+Rule = tuple[bool, str, str, str]
+
+
+def _key_rules(study: Study) -> Iterator[Rule]:
+    """Yields the rules for the names of keys and for the tables of joint values."""
+    first: dict[str, str] = {}
+    for name, key in named_keys(study):
+        other, is_seed, section = first.setdefault(key, name), key == "seed", key.partition(".")[0]
+        yield is_seed, name, "the seed cannot be set or varied here", "sampling.seed and sampling.seeds"
+        yield section == "require", name, "cannot be set or varied", "[require]"
+        yield section == "extends", name, "cannot be set or varied", "scenario"
+        yield other != name and not is_seed, name, f"is already given by {other}", "each key once"
+    for k, table in enumerate(study.together):
+        n = len(table.keys)
+        for row, values in enumerate(table.rows):
+            problem = f"row {row} has {len(values)} values"
+            yield len(values) != n, f"together.{k}.rows", problem, f"{n}, one per key"
+
+
+def _sampling_rules(study: Study) -> Iterator[Rule]:
+    """Yields the rules for the method and the number of samples."""
+    method, n, field = study.sampling.method, study.sampling.samples, "sampling.samples"
+    is_grid, is_sampled = method == "grid", bool(study.axes(listed=False))
+    yield is_grid and n is not None, field, "a grid determines the number of samples", "no value"
+    for key, law in study.vary.items():
+        problem = f"{law.kind} has no list of values"
+        yield is_grid and law.kind not in ("grid", "choice"), f"vary.{key}", problem, "grid or choice"
+    useless = not is_grid and not is_sampled and n not in (None, 1)
+    yield useless, field, "no key is sampled, so all samples are equal", "sampling.seeds"
+    yield is_sampled and n is None, field, "missing", "a number of samples"
+    m = n or 1
+    no_power = is_sampled and method in ("sobol", "saltelli") and m & (m - 1) != 0
+    yield no_power, field, f"{m} is not a power of 2", f"a power of 2, e.g. {1 << m.bit_length()}"
+    allowed = f"up to {MAX_SURVEYS}: fewer sampling.samples, sampling.seeds or values of grids"
+    yield study.n_surveys > MAX_SURVEYS, "sampling", f"{study.n_surveys} surveys are too many", allowed
+    for key in study.axes(listed=True) if method == "saltelli" else ():
+        yield True, f"vary.{key}", "a grid has no Sobol index", "choice, or another sampling.method"
+
+
+def _metric_rules(study: Study) -> Iterator[Rule]:
+    """Yields the rules for the names of metrics, and for the keys of the search."""
+    known, tune = empty_metrics(), study.tune
+    objectives = [name for name in tune.objectives if name != "risk"] if tune else []
+    named = {"": study.limits, "show": study.show, "compare": study.compare, "tune.objectives": objectives}
+    for field, name in ((field, name) for field, names in named.items() for name in names):
+        try:
+            check_metric_names([name], known)
+        except TwinError as error:
+            yield True, field or error.field, f"{name}: {error.problem}" if field else error.problem, error.allowed
+    for key, law in tune.search.items() if tune else ():
+        cannot, allowed = law.kind not in ("uniform", "log_uniform", "choice"), "uniform, log_uniform or choice"
+        yield cannot, f"tune.search.{key}", f"{law.kind} cannot be searched", allowed
+
+
+def _goal_rules(study: Study) -> Iterator[Rule]:
+    """Yields the rules for the comparison of both fidelities, the required probability, and the scenario."""
+    fidelity = study.vary.get("imaging.fidelity")
+    for name in study.compare:
+        problem = f"{name} can be negative, but the ratio of its medians is compared"
+        yield name in SIGNED, "compare", problem, "metrics that are never negative, such as map.rmse_m"
+    has_both = fidelity is not None and fidelity.grid is not None and set(fidelity.grid) == FIDELITIES
+    single, allowed = bool(study.compare) and not has_both, "vary.imaging.fidelity with a grid of both"
+    yield single, "compare", "needs surveys of both fidelities", allowed
+    if study.seek is not None:
+        law = study.vary.get(study.seek)
+        is_numeric = law is not None and all(isinstance(value, int | float) for value in law.values)
+        yield not is_numeric, "seek", f"{study.seek!r} is not a varied numeric key", "a key of [vary] with numbers"
+        yield study.probability is None, "seek", "needs a required pass probability", "require.probability"
+    if study.probability is not None:
+        outside = not 0 <= study.probability <= 1
+        yield outside, "require.probability", f"{study.probability:g}: not allowed", "0 to 1"
     try:
         _ = study.scenario_file
     except ScenarioError as error:
-        yield TwinError("scenario", error.lines[0])
-
-
-def _key_errors(study: Study) -> Iterable[TwinError]:
-    seen: dict[str, str] = {}
-    for study_key, key in named_keys(study):
-        if key == "seed":
-            yield TwinError(study_key, "the seed cannot be set or varied here", "sampling.seed and sampling.seeds")
-        elif key.partition(".")[0] in ("require", "extends"):
-            yield TwinError(study_key, "cannot be set or varied", "[require]" if key.startswith("r") else "scenario")
-        elif key in seen:
-            yield TwinError(study_key, f"is already given by {seen[key]}", "each key once")
-        seen.setdefault(key, study_key)
-
-
-def named_keys(study: Study) -> Iterator[tuple[str, str]]:
-    """Yields (dotted name in the study file, key of the scenario) for every key that is set, varied or searched."""
-    yield from ((f"set.{key}", key) for key in study.set)
-    yield from ((f"vary.{key}", key) for key in study.vary)
-    for k, table in enumerate(study.together):
-        yield from ((f"together.{k}.keys", key) for key in table.keys)
-    if study.tune is not None:
-        yield from ((f"tune.search.{key}", key) for key in study.tune.search)
-
-
-def _table_errors(study: Study) -> Iterable[TwinError]:
-    for k, table in enumerate(study.together):
-        for row, values in enumerate(table.rows):
-            if len(values) != (n_keys := len(table.keys)):
-                yield TwinError(f"together.{k}.rows", f"row {row} has {len(values)} values", f"{n_keys}, one per key")
-
-
-def _sampling_errors(study: Study) -> Iterable[TwinError]:
-    sampling = study.sampling
-    sampled = [key for key, distribution in study.vary.items() if distribution.is_sampled]
-    if sampling.method == "grid":
-        if sampling.samples is not None:
-            yield TwinError("sampling.samples", "a grid determines the number of samples", "no value")
-        for key in sampled:
-            if study.vary[key].kind != "choice":
-                yield TwinError(f"vary.{key}", f"{study.vary[key].kind} has no list of values", "grid or choice")
-    elif not sampled and not study.together:
-        if sampling.samples not in (None, 1):
-            yield TwinError("sampling.samples", "no key is sampled, so all samples are equal", "sampling.seeds")
-    elif sampling.samples is None:
-        yield TwinError("sampling.samples", "missing", "a number of samples")
-    elif sampling.method in ("sobol", "saltelli") and sampling.samples & (sampling.samples - 1):
-        power = 1 << sampling.samples.bit_length()
-        yield TwinError("sampling.samples", f"{sampling.samples} is not a power of 2", f"a power of 2, e.g. {power}")
-    if (n_surveys := n_planned_surveys(study)) > MAX_SURVEYS:
-        remedy = "fewer sampling.samples, sampling.seeds or values of grids"
-        yield TwinError("sampling", f"{n_surveys} surveys are too many", f"up to {MAX_SURVEYS}: {remedy}")
-    if sampling.method == "saltelli":
-        for key in study.vary.keys() - set(sampled):
-            yield TwinError(f"vary.{key}", "a grid has no Sobol index", "choice, or another sampling.method")
-
-
-def n_planned_surveys(study: Study) -> int:
-    """Returns the number of surveys of a study, without enumerating them."""
-    sampling = study.sampling
-    is_grid = sampling.method == "grid"
-    cells = math.prod(len(d.values) for d in study.vary.values() if is_grid or not d.is_sampled)
-    tables = math.prod(len(table.rows) for table in study.together) if is_grid else 1
-    n_axes = sum(d.is_sampled for d in study.vary.values()) + len(study.together)
-    points = (sampling.samples or 1) * (n_axes + 2 if sampling.method == "saltelli" and n_axes else 1)
-    return (1 if is_grid else points) * cells * tables * sampling.seeds
-
-
-def _metric_errors(study: Study) -> Iterable[TwinError]:
-    tune, fidelity = study.tune, study.vary.get("imaging.fidelity")
-    objectives = [name for name in tune.objectives if name != "risk"] if tune else []
-    known = empty_metrics()
-    for key, names in (("", study.limits), ("show", study.show), ("compare", study.compare), (_OBJECTIVES, objectives)):
-        for name in names:
-            try:
-                check_metric_names([name], known)
-            except TwinError as error:
-                yield TwinError(key, f"{name}: {error.problem}", error.allowed) if key else error
-    for key, distribution in tune.search.items() if tune else ():
-        if distribution.kind not in ("uniform", "log_uniform", "choice"):
-            allowed = "uniform, log_uniform or choice"
-            yield TwinError(f"tune.search.{key}", f"{distribution.kind} cannot be searched", allowed)
-    for name in study.compare:
-        if name in SIGNED:
-            problem = f"{name} can be negative, but the ratio of its medians is compared"
-            yield TwinError("compare", problem, "metrics that are never negative, such as map.rmse_m")
-    if study.compare and (fidelity is None or fidelity.grid is None or set(fidelity.grid) != FIDELITIES):
-        yield TwinError("compare", "needs surveys of both fidelities", "vary.imaging.fidelity with a grid of both")
-    if study.seek is not None:
-        distribution = study.vary.get(study.seek)
-        if distribution is None or not all(isinstance(value, int | float) for value in distribution.values):
-            yield TwinError("seek", f"{study.seek!r} is not a varied numeric key", "a key of [vary] with numbers")
-        if study.probability is None:
-            yield TwinError("seek", "needs a required pass probability", "require.probability")
-    if study.probability is not None and not 0 <= study.probability <= 1:
-        yield TwinError("require.probability", f"{study.probability:g}: not allowed", "0 to 1")
+        yield True, "scenario", error.lines[0], ""

@@ -36,28 +36,25 @@ def metric_name(metric: str) -> str:
     return _METRIC_NAMES.get(metric, metric)
 
 
+def metric_heading(metric: str) -> str:
+    """Returns the readable name of a metric with a capital first letter."""
+    name = metric_name(metric)
+    return name[:1].upper() + name[1:]
+
+
 def metric_value(metric: str, value: float | None) -> str:
     """Returns the value of a metric with its unit; `risk` in percent; a dash for None, NaN and infinity."""
     if metric == "risk":
         return percent(value)
     if value is None or not np.isfinite(value):
         return DASH
-    if metric.endswith("_m"):
-        return length(value)
-    return with_unit(metric, float(value))
+    return length(value) if metric.endswith("_m") else with_unit(metric, float(value))
 
 
 def metric_interval(metric: str, interval: Interval) -> str:
     """Returns the estimate of a metric, with its confidence interval in brackets unless the bounds are not finite."""
-    low, high = metric_value(metric, interval.low), metric_value(metric, interval.high)
-    bounds = f" ({low} to {high})" if np.isfinite(interval.low) else ""
-    return metric_value(metric, interval.value) + bounds
-
-
-def metric_heading(metric: str) -> str:
-    """Returns the readable name of a metric with a capital first letter."""
-    name = metric_name(metric)
-    return name[:1].upper() + name[1:]
+    value, low, high = (metric_value(metric, number) for number in interval)
+    return f"{value} ({low} to {high})" if np.isfinite(interval.low) else value
 
 
 def correlation(interval: Interval) -> str:
@@ -67,34 +64,42 @@ def correlation(interval: Interval) -> str:
     return f"{interval.value:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
 
 
-def percent_interval(interval: Interval) -> str:
-    """Returns a fraction in percent with its confidence interval in brackets."""
-    return f"{percent(interval.value)} ({percent(interval.low)} to {percent(interval.high)})"
+def percent_interval(interval: Interval, label: str = "") -> str:
+    """Returns a fraction in percent with its confidence interval, after a label, in brackets."""
+    return f"{percent(interval.value)} ({label}{percent(interval.low)} to {percent(interval.high)})"
 
 
 def confidence(interval: Interval) -> str:
     """Returns a fraction in percent with its confidence interval and confidence level in brackets."""
-    return f"{percent(interval.value)} ({_labelled(percent(interval.low), percent(interval.high))})"
+    return percent_interval(interval, f"{percent(LEVEL)} confidence interval: ")
 
 
-def headline(study: Study, analysis: StudyAnalysis) -> str:
+def counted(n: int, noun: str) -> str:
+    """Returns a number with its noun, e.g. "1 survey" or "2 surveys"."""
+    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def headline(analysis: StudyAnalysis) -> str:
     """Returns the main results of a study as text.
 
     They are the answer for the key that `seek` of the study names, the pass probability, whether the requirement is
     met, the most frequent reason if no survey passed, the numbers of surveys that are not counted, and the most
     frequent warning. Without an evaluated survey, only the numbers of surveys that are not counted are given.
     """
-    n = int(analysis.evaluated.sum())
-    left_out = _refused(analysis) + _duplicates(analysis) + _failed(analysis) + _not_flown(analysis)
+    n, study = int(analysis.evaluated.sum()), analysis.study
+    left_out = [*_refused(analysis), *_duplicates(analysis), *_failed(analysis), *_not_flown(analysis)]
     if n == 0:
-        return "No survey could be evaluated." + left_out
-    sought = [] if study.seek is None else analysis.answers.get(study.seek, [])
-    answer = answer_sentence(study.seek, sought, study.probability) + " " if study.seek and sought else ""
-    return (
-        f"{answer}The pass probability is {confidence(analysis.pass_probability)}: "
-        f"{int(analysis.passed.sum())} of {n} surveys {_passing(analysis)}."
-        f"{_requirement(analysis)}{_main_reason(analysis)}{left_out}{_warnings(analysis)}"
+        return " ".join(["No survey could be evaluated.", *left_out])
+    sought = {} if study.seek is None else {study.seek: analysis.answers.get(study.seek)}
+    limits = [f"{metric_name(m)} {limit_relation(m)} {metric_value(m, v)}" for m, v in analysis.limits.items()]
+    completed = "were completed" + (" with " + " and ".join(limits) if limits else "")
+    result = (
+        f"The pass probability is {confidence(analysis.pass_probability)}: "
+        f"{int(analysis.passed.sum())} of {n} surveys {completed}."
     )
+    answers = [answer_sentence(key, found, study.probability) for key, found in sought.items() if found]
+    conclusions = [*_requirement(analysis), *_main_reason(analysis)]
+    return " ".join([*answers, result, *conclusions, *left_out, *_warnings(analysis)])
 
 
 def answer_lines(analysis: StudyAnalysis) -> list[str]:
@@ -118,30 +123,24 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
     )
     constant = f"{key} has one value only. " if len(answers) == 1 and answers[0].low == answers[0].high else ""
     fraction = f"at least {percent(required)} of surveys pass"
-    parts = []
+    parts = [f"no value of {key} is known at which {fraction}"]
     if passes:
-        parts.append(f"{fraction} at {key} {_labels(passes)}")
-    else:
-        parts.append(f"no value of {key} is known at which {fraction}")
+        parts = [f"{fraction} at {key} {_labels(passes)}"]
     if fails:
         parts.append(f"fewer pass at {_labels(fails)}")
     if undecided:
-        n = sum(answer.surveys for answer in undecided)
-        verb = "is" if len(undecided) == 1 else "are"
+        n, verb = sum(answer.surveys for answer in undecided), "is" if len(undecided) == 1 else "are"
         unknown = sum(answer.unknown for answer in undecided)
         of_them = f", {unknown} of them unknown" if unknown else ""
-        parts.append(f"{_labels(undecided)} {verb} not decided with {_count(n)}{of_them} ({_more(undecided)})")
+        more = _more(undecided)
+        parts.append(f"{_labels(undecided)} {verb} not decided with {counted(n, 'survey')}{of_them} ({more})")
     text = "; ".join(parts) + "."
     return constant + text[:1].upper() + text[1:]
 
 
 def _labels(answers: list[Answer]) -> str:
-    labels = [answer.label for answer in answers]
-    return " and ".join([", ".join(labels[:-1]), labels[-1]]) if len(labels) > 1 else labels[0]
-
-
-def _count(surveys: int) -> str:
-    return f"{surveys} survey" + ("" if surveys == 1 else "s")
+    *first, last = (answer.label for answer in answers)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _more(undecided: list[Answer]) -> str:
@@ -156,56 +155,16 @@ def _more(undecided: list[Answer]) -> str:
 
 
 def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
-    """Returns a phrase with the number of surveys flown, their rate, and their mean run time.
-
-    Args:
-        wall_s: wall time [s].
-        worker_s: sum of the surveys' run times on the workers [s].
-    """
+    """Returns a phrase with the number of surveys flown in a wall time [s], their rate, and their mean run time."""
     return (
         f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} per minute; "
         f"mean run time {worker_s / surveys:.2f} s"
     )
 
 
-def _labelled(low: str, high: str) -> str:
-    return f"{percent(LEVEL)} confidence interval: {low} to {high}"
-
-
-def _warnings(analysis: StudyAnalysis) -> str:
-    """Returns a sentence, after a space, on the surveys that have a warning; "" if none has."""
-    different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)
-    warned = int((different != "").sum())
-    return f" Warning in {warned} of {len(different)} surveys: {texts[0].rstrip('.')}." if texts else ""
-
-
-def _main_reason(analysis: StudyAnalysis) -> str:
-    """Returns a sentence with the most frequent reason why surveys did not pass; "" if a survey passed."""
-    if analysis.passed.any() or not analysis.failure_reasons:
-        return ""
-    return f" The most frequent reason: {analysis.failure_reasons[0].reason}."
-
-
-def _passing(analysis: StudyAnalysis) -> str:
-    limits = [f"{metric_name(m)} {limit_relation(m)} {metric_value(m, v)}" for m, v in analysis.limits.items()]
-    return "were completed" + (" with " + " and ".join(limits) if limits else "")
-
-
 def limit_relation(metric: str) -> str:
     """Returns "at least" for a metric with a lower limit, "at most" for one with an upper limit."""
     return "at least" if more_is_better(metric) else "at most"
-
-
-def _requirement(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on whether the required pass probability is reached, and whether more surveys are needed."""
-    required, passing = analysis.required_probability, analysis.pass_probability
-    if required is None:
-        return ""
-    verdict = requirement_verdict(analysis)
-    conclusive = passing.high < required or passing.low >= required or verdict == "not decided"
-    doubt = "" if conclusive else ", but the confidence interval includes the required value (more surveys are needed)"
-    where = " over all values of the varied keys" if analysis.study.seek is not None else ""
-    return f" The required {percent(required)} is {verdict}{where}{doubt}."
 
 
 def requirement_verdict(analysis: StudyAnalysis) -> str:
@@ -216,71 +175,87 @@ def requirement_verdict(analysis: StudyAnalysis) -> str:
     return "not decided" if is_possible else "not met"
 
 
-def sample_count(n: int) -> str:
-    """Returns a number of samples with its noun."""
-    return "1 sample" if n == 1 else f"{n} samples"
+# Each of the following functions returns sentences of the headline, none if there is nothing to say.
 
 
-def _refused(analysis: StudyAnalysis) -> str:
-    """Returns sentences on the samples that cannot be flown or that only the surrogate refuses; "" without any."""
-    sentences = ""
+def _requirement(analysis: StudyAnalysis) -> list[str]:
+    """States whether the required pass probability is reached, and whether more surveys are needed."""
+    required, passing = analysis.required_probability, analysis.pass_probability
+    if required is None:
+        return []
+    verdict = requirement_verdict(analysis)
+    conclusive = passing.high < required or passing.low >= required or verdict == "not decided"
+    doubt = "" if conclusive else ", but the confidence interval includes the required value (more surveys are needed)"
+    where = " over all values of the varied keys" if analysis.study.seek is not None else ""
+    return [f"The required {percent(required)} is {verdict}{where}{doubt}."]
+
+
+def _main_reason(analysis: StudyAnalysis) -> list[str]:
+    reasons = [] if analysis.passed.any() else analysis.failure_reasons[:1]
+    return [f"The most frequent reason: {reason.reason}." for reason in reasons]
+
+
+def _refused(analysis: StudyAnalysis) -> list[str]:
+    """Describes the samples that cannot be flown or that only the surrogate refuses."""
+    sentences = []
     if (refused := analysis.refused & ~analysis.unmodelled).any():
-        n, verb = _refused_count(analysis, refused)
-        sentences += f" {n} cannot be flown and {verb} not counted, e.g.: {_first_reason(analysis, refused)}."
+        n, verb, reason = _refusals(analysis, refused)
+        sentences.append(f"{n} cannot be flown and {verb} not counted, e.g.: {reason}.")
     if analysis.unmodelled.any():
-        n, verb = _refused_count(analysis, analysis.unmodelled)
-        sentences += (
-            f" {n} {verb} unknown, because the surrogate cannot simulate them: they count as not passed at the lower "
+        n, verb, reason = _refusals(analysis, analysis.unmodelled)
+        sentences.append(
+            f"{n} {verb} unknown, because the surrogate cannot simulate them: they count as not passed at the lower "
             'bound and as passed at the upper bound of the confidence intervals; imaging.fidelity = "rendered" flies '
-            f"them; e.g.: {_first_reason(analysis, analysis.unmodelled)}."
+            f"them; e.g.: {reason}."
         )
     return sentences
 
 
-def _refused_count(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, str]:
-    """Returns a phrase with the numbers of the samples and of the chosen surveys (n,) in them, and the verb for it."""
+def _refusals(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, str, str]:
+    """Returns the numbers of samples and surveys among the chosen ones (n,), the verb, and the most frequent reason."""
     n = len(np.unique(analysis.numbers("sample")[chosen]))
-    return f"{sample_count(n)} ({_count(int(chosen.sum()))})", "is" if n == 1 else "are"
+    count = f"{counted(n, 'sample')} ({counted(int(chosen.sum()), 'survey')})"
+    return count, "is" if n == 1 else "are", next(iter(count_similar(analysis.reason[chosen])))
 
 
-def _first_reason(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> str:
-    """Returns the most frequent reason of the chosen surveys (n,)."""
-    return next(iter(count_similar(analysis.reason[chosen])))
-
-
-def _duplicates(analysis: StudyAnalysis) -> str:
+def _duplicates(analysis: StudyAnalysis) -> list[str]:
     n = int(analysis.duplicate.sum())
-    if not n:
-        return ""
-    repeat = "repeats another one" if n == 1 else "repeat others"
-    return f" {_count(n)} {repeat} (same scenario, same seed) and {'is' if n == 1 else 'are'} not counted again."
+    repeat, verb = ("repeats another one", "is") if n == 1 else ("repeat others", "are")
+    return [f"{counted(n, 'survey')} {repeat} (same scenario, same seed) and {verb} not counted again."] if n else []
 
 
-def _not_flown(analysis: StudyAnalysis) -> str:
-    n = analysis.not_flown
-    return f" The study is not finished: {_count(n)} not flown yet; --resume continues it." if n else ""
-
-
-def _failed(analysis: StudyAnalysis) -> str:
+def _failed(analysis: StudyAnalysis) -> list[str]:
     n = int(analysis.failed.sum())
     if not n:
-        return ""
+        return []
     lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.counted.sum())))
-    subject, none, again = (
-        ("1 more survey", "it had not", "it") if n == 1 else (f"{n} more surveys", "none of them had", "them")
+    subject, verb, none, again = (
+        ("1 more survey", "is", "it had not", "it")
+        if n == 1
+        else (f"{n} more surveys", "are", "none of them had", "them")
     )
-    return (
-        f" {subject} failed because of the computer or the program and {'is' if n == 1 else 'are'} not counted; if "
-        f"{none} passed, the pass probability would be {lowest}. Use --resume to fly {again} again."
-    )
+    return [
+        f"{subject} failed because of the computer or the program and {verb} not counted; if {none} passed, the pass "
+        f"probability would be {lowest}. Use --resume to fly {again} again."
+    ]
+
+
+def _not_flown(analysis: StudyAnalysis) -> list[str]:
+    n = analysis.not_flown
+    return [f"The study is not finished: {counted(n, 'survey')} not flown yet; --resume continues it."] if n else []
+
+
+def _warnings(analysis: StudyAnalysis) -> list[str]:
+    different, texts = analysis.warning[~analysis.duplicate], list(analysis.warning_counts)[:1]
+    n = int((different != "").sum())
+    return [f"Warning in {n} of {len(different)} surveys: {text.rstrip('.')}." for text in texts]
 
 
 def independence_note(analysis: StudyAnalysis) -> str:
     """Returns a sentence on which surveys the confidence intervals assume to be independent."""
-    n = len(np.unique(analysis.clusters))
+    n, name = len(np.unique(analysis.clusters)), analysis.cluster_name
     if n == analysis.rows.num_rows:
         return "The confidence intervals assume that the surveys are independent."
-    name = analysis.cluster_name
     return (
         f"The confidence intervals assume that the {n} {name}s are independent; surveys of the same {name} may be "
         "correlated."

@@ -26,7 +26,6 @@ from twin.studies.study_file import Study, TuningConfig
 from twin.studies.surveys import (
     Sample,
     Survey,
-    axis_names,
     merge_errors,
     refusals,
     samples,
@@ -133,7 +132,7 @@ class CandidateSurveys:
         `tune.confirm` times as many seeds.
         """
         sampling = self.study.sampling
-        n_axes = len(axis_names(self.study))
+        n_axes = len(self.study.axes(listed=False))
         count = "samples" if sampling.method != "grid" and n_axes > 0 else "seeds"
         n = (getattr(sampling, count) or 1) * self.config.confirm
         update: dict[str, Any] = {"seed": sampling.seed + _CONFIRM_SEEDS, "paired": False, count: n}

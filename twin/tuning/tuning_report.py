@@ -20,7 +20,7 @@ from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.report.wording import percent, plain
 from twin.scenario.file import dump_toml
 from twin.studies import wording
-from twin.studies.figures import axis_label, make_panels, spans_decades, unit_axis
+from twin.studies.figures import axis_label, make_panels, metric_axis, value_axis
 from twin.studies.study_file import Study, TuningConfig
 from twin.tuning.candidates import Candidate, pareto_front, required_probability
 from twin.tuning.rounds import TuningResult
@@ -198,9 +198,7 @@ def trade_off_figure(shown: list[Candidate], result: TuningResult, config: Tunin
             axes.plot(x, [c.objectives[y_index] for c in candidates], **style)
         for axis, k in ((axes.xaxis, x_index), (axes.yaxis, y_index)):
             if k is not None:
-                values = np.array([c.objectives[k] for c in shown])
-                if spans_decades(values):
-                    log_axis(axis)
+                value_axis(axis, np.array([c.objectives[k] for c in shown]))
                 _format_axis(axis, config.objectives[k])
         if x_index is None:
             axes.set_xlabel("trial")
@@ -240,7 +238,7 @@ def _groups(
 
 def _format_axis(axis: Any, objective: str) -> None:
     """Labels an axis with an objective and formats its tick labels in the unit of the objective."""
-    unit_axis(axis, objective)
+    metric_axis(axis, objective)
     if axis.get_scale() == "linear":
         axis.set_major_locator(MaxNLocator(4))  # few ticks, as their labels are long
     axis.set_label_text(axis_label(objective))
