@@ -27,7 +27,6 @@ from twin.studies.analysis import StudyAnalysis
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
 from twin.studies.surveys import survey_keys, surveys
-from twin.tuning.candidates import tuning_config
 from twin.tuning.tuning_report import write_tuning_report
 
 pytestmark = pytest.mark.long
@@ -116,7 +115,7 @@ def agreement(folder):
 
 def tuned(folder):
     found = study_of(folder, tuning.TUNING)
-    write_tuning_report(found, tuning_config(found), tuning.search(found, folder / "out"), folder)
+    write_tuning_report(tuning.search(found, folder / "out"), folder)
     return folder / "tuning.html"
 
 

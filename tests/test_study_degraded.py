@@ -14,7 +14,7 @@ from twin.studies.progress import survey_line
 from twin.studies.report import summary, write_report
 from twin.studies.surveys import surveys
 from twin.tuning import tuning_report
-from twin.tuning.candidates import CandidateSurveys, tuning_config
+from twin.tuning.candidates import CandidateSurveys
 from twin.tuning.rounds import TuningResult
 
 REASON = "the stereo residuals are 3.1 px"
@@ -91,7 +91,7 @@ def evaluated(folder, changes):
     """Returns study and candidate of a search that minimises LE90 over the asked area, with changed rows."""
     old = 'objectives = ["timing.simulated_s", "map.le90_m", "risk"]'
     study = study_of(folder, TUNING, (old, 'objectives = ["map.le90_area_m"]'), ("samples = 2", "samples = 5"))
-    flown = CandidateSurveys(study, tuning_config(study), folder, ())
+    flown = CandidateSurveys(study, folder, ())
     values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
     for survey, change in zip(flown.surveys(0, values), changes, strict=True):
         flown.add(flight.row_of(survey, "complete", "") | change)
@@ -111,9 +111,9 @@ def test_the_recommendation_of_a_search_names_the_completeness(tmp_path):
     changes = [{"map.le90_area_m": 0.01, "map.completeness_area": 0.95 + 0.01 * k} for k in range(5)]
     study, candidate = evaluated(tmp_path, changes)
     assert candidate.completeness == (("map.completeness_area", pytest.approx(0.97)),)
-    result = TuningResult([candidate], [candidate], [], candidate, None, False, False, {})
-    assert "map completeness (asked area) 0.97" in tuning_report.headline(study, tuning_config(study), result)
-    tuning_report.write_tuning_report(study, tuning_config(study), result, tmp_path)
+    result = TuningResult(study, [candidate], [candidate], [], candidate, None, False, False, {})
+    assert "map completeness (asked area) 0.97" in tuning_report.headline(result)
+    tuning_report.write_tuning_report(result, tmp_path)
     assert "<th>map completeness (asked area)</th>" in (tmp_path / "tuning.html").read_text()
 
 

@@ -13,7 +13,7 @@ from twin.studies.runner import Fleet
 from twin.studies.statistics import wilson_interval
 from twin.studies.surveys import refusals
 from twin.tuning import tuning_report
-from twin.tuning.candidates import Candidate, CandidateSurveys, check_bounds, pareto_front, tuning_config
+from twin.tuning.candidates import Candidate, CandidateSurveys, confirmation_of, pareto_front, tuning_config
 from twin.tuning.rounds import tune
 
 TUNING = """
@@ -89,7 +89,7 @@ def test_the_recommended_scenario_reads_back_with_the_chosen_values(searched):
     study, result, folder = searched
     imaging = result.scenario.imaging.model_copy(update={"fidelity": "surrogate"})
     by_surrogate = result._replace(scenario=result.scenario.model_copy(update={"imaging": imaging}))
-    tuning_report.write_tuning_report(study, tuning_config(study), by_surrogate, folder)
+    tuning_report.write_tuning_report(by_surrogate, folder)
     scenario = load_scenario(folder / "recommended.toml")
     assert scenario.model_dump() == result.scenario.model_dump()  # rendered
     assert scenario.plan.altitude_m == result.recommended.values["plan.altitude_m"]
@@ -117,7 +117,7 @@ def evaluate(tmp_path):
     values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
 
     def evaluate_plan(*changes):
-        candidate_surveys = CandidateSurveys(study, tuning_config(study), tmp_path, ())
+        candidate_surveys = CandidateSurveys(study, tmp_path, ())
         for survey, change in zip(candidate_surveys.surveys(0, values), changes, strict=True):
             candidate_surveys.add(fly(survey) | change)
         again = [survey.key for survey in candidate_surveys.missing({0: values})]
@@ -129,7 +129,7 @@ def evaluate(tmp_path):
 def test_a_plan_without_sampled_keys_is_confirmed_with_as_many_different_surveys(tmp_path):
     text = TUNING.replace("water.turbidity = { uniform = [4.0, 6.0] }", "").replace("samples = 2", "samples = 1")
     study = study_of(tmp_path, text)
-    confirmation = CandidateSurveys(study, tuning_config(study), tmp_path, ()).confirmation(())
+    confirmation = CandidateSurveys(confirmation_of(study), tmp_path, ())
     surveys = list(confirmation.surveys(0, {"plan.altitude_m": 2.0, "estimate.node_stride": 1}))
     assert len({survey.scenario_hash for survey in surveys}) == len(surveys) == 4  # tune.confirm
 
@@ -138,11 +138,11 @@ def test_a_parameter_with_one_value_does_not_repeat_surveys_in_the_confirmation(
     text = TUNING.replace("{ uniform = [4.0, 6.0] }", "{ choice = [5.0] }").replace("samples = 2", "samples = 3")
     study = study_of(tmp_path, text)
     values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
-    searched = CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    searched = CandidateSurveys(study, tmp_path, ())
     for survey in searched.surveys(0, values):
         searched.add(fly(survey))
     assert searched.evaluate(0, values).pass_probability == wilson_interval(1, 1)  # three times the same survey
-    confirmation = searched.confirmation(())
+    confirmation = CandidateSurveys(confirmation_of(study), tmp_path, ())
     for survey in confirmation.surveys(0, values):
         confirmation.add(fly(survey))
     assert confirmation.evaluate(0, values).pass_probability == wilson_interval(12, 12)  # tune.confirm is 4
@@ -154,9 +154,10 @@ def test_a_parameter_with_one_value_does_not_repeat_surveys_in_the_confirmation(
 def test_a_plan_is_confirmed_with_a_multiple_of_the_surveys_of_the_search(method, n_search, factor, tmp_path):
     text = TUNING.replace('"lhs"', f'"{method}"').replace("trials = 24", f"confirm = {factor}")
     study = study_of(tmp_path, text)
-    searched = CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    searched = CandidateSurveys(study, tmp_path, ())
     assert searched.n_surveys == n_search
-    surveys = list(searched.confirmation(()).surveys(0, {"plan.altitude_m": 2.0, "estimate.node_stride": 1}))
+    confirmation = CandidateSurveys(confirmation_of(study), tmp_path, ())
+    surveys = list(confirmation.surveys(0, {"plan.altitude_m": 2.0, "estimate.node_stride": 1}))
     assert len({survey.scenario_hash for survey in surveys}) >= 2 * factor
     assert len(surveys) == factor * n_search
 
@@ -193,7 +194,7 @@ def test_a_plan_without_a_completed_survey_has_the_penalty_in_every_objective(ev
 
 def test_the_penalty_is_negative_for_a_metric_of_which_more_is_better(tmp_path):
     study = study_of(tmp_path, TUNING, ('"map.le90_m", "risk"', '"map.completeness", "risk"'))
-    candidate_surveys = CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    candidate_surveys = CandidateSurveys(study, tmp_path, ())
     values = {"plan.altitude_m": 1.6, "estimate.node_stride": 1}
     for survey in candidate_surveys.surveys(0, values):
         candidate_surveys.add(abort(survey))
@@ -204,10 +205,8 @@ def test_no_plan_is_recommended_if_none_is_feasible(searched, tmp_path):
     study, *_ = searched
     result = search(study, tmp_path / "out", function=abort)
     assert (result.recommended, result.scenario, result.finalists) == (None, None, [])
-    assert tuning_report.headline(study, tuning_config(study), result).startswith(
-        "No plan is recommended: 24 plans were evaluated"
-    )
-    tuning_report.write_tuning_report(study, tuning_config(study), result, tmp_path / "out")
+    assert tuning_report.headline(result).startswith("No plan is recommended: 24 plans were evaluated")
+    tuning_report.write_tuning_report(result, tmp_path / "out")
     assert not (tmp_path / "out" / "recommended.toml").exists()
 
 
@@ -252,10 +251,10 @@ def test_a_search_starts_although_its_first_sample_is_refused(tmp_path):
     changes = ("uniform = [4.0, 6.0]", "grid = [-4.0, 6.0]"), ('method = "lhs"\nsamples = 2', "seeds = 1")
     study = study_of(tmp_path, TUNING, *changes)
     assert list(refusals(study)) == [0]
-    check_bounds(study, tuning_config(study))
+    CandidateSurveys(study, tmp_path, ()).check_bounds()
     with pytest.raises(ScenarioError, match=r"plan.altitude_m: -1.5: not allowed"):
         other = study_of(tmp_path, TUNING, *changes, ("[1.5, 3.0]", "[-1.5, 3.0]"))
-        check_bounds(other, tuning_config(other))
+        CandidateSurveys(other, tmp_path, ()).check_bounds()
 
 
 def test_a_study_without_a_search_is_rejected(tmp_path):

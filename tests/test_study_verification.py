@@ -162,17 +162,16 @@ def test_the_table_distinguishes_rendered_from_surrogate_surveys(searched):
 
 
 def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(searched):
-    study, result, folder = searched
-    config = tuning_config(study)
-    headline = tuning_report.headline(study, config, result)
+    _, result, folder = searched
+    headline = tuning_report.headline(result)
     assert "2 of 2 rendered surveys were completed and met every requirement" in headline
     median = result.recommended_verification.medians["map.le90_m"]
     assert f"{1e3 * median[1]:.1f} mm ({1e3 * median[0]:.1f} mm)" in headline.replace("1.0 cm", "10.0 mm")
-    tuning_report.write_tuning_report(study, config, result, folder)
+    tuning_report.write_tuning_report(result, folder)
     warnings = tuning_report.warnings(result)
     assert any("the surrogate extrapolates to" in text for text in warnings)
     assert any("the surrogate is wrong about the map height error (LE90)" in text for text in warnings)
-    summary = tuning_report.summary(study, config, result)
+    summary = tuning_report.summary(result)
     assert json.loads(json.dumps(summary, allow_nan=False))["warnings"] == warnings
     assert summary["recommended"]["verified"]
     page, scenario = (folder / "tuning.html").read_text(), (folder / "recommended.toml").read_text()
@@ -188,9 +187,9 @@ def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_roun
     assert result.recommended is None
     assert {v.search_round for v in result.verifications} <= {0, 1, 2}
     assert 1 <= len(result.verifications) <= 9
-    headline = tuning_report.headline(study, tuning_config(study), result)
+    headline = tuning_report.headline(result)
     assert "no plan of the search passed in rendered surveys" in headline
-    assert tuning_report.summary(study, tuning_config(study), result)["recommended"] is None
+    assert tuning_report.summary(result)["recommended"] is None
 
 
 def test_a_degraded_survey_does_not_pass(tmp_path):
@@ -226,14 +225,13 @@ def test_an_interrupted_verification_ends_with_the_same_plans(searched, tmp_path
 
 def test_without_verification_the_plan_is_recommended_with_a_warning_in_every_output(tmp_path):
     study = study_of(tmp_path, TUNING, ("verify = 2", "verify = 0"))
-    config = tuning_config(study)
     result = search(study, tmp_path / "out")
     assert result.verifications == []
     assert result.recommended.values["plan.altitude_m"] > RENDERED_LIMIT_M
-    tuning_report.write_tuning_report(study, config, result, tmp_path / "out")
-    summary = tuning_report.summary(study, config, result)
+    tuning_report.write_tuning_report(result, tmp_path / "out")
+    summary = tuning_report.summary(result)
     assert not summary["recommended"]["verified"]
-    assert tuning_report.NOT_VERIFIED in tuning_report.headline(study, config, result)
+    assert tuning_report.NOT_VERIFIED in tuning_report.headline(result)
     assert tuning_report.NOT_VERIFIED in summary["warnings"]
     assert "Not verified" in (tmp_path / "out" / "tuning.html").read_text()
     assert f"# Warning: {tuning_report.NOT_VERIFIED}" in (tmp_path / "out" / "recommended.toml").read_text()
@@ -286,7 +284,7 @@ def test_a_plan_whose_scenario_is_not_valid_is_refused_and_not_flown(tmp_path, m
 
     monkeypatch.setattr(candidates, "scenario_of_sample", valid_up_to_2_m)
     study, values = study_of(tmp_path, TUNING), {"plan.altitude_m": 2.5, "plan.speed_mps": 0.3}
-    surveys = candidates.CandidateSurveys(study, tuning_config(study), tmp_path, ())
+    surveys = candidates.CandidateSurveys(study, tmp_path, ())
     assert list(surveys.missing({0: values})) == []
     assert {score.status for score in surveys.scores(0, values)} == {"refused"}
     assert surveys.evaluate(0, values).pass_probability.value == 0.0

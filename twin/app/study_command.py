@@ -130,11 +130,11 @@ def tune(file: str, options: StudyOptions) -> int:
     with options.engine() as engine, study_progress(options.live) as progress:
         result = rounds.tune(study, folder, options.resume, Fleet(engine, progress))
     with sole_writer(folder, used=True):
-        tuning_report.write_tuning_report(study, config, result, folder)
+        tuning_report.write_tuning_report(result, folder)
     if options.as_json:
-        print(json.dumps(tuning_report.summary(study, config, result), indent=1))
+        print(json.dumps(tuning_report.summary(result), indent=1))
     else:
-        print(tuning_report.headline(study, config, result))
+        print(tuning_report.headline(result))
         for text in tuning_report.warnings(result):
             print(f"Warning: {text}")
         print(f"Report: {folder / 'tuning.html'}")

@@ -16,15 +16,11 @@ _MISSING = 10.0  # ratio of an error metric without a rendered value, e.g. becau
 
 
 class PlanRatio(NamedTuple):
-    """A plan with both rendered and surrogate surveys.
+    """A plan with both rendered and surrogate surveys."""
 
-    `values` are the searched values, `ratios` the ratio rendered / surrogate of each metric, and `complete` is the
-    fraction of the rendered surveys with status "complete".
-    """
-
-    values: dict[str, Any]
-    ratios: dict[str, float]
-    complete: float
+    values: dict[str, Any]  #: value of each searched key
+    ratios: dict[str, float]  #: ratio rendered / surrogate of each metric
+    complete: float  #: fraction of the rendered surveys with status "complete"
 
 
 class PlanCorrection(NamedTuple):

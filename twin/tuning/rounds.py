@@ -5,31 +5,33 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from twin.scenario.model import Scenario
 from twin.studies.flight import Row
 from twin.studies.results_log import ResultsLog, write_parquet
 from twin.studies.runner import Fleet, open_folder
-from twin.studies.study_file import Study, TuningConfig
+from twin.studies.study_file import Study
 from twin.tuning.candidates import (
     Candidate,
     CandidateSurveys,
-    check_bounds,
+    Values,
+    confirmation_of,
     cost_index,
+    costs_of,
     non_dominated,
-    objective_signs,
     pareto_front,
-    tuning_config,
+    rendered_of,
 )
-from twin.tuning.correction import PlanCorrection, correction_at
+from twin.tuning.correction import correction_at
 from twin.tuning.search import Search
-from twin.tuning.verification import Verification, expected_time, verification_of
+from twin.tuning.verification import Verification, duration, expected_time, verification_of
 
 
 class TuningResult(NamedTuple):
     """Result of a search."""
 
+    study: Study
     #: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if any were
     #: flown
     candidates: list[Candidate]
@@ -66,10 +68,9 @@ def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult
         ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
         OSError: the results cannot be written.
     """
-    config, interrupted = tuning_config(study), False
-    check_bounds(study, config)
+    CandidateSurveys(study, folder, ()).check_bounds()
     with open_folder(folder, resume, search=True) as log:
-        tuning = Tuning(study, config, folder, fleet, log)
+        tuning, interrupted = Tuning(study, folder, fleet, log), False
         try:
             tuning.run()
         except KeyboardInterrupt:
@@ -82,13 +83,14 @@ def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult
 class Tuning:
     """State of a search: the evaluated plans, the finalists (evaluated again with new seeds), and the verifications."""
 
-    def __init__(self, study: Study, config: TuningConfig, folder: Path, fleet: Fleet, log: ResultsLog):
-        self.study, self.config, self.folder, self.fleet, self.log = study, config, folder, fleet, log
-        self.trials = CandidateSurveys(study, config, folder, log.rows())
-        self.confirmation = self.trials.confirmation(log.rows())
-        self.rendered = self.trials.rendered(log.rows())
-        self.needs_rendering = self.trials.uses_surrogate
-        self.plans: dict[int, dict[str, Any]] = {}
+    def __init__(self, study: Study, folder: Path, fleet: Fleet, log: ResultsLog):
+        self.study, self.folder, self.fleet, self.log = study, folder, fleet, log
+        studies = (study, confirmation_of(study), rendered_of(study))
+        self.trials, self.confirmation, self.rendered = (CandidateSurveys(s, folder, log.rows()) for s in studies)
+        self.config = self.trials.config
+        self.needs_rendering = self.trials.original.imaging.fidelity == "surrogate"
+        self.is_verifying = self.needs_rendering and self.config.verify > 0  # before a plan is recommended
+        self.plans: dict[int, Values] = {}
         self.finalists: dict[int, Candidate] = {}
         self.verifications: dict[int, Verification] = {}
         self.confirmed: Candidate | None = None
@@ -114,36 +116,29 @@ class Tuning:
 
     @property
     def recommended(self) -> Candidate | None:
-        """Returns the cheapest plan that passed verification; the cheapest confirmed plan if plans are not verified.
-
-        None if there is no such plan.
-        """
+        """Returns the cheapest plan that passed verification or, if plans are not verified, that was confirmed."""
         if not self.is_verifying:
             return self.confirmed
         passed = [v.surrogate._replace(shortfall=0.0) for v in self.verifications.values() if v.passed]
         return next(iter(pareto_front(passed, self.config)), None)
 
-    @property
-    def is_verifying(self) -> bool:
-        """Returns whether rendered surveys verify plans before one is recommended."""
-        return self.needs_rendering and self.config.verify > 0
-
     def result(self, interrupted: bool) -> TuningResult:
         """Returns the result of the search; an interrupted search recommends no plan."""
         recommended = None if interrupted else self.recommended
         return TuningResult(
+            self.study,
             self._candidates(),
             list(self.finalists.values()),
             list(self.verifications.values()),
             recommended,
-            self.trials.scenario(recommended) if recommended else None,
+            self.trials.scenario(recommended.values) if recommended else None,
             interrupted,
             self.needs_rendering,
             self.confirmation.warnings(self.finalists.values()),
             self.trials.refusals(self.plans),
         )
 
-    def _fly(self, surveys: CandidateSurveys, plans: dict[int, dict[str, Any]]) -> None:
+    def _fly(self, surveys: CandidateSurveys, plans: dict[int, Values]) -> None:
         """Flies those surveys of the given plans that have no result yet.
 
         Raises:
@@ -161,15 +156,16 @@ class Tuning:
 
     def _search(self, search_round: int) -> None:
         """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
-        search = Search(self.study, self.config, self.folder, self.trials.fingerprint, search_round)
+        search = Search(self.study, self.config, self.folder, self.trials.original.fingerprint(), search_round)
         if search_round:
             search.add_earlier_candidates((c.values, c.objectives, c.shortfall) for c in self._candidates())
         while batch := search.next_batch():
-            self._fly(self.trials, {proposal.number: proposal.values for proposal in batch})
-            for proposal in batch:
-                candidate = self._evaluate(self.trials, proposal.number, proposal.values)
-                search.record(proposal, candidate.objectives, candidate.shortfall)
-        self.plans |= dict(search.finished())
+            plans = {number: dict(trial.params) for number, trial in batch.items()}
+            self._fly(self.trials, plans)
+            for number, values in plans.items():
+                candidate = self._evaluate(self.trials, number, values)
+                search.record(batch[number], candidate.objectives, candidate.shortfall)
+        self.plans |= search.finished()
 
     def _verify_front(self, search_round: int) -> None:
         """Verifies the cheapest confirmed plan by rendered surveys, and corrects the predictions for all plans.
@@ -198,29 +194,32 @@ class Tuning:
         The costs of all plans are the corrected results of the search. Of the cheaper plans that no other dominates and
         that are not verified, it has the smallest shortfall of the pass probability and, of those, the highest cost.
         """
-        if self.recommended is None:
+        if (chosen := self.recommended) is None:
             return None
-        sign, cost = objective_signs(self.config), cost_index(self.config)
-        recommended = self._evaluate(self.trials, self.recommended.number, self.recommended.values)
-        most = recommended.objectives[cost] * sign[cost]
-        cheaper = [c for c in self._candidates() if c.objectives[cost] * sign[cost] < most]
-        front = [one for one in non_dominated(cheaper, self.config) if one.number not in self.verifications]
-        return min(front, key=lambda one: (one.shortfall, -one.objectives[cost] * sign[cost]), default=None)
+
+        def cost(plan: Candidate) -> float:
+            return float(costs_of([plan], self.config)[0, cost_index(self.config)])
+
+        most = cost(self._evaluate(self.trials, chosen.number, chosen.values))
+        front = non_dominated([plan for plan in self._candidates() if cost(plan) < most], self.config)
+        untried = [plan for plan in front if plan.number not in self.verifications]
+        return min(untried, key=lambda plan: (plan.shortfall, -cost(plan)), default=None)
 
     def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
-        """Flies the rendered surveys of a plan and compares them with its surrogate surveys."""
-        self._announce(plan, most_plans)
-        self._fly(self.rendered, {plan.number: plan.values})
-        surrogate = self.finalists[plan.number]
-        verification = verification_of(self.rendered, self.confirmation, surrogate, search_round)
-        self.verifications[plan.number] = verification
-        self.fleet.progress.print_line(verification.notice())
-
-    def _announce(self, plan: Candidate, most_plans: int) -> None:
-        """Prints the number and the expected run time of a plan's rendered surveys that are to be flown, if any."""
-        if n_missing := sum(1 for _ in self.rendered.missing({plan.number: plan.values})):
-            times = expected_time(self.trials, self.rendered, plan, self.log.rows())
-            self.fleet.progress.print_line(times.notice(plan.number, n_missing, most_plans * self.rendered.n_surveys))
+        """Announces and flies the rendered surveys of a plan, and compares them with its surrogate surveys."""
+        progress, values = self.fleet.progress, {plan.number: plan.values}
+        if n_missing := sum(1 for _ in self.rendered.missing(values)):
+            survey_s, source = expected_time(self.trials, self.rendered, plan, self.log.rows())
+            most = most_plans * self.rendered.n_surveys
+            progress.print_line(
+                f"Flying plan {plan.number} rendered: {n_missing} surveys of about {duration(survey_s)} on one core "
+                f"each ({source}), {duration(n_missing * survey_s)} of core time; at most {most} surveys and "
+                f"{duration(most * survey_s)} until the end of the search"
+            )
+        self._fly(self.rendered, values)
+        found = verification_of(self.rendered, self.confirmation, self.finalists[plan.number], search_round)
+        self.verifications[plan.number] = found
+        progress.print_line(found.notice())
 
     def _cheapest_confirmed(self) -> Candidate | None:
         """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
@@ -249,12 +248,10 @@ class Tuning:
         """Returns all candidates evaluated so far, corrected by the rendered surveys."""
         return [self._evaluate(self.trials, number, values) for number, values in self.plans.items()]
 
-    def _evaluate(self, surveys: CandidateSurveys, number: int, values: dict[str, Any]) -> Candidate:
+    def _evaluate(self, surveys: CandidateSurveys, number: int, values: Values) -> Candidate:
         """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans."""
-        candidate = surveys.evaluate(number, values, self._correction(values))
+        correction = correction_at(self.config.search, [v.ratio for v in self.verifications.values()], values)
+        candidate = surveys.evaluate(number, values, correction)
         if (verification := self.verifications.get(number)) is None:
             return candidate
         return candidate._replace(shortfall=min(candidate.shortfall, 0.0) if verification.passed else 1.0)
-
-    def _correction(self, values: dict[str, Any]) -> PlanCorrection:
-        return correction_at(self.config.search, [v.ratio for v in self.verifications.values()], values)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import optuna
 from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution
@@ -23,30 +23,25 @@ from twin.studies.study_file import Study, TuningConfig
 NAME = "twin"  #: name of the Optuna study of the first round in the journal
 ROUND_NUMBERS = 1_000_000  #: offset between the candidate numbers of successive rounds
 _EARLIER = "earlier_round"  # marks the trials that were added from earlier rounds
-
-
-class Proposal(NamedTuple):
-    """A candidate to evaluate: its number, the value of each searched key, and its Optuna trial."""
-
-    number: int
-    values: dict[str, Any]
-    trial: Trial
+_EXTENDABLE = {"trials", "confirm", "verify", "plans", "rounds", "keep", "timeout_s"}  # may change on --resume
 
 
 class Search:
-    """Search for the best plans; stores its trials in `optuna.journal`, which other programs can read while it runs."""
+    """Search for the best plans; stores its trials in `optuna.journal`, which other programs can read while it runs.
+
+    A search that is stored in the folder is continued.
+
+    Args:
+        config: section [tune] of the study.
+        fingerprint: hash of the scenario with the original plan.
+        search_round: round of the search, from 0; a further round begins with the candidates given to
+            `add_earlier_candidates`.
+
+    Raises:
+        TwinError: the journal in the folder belongs to another search, or the scenario file was changed.
+    """
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, fingerprint: str, search_round: int = 0):
-        """Starts a search, or continues the search stored in the folder.
-
-        Args:
-            config: section [tune] of the study.
-            search_round: round of the search, from 0; a further round begins with the candidates given to
-                `add_earlier_candidates`.
-
-        Raises:
-            TwinError: the journal in the folder belongs to another search, or the scenario file was changed.
-        """
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self.config, self.seed, self.first_number = config, study.sampling.seed, search_round * ROUND_NUMBERS
         self.n_trials = further_trials(config) if search_round else config.trials
@@ -57,11 +52,11 @@ class Search:
             directions=["maximize" if more_is_better(name) else "minimize" for name in config.objectives],
             load_if_exists=True,
         )
-        extendable = {"tune": {"trials", "confirm", "verify", "plans", "rounds", "keep", "timeout_s"}}  # may change
-        identity = study.model_dump_json(exclude=extendable | {"timeout_s": True, "retries": True})  # pyright: ignore
-        if self.optuna_study.user_attrs.get("identity", identity) != identity:
+        identity = study.model_dump_json(exclude={"tune": _EXTENDABLE, "timeout_s": True, "retries": True})  # pyright: ignore
+        attributes = self.optuna_study.user_attrs
+        if attributes.get("identity", identity) != identity:
             raise TwinError("--resume", f"{folder} contains another search", "the folder of this search")
-        if self.optuna_study.user_attrs.get("scenario", fingerprint) != fingerprint:
+        if attributes.get("scenario", fingerprint) != fingerprint:
             problem = f"{folder} contains a search with another scenario: {study.scenario_file} was changed"
             raise TwinError("--resume", problem, "the scenario of this search, or a new folder")
         self.optuna_study.set_user_attr("identity", identity)
@@ -81,56 +76,45 @@ class Search:
         if any(_EARLIER not in trial.user_attrs for trial in known):
             return
         for values, objectives, shortfall in islice(candidates, len(known), None):
-            self.optuna_study.add_trial(
-                create_trial(
-                    params=values,
-                    distributions=self.space,
-                    values=list(objectives),
-                    constraints={"shortfall": shortfall},
-                    user_attrs={_EARLIER: True},
-                )
+            trial = create_trial(
+                params=values,
+                distributions=self.space,
+                values=list(objectives),
+                constraints={"shortfall": shortfall},
+                user_attrs={_EARLIER: True},
             )
+            self.optuna_study.add_trial(trial)
 
-    def next_batch(self) -> list[Proposal]:
-        """Returns the candidates to evaluate next; an empty list after the last trial of this round.
+    def next_batch(self) -> dict[int, Trial]:
+        """Returns the candidates to evaluate next, by number; none after the last trial of this round.
 
         If an interrupted search left unfinished candidates, returns these, otherwise a new batch. A batch depends only
         on the earlier trials and the seed of the study, not on the number of workers or on interruptions.
         """
         known = self._trials()
-        if unfinished := [trial for trial in known if trial.state == TrialState.RUNNING]:
-            return [self._proposal(Trial(self.optuna_study, trial._trial_id)) for trial in unfinished]
-        self.optuna_study.sampler = TPESampler(seed=self.seed + len(known), multivariate=True)
-        own = sum(_EARLIER not in trial.user_attrs for trial in known)
-        count = min(self.config.batch, self.n_trials - own)
-        return [self._proposal(self.optuna_study.ask(self.space)) for _ in range(count)]
+        batch = [Trial(self.optuna_study, trial._trial_id) for trial in known if trial.state == TrialState.RUNNING]
+        if not batch:
+            self.optuna_study.sampler = TPESampler(seed=self.seed + len(known), multivariate=True)
+            own = sum(_EARLIER not in trial.user_attrs for trial in known)
+            batch = [self.optuna_study.ask(self.space) for _ in range(min(self.config.batch, self.n_trials - own))]
+        return {self.first_number + trial.number: trial for trial in batch}
 
-    def finished(self) -> list[tuple[int, dict[str, Any]]]:
-        """Returns, for every candidate evaluated in this round, its number and the values of the searched keys."""
+    def record(self, trial: Trial, objectives: Sequence[float], shortfall: float) -> None:
+        """Records the evaluation of a candidate; `shortfall` is the required minus the achieved pass probability."""
+        trial.set_constraint("shortfall", shortfall)
+        self.optuna_study.tell(trial, list(objectives))
+
+    def finished(self) -> dict[int, dict[str, Any]]:
+        """Returns the values of the searched keys of every candidate evaluated in this round, by number."""
         complete = [trial for trial in self._trials() if trial.state == TrialState.COMPLETE]
-        return [(self.first_number + t.number, dict(t.params)) for t in complete if _EARLIER not in t.user_attrs]
-
-    def record(self, proposal: Proposal, objectives: Sequence[float], shortfall: float) -> None:
-        """Records the evaluation of a candidate.
-
-        Args:
-            shortfall: required minus achieved pass probability; 0 or negative if the candidate is feasible.
-        """
-        proposal.trial.set_constraint("shortfall", shortfall)
-        self.optuna_study.tell(proposal.trial, list(objectives))
+        return {self.first_number + t.number: dict(t.params) for t in complete if _EARLIER not in t.user_attrs}
 
     def _trials(self) -> list[FrozenTrial]:
         return self.optuna_study.get_trials(deepcopy=False)
 
-    def _proposal(self, trial: Trial) -> Proposal:
-        return Proposal(self.first_number + trial.number, dict(trial.params), trial)
-
 
 def further_trials(config: TuningConfig) -> int:
-    """Returns the number of new candidates of a further round.
-
-    It is a quarter of `trials`, but at least one batch and at most `trials`.
-    """
+    """Returns the number of candidates of a further round: a quarter of `trials`, but at least one batch."""
     return max(min(config.batch, config.trials), config.trials // 4)
 
 

@@ -21,8 +21,7 @@ from twin.report.wording import percent, plain
 from twin.scenario.file import dump_toml
 from twin.studies import wording
 from twin.studies.figures import axis_label, make_panels, metric_axis, value_axis
-from twin.studies.study_file import Study, TuningConfig
-from twin.tuning.candidates import Candidate, pareto_front, required_probability
+from twin.tuning.candidates import Candidate, pareto_front, required_probability, tuning_config
 from twin.tuning.rounds import TuningResult
 from twin.tuning.verification import Verification
 
@@ -30,30 +29,32 @@ NOT_VERIFIED = (
     "Not verified: the plan has no rendered surveys (verify = 0), and the surrogate's prediction may not hold."
 )
 _LARGE_RATIO = 1.5  # a median ratio rendered / surrogate above this value, or below its inverse, gives a warning
-FRONT, FEASIBLE, INFEASIBLE = COLOURS["final"], COLOURS["link"], COLOURS["f2f"]
+_DOT = {"linestyle": "", "marker": "o", "markersize": 4}
+Groups = list[tuple[list[Candidate], dict[str, Any]]]
 
 
-def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult, folder: Path) -> None:
+def write_tuning_report(result: TuningResult, folder: Path) -> None:
     """Writes tuning.html, pareto.png and, if a plan is recommended, recommended.toml to a folder."""
     shown = [candidate for candidate in result.candidates if candidate.has_metrics]
+    front = pareto_front(result.candidates, tuning_config(result.study))
+    groups, figures = _groups(shown, front, result), {}
     with matplotlib.rc_context(FIGURE_STYLE):
-        trade_off = trade_off_figure(shown, result, config)
-        figures = {}
+        trade_off = _trade_off_figure(groups, result)
         if shown:
-            keys = searched_keys_figure(shown, result, config)
+            keys = _searched_keys_figure(groups, result)
             figures = {"trade_off": to_data_uri(trade_off), "searched_keys": to_data_uri(keys)}
         trade_off.savefig(folder / "pareto.png")
     page = {
-        "study": study,
-        "config": config,
+        "study": result.study,
+        "config": result.study.tune,
         "result": result,
-        "front": pareto_front(result.candidates, config),
+        "front": front,
         "wording": wording,
-        "headline": headline(study, config, result),
+        "headline": headline(result),
         "warnings": warnings(result),
         "figures": figures,
-        "recommended": recommended_toml(study, config, result),
-        "text": read_text(study.source.path),
+        "recommended": recommended_toml(result),
+        "text": read_text(result.study.source.path),
         "version": version("seabed-twin"),
     }
     (folder / "tuning.html").write_text(render_page("twin.tuning", "tuning.html.j2", page), encoding="utf-8")
@@ -61,55 +62,47 @@ def write_tuning_report(study: Study, config: TuningConfig, result: TuningResult
         (folder / "recommended.toml").write_text(page["recommended"], encoding="utf-8")
 
 
-def headline(study: Study, config: TuningConfig, result: TuningResult) -> str:
+def headline(result: TuningResult) -> str:
     """Returns the main result: the recommended plan with its medians and pass probability, or why there is none."""
     count = f"{len(result.candidates)} plans were evaluated"
     if n_rendered := len(result.verifications):
         count += f", {n_rendered} of them also in rendered surveys"
     if (chosen := result.recommended) is None:
-        return f"No plan is recommended: {_missing_plan(study, result, count)}"
-    values = ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
+        return f"No plan is recommended: {_missing_plan(result, count)}"
+    plan = "Recommended plan: " + ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
     passing = f"pass probability with new seeds {wording.confidence(chosen.pass_probability)}"
     if (verification := result.recommended_verification) is None:
+        named = (*zip(tuning_config(result.study).objectives, chosen.objectives, strict=True), *chosen.completeness)
         objectives = ", ".join(
-            f"{wording.metric_name(name)} {wording.metric_value(name, value)}"
-            for name, value in (*zip(config.objectives, chosen.objectives, strict=True), *chosen.completeness)
-            if name != "risk"
+            f"{wording.metric_name(n)} {wording.metric_value(n, v)}" for n, v in named if n != "risk"
         )
         unverified = f" {NOT_VERIFIED}" if result.needs_rendering else ""
-        return f"Recommended plan: {values}. Medians: {objectives}; {passing}. {count}.{unverified}"
+        return f"{plan}. Medians: {objectives}; {passing}. {count}.{unverified}"
     medians = ", ".join(
-        f"{wording.metric_name(name)} {_metric(name, rendered)} ({_metric(name, surrogate)})"
+        f"{wording.metric_name(name)} {wording.metric_value(name, rendered)} ({wording.metric_value(name, surrogate)})"
         for name, (surrogate, rendered) in verification.medians.items()
     )
     return (
-        f"Recommended plan: {values}. {verification.n_passed} of {verification.surveys} rendered surveys were "
-        f"completed and met every requirement ({wording.confidence(verification.rendered.pass_probability)}). Medians "
+        f"{plan}. {verification.n_passed} of {verification.surveys} rendered surveys were completed and met every "
+        f"requirement ({wording.confidence(verification.rendered.pass_probability)}). Medians "
         f"rendered (surrogate): {medians}; by the surrogate, {passing}. {count}."
     )
 
 
-def _metric(name: str, value: float | None) -> str:
-    return wording.metric_value(name, value)
-
-
-def _missing_plan(study: Study, result: TuningResult, count: str) -> str:
+def _missing_plan(result: TuningResult, count: str) -> str:
     """Returns the reason why no plan is recommended, as text that follows a colon."""
     if result.interrupted:
         return f"{count}, and the search was interrupted before a plan was confirmed."
-    if result.verifications:
-        surveys = sum(v.surveys - v.n_failed for v in result.verifications)
-        passed = sum(v.n_passed for v in result.verifications)
-        n_failed = sum(v.n_failed for v in result.verifications)
-        failed = (
-            f"; {n_failed} more failed because of the computer or the program, --resume flies them" if n_failed else ""
-        )
-        return (
-            f"no plan of the search passed in rendered surveys. {count}; {passed} of {surveys} rendered surveys "
-            f"passed{failed}."
-        )
-    required = f"the required pass probability of {percent(required_probability(study))}"
-    return f"{count}, and none reached {required} when flown again with new seeds."
+    if not result.verifications:
+        required = f"the required pass probability of {percent(required_probability(result.study))}"
+        return f"{count}, and none reached {required} when flown again with new seeds."
+    numbers = np.array([(v.surveys, v.n_passed, v.n_failed) for v in result.verifications])
+    surveys, passed, n_failed = numbers.sum(axis=0).tolist()
+    failed = f"; {n_failed} more failed because of the computer or the program, --resume flies them" if n_failed else ""
+    return (
+        f"no plan of the search passed in rendered surveys. {count}; {passed} of {surveys - n_failed} rendered surveys "
+        f"passed{failed}."
+    )
 
 
 def warnings(result: TuningResult) -> list[str]:
@@ -118,18 +111,10 @@ def warnings(result: TuningResult) -> list[str]:
     They concern a plan that was not verified, large errors of the surrogate, refused plans, and the warnings of
     surveys.
     """
-    texts = []
-    if result.recommended and result.needs_rendering and result.recommended_verification is None:
-        texts.append(NOT_VERIFIED)
-    verified = [result.recommended_verification] if result.recommended_verification else result.verifications
-    for verification in verified:
-        for name, ratio in verification.ratio.ratios.items():
-            if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
-                surrogate, rendered = (_metric(name, value) for value in verification.medians[name])
-                texts.append(
-                    f"Plan {verification.surrogate.number}: the surrogate is wrong about the "
-                    f"{wording.metric_name(name)}: {surrogate} expected, {rendered} in rendered surveys."
-                )
+    chosen = result.recommended_verification
+    texts = [NOT_VERIFIED] if result.recommended and result.needs_rendering and chosen is None else []
+    for verification in [chosen] if chosen else result.verifications:
+        texts += _surrogate_errors(verification)
         texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
     texts += [
         f"{n} of {len(result.candidates)} plans could not be flown in the search: {reason}"
@@ -138,39 +123,54 @@ def warnings(result: TuningResult) -> list[str]:
     return texts + [f"{text} (in {n} surveys of the finalists by the surrogate)" for text, n in result.warnings.items()]
 
 
-def summary(study: Study, config: TuningConfig, result: TuningResult) -> dict[str, Any]:
+def _surrogate_errors(verification: Verification) -> Iterator[str]:
+    """Yields a sentence for each metric whose medians differ much between surrogate and rendered surveys."""
+    for name, ratio in verification.ratio.ratios.items():
+        if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
+            surrogate, rendered = (wording.metric_value(name, value) for value in verification.medians[name])
+            yield (
+                f"Plan {verification.surrogate.number}: the surrogate is wrong about the {wording.metric_name(name)}: "
+                f"{surrogate} expected, {rendered} in rendered surveys."
+            )
+
+
+def summary(result: TuningResult) -> dict[str, Any]:
     """Returns the summary that `--json` prints: candidates, the recommended plan, verifications and warnings."""
-    chosen, verification = result.recommended, result.recommended_verification
+    chosen, verification, names = result.recommended, result.recommended_verification, tuning_config(result.study)
     recommended = chosen and {
         "values": chosen.values,
-        "objectives": dict(zip(config.objectives, chosen.objectives, strict=True)),
+        "objectives": dict(zip(names.objectives, chosen.objectives, strict=True)),
         "probability": chosen.pass_probability._asdict(),
         "verified": not result.needs_rendering or verification is not None,
         "rendered": verification and _rendered(verification),
     }
     return {
-        "name": study.name,
+        "name": result.study.name,
         "candidates": len(result.candidates),
         "interrupted": result.interrupted,
         "recommended": recommended,
         "verifications": [_rendered(one) for one in result.verifications],
         "warnings": warnings(result),
-        "headline": headline(study, config, result),
+        "headline": headline(result),
     }
 
 
 def _rendered(verification: Verification) -> dict[str, Any]:
     """Returns a verification as JSON values: verdict, numbers of rendered surveys, plan, and medians with ratios."""
-    medians = {
-        name: {"surrogate": surrogate, "rendered": rendered, "ratio": verification.ratio.ratios[name]}
-        for name, (surrogate, rendered) in verification.medians.items()
+    return {
+        "plan": verification.surrogate.number,
+        "round": verification.search_round,
+        "passed": verification.passed,
+        **{name: getattr(verification, name) for name in ("surveys", "n_passed", "n_failed")},
+        "values": verification.surrogate.values,
+        "medians": {
+            name: {"surrogate": surrogate, "rendered": rendered, "ratio": verification.ratio.ratios[name]}
+            for name, (surrogate, rendered) in verification.medians.items()
+        },
     }
-    counts = {"surveys": verification.surveys, "n_passed": verification.n_passed, "n_failed": verification.n_failed}
-    plan = {"plan": verification.surrogate.number, "round": verification.search_round, "passed": verification.passed}
-    return plan | counts | {"values": verification.surrogate.values, "medians": medians}
 
 
-def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -> str:
+def recommended_toml(result: TuningResult) -> str:
     """Returns the recommended plan as the text of a scenario file; "" if no plan is recommended.
 
     Comments at the start contain the headline and the warnings. The scenario selects rendered images, even if the
@@ -179,61 +179,62 @@ def recommended_toml(study: Study, config: TuningConfig, result: TuningResult) -
     if result.scenario is None:
         return ""
     imaging = result.scenario.imaging.model_copy(update={"fidelity": "rendered"})
-    comments = [f"twin tune of {study.name}", headline(study, config, result)]
+    comments = [f"twin tune of {result.study.name}", headline(result)]
     comments += [f"Warning: {text}" for text in warnings(result)]
     scenario = result.scenario.model_copy(update={"imaging": imaging})
     return "".join(f"# {' '.join(line.split())}\n" for line in comments) + dump_toml(scenario)
 
 
-def trade_off_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
-    """Returns a scatter plot of the candidates for each pair of objectives.
+def _groups(shown: list[Candidate], front: list[Candidate], result: TuningResult) -> Groups:
+    """Returns each group of candidates with its plot style: infeasible, feasible, Pareto-optimal, recommended."""
+    chosen = result.recommended
+    star = {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": "recommended"}
+    return [
+        (
+            [c for c in shown if c.shortfall > 0],
+            _DOT | {"color": COLOURS["f2f"], "alpha": 0.5, "label": "pass probability too low"},
+        ),
+        (
+            [c for c in shown if c.shortfall <= 0 and c not in front],
+            _DOT | {"color": COLOURS["link"], "label": "feasible"},
+        ),
+        (front, _DOT | {"color": COLOURS["final"], "markersize": 5, "label": "Pareto-optimal"}),
+        ([c for c in shown if chosen and c.number == chosen.number], _DOT | star),
+    ]
 
-    A single objective is plotted against the trial number.
-    """
-    pairs = list(combinations(range(len(config.objectives)), 2)) or [(None, 0)]
+
+def _trade_off_figure(groups: Groups, result: TuningResult) -> Figure:
+    """Returns a scatter plot of the candidates for each pair of objectives, or of a single one by trial number."""
+    names = tuning_config(result.study).objectives
+    pairs = list(combinations(range(len(names)), 2)) or [(None, 0)]
     figure, panels = make_panels(len(pairs))
     for (x_index, y_index), axes in zip(pairs, panels, strict=True):
-        for candidates, style in _groups(shown, result, config):
+        for candidates, style in groups:
             x = [c.number if x_index is None else c.objectives[x_index] for c in candidates]
             axes.plot(x, [c.objectives[y_index] for c in candidates], **style)
         for axis, k in ((axes.xaxis, x_index), (axes.yaxis, y_index)):
             if k is not None:
-                value_axis(axis, np.array([c.objectives[k] for c in shown]))
-                _format_axis(axis, config.objectives[k])
+                value_axis(axis, np.array([c.objectives[k] for c in result.candidates if c.has_metrics]))
+                _format_axis(axis, names[k])
         if x_index is None:
             axes.set_xlabel("trial")
     panels[0].legend(fontsize=8)
     return figure
 
 
-def searched_keys_figure(shown: list[Candidate], result: TuningResult, config: TuningConfig) -> Figure:
+def _searched_keys_figure(groups: Groups, result: TuningResult) -> Figure:
     """Returns a scatter plot of each objective against each searched key."""
+    config = tuning_config(result.study)
     cells = [(k, key) for k in range(len(config.objectives)) for key in config.search]
     figure, panels = make_panels(len(cells), columns=min(len(config.search), 4))
     for (k, key), axes in zip(cells, panels, strict=True):
-        for candidates, style in _groups(shown, result, config):
+        for candidates, style in groups:
             axes.plot([c.values[key] for c in candidates], [c.objectives[k] for c in candidates], **style)
         if config.search[key].kind == "log_uniform":
             log_axis(axes.xaxis)
         axes.set_xlabel(key)
         _format_axis(axes.yaxis, config.objectives[k])
     return figure
-
-
-def _groups(
-    shown: list[Candidate], result: TuningResult, config: TuningConfig
-) -> Iterator[tuple[list[Candidate], dict[str, Any]]]:
-    """Yields each group of candidates with its plot style: infeasible, feasible, Pareto-optimal, recommended."""
-    front = pareto_front(result.candidates, config)
-    chosen = {result.recommended.number} if result.recommended else set()
-    dot: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4}
-    infeasible = dot | {"color": INFEASIBLE, "alpha": 0.5, "label": "pass probability too low"}
-    yield [c for c in shown if c.shortfall > 0], infeasible
-    feasible = dot | {"color": FEASIBLE, "label": "feasible"}
-    yield [c for c in shown if c.shortfall <= 0 and c not in front], feasible
-    yield front, dot | {"color": FRONT, "markersize": 5, "label": "Pareto-optimal"}
-    star = dot | {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": "recommended"}
-    yield [c for c in shown if c.number in chosen], star
 
 
 def _format_axis(axis: Any, objective: str) -> None:

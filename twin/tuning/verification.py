@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from twin.studies.flight import Row
+from twin.studies.results_log import key_of
 from twin.tuning.candidates import Candidate, CandidateSurveys, median_of
 from twin.tuning.correction import PlanRatio, metric_ratio
 
@@ -47,13 +48,8 @@ def verification_of(
     number, values = surrogate.number, surrogate.values
     scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
     medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
-    n_failed = rendered.n_failed(number, values)
-    n_complete = sum(score.status == "complete" for score in scores)
-    ratio = PlanRatio(
-        values,
-        {name: metric_ratio(name, flown, expected) for name, (expected, flown) in medians.items()},
-        n_complete / len(scores) if scores else 1.0,
-    )
+    ratios = {name: metric_ratio(name, flown, expected) for name, (expected, flown) in medians.items()}
+    n_complete, n_failed = sum(score.status == "complete" for score in scores), rendered.n_failed(number, values)
     return Verification(
         surrogate,
         rendered.evaluate(number, values),
@@ -61,51 +57,34 @@ def verification_of(
         sum(score.passed for score in scores),
         n_failed,
         medians,
-        ratio,
+        PlanRatio(values, ratios, n_complete / len(scores) if scores else 1.0),
         search_round,
         rendered.warnings([surrogate]),
     )
 
 
-class ExpectedTime(NamedTuple):
-    """Expected run time of one rendered survey on one CPU core."""
-
-    survey_s: float  #: run time [s]
-    #: whether the run time is derived from rendered surveys of this search; if not, it is a rough estimate
-    measured: bool
-
-    def notice(self, number: int, surveys: int, most_surveys: int) -> str:
-        """Returns a line that announces rendered surveys of a plan with their expected run time."""
-        source = "as measured" if self.measured else "a rough estimate"
-        return (
-            f"Flying plan {number} rendered: {surveys} surveys of about {duration(self.survey_s)} on one core each "
-            f"({source}), {duration(surveys * self.survey_s)} of core time; at most {most_surveys} surveys and "
-            f"{duration(most_surveys * self.survey_s)} until the end of the search"
-        )
-
-
 def expected_time(
     trials: CandidateSurveys, rendered: CandidateSurveys, plan: Candidate, rows: Iterable[Row]
-) -> ExpectedTime:
-    """Returns the expected run time of a rendered survey of a plan.
+) -> tuple[float, str]:
+    """Returns the expected run time of a rendered survey of a plan on one CPU core [s], and how it was found.
 
     It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second. The
     run time per simulated second is measured in the rendered surveys flown so far; before the first one, it is
     estimated from the frame rate and the image size.
     """
-    run_s = simulated_s = longest = 0.0
+    run_s = simulated_s = longest_s = 0.0
     own = set(trials.keys(plan.number, plan.values))
     for row in rows:
         duration_s = row.get("timing.simulated_s") or 0.0
         if row.get("fidelity") == "rendered" and duration_s:
             run_s, simulated_s = run_s + (row.get("timing.survey_s") or 0.0), simulated_s + duration_s
-        if (row["sample"], row["seed"]) in own:
-            longest = max(longest, duration_s)
+        if key_of(row) in own:
+            longest_s = max(longest_s, duration_s)
     if run_s and simulated_s:
-        return ExpectedTime(longest * run_s / simulated_s, measured=True)
-    rig = rendered.scenario(plan).rig
+        return longest_s * run_s / simulated_s, "as measured"
+    rig = rendered.scenario(plan.values).rig
     frame_s = _FRAME_S + _MEGAPIXEL_S * 1e-6 * rig.image_width_px * rig.image_height_px
-    return ExpectedTime(longest * rig.frame_rate_hz * frame_s, measured=False)
+    return longest_s * rig.frame_rate_hz * frame_s, "a rough estimate"
 
 
 def duration(time_s: float) -> str:
