@@ -9,7 +9,7 @@ import pytest
 
 from twin import cli
 from twin.app import look_sheet
-from twin.app.look import image_quality, noise_image, parse_position, parse_twist, quality_rows, render_view
+from twin.app.look import image_quality, parse_position, parse_twist, quality_rows, render_view
 from twin.errors import TwinError
 from twin.imaging.camera.photo_sensor import PhotoSensor
 from twin.imaging.camera.photons import electrons_per_cd
@@ -55,7 +55,7 @@ def test_the_view_is_reproducible_and_its_left_image_is_the_noise_free_image_plu
     level = signal[..., 1].mean() / 255
     expected = 255 * np.sqrt(imaging.noise_sd**2 + imaging.shot_noise**2 * level)
     # 12,288 samples: the standard error of a standard deviation is 0.6 %; both images are rounded
-    assert noise_image(view)[..., 1].std() == pytest.approx(np.hypot(expected, 0.41), rel=0.03)
+    assert view.noise[..., 1].std() == pytest.approx(np.hypot(expected, 0.41), rel=0.03)
 
 
 def test_image_quality_falls_with_attenuation():
@@ -117,7 +117,7 @@ def test_the_noise_of_a_physical_sensor_is_photon_and_read_noise():
     electrons = a.components.total[..., 1] * electrons_per_cd(here.scenario.sensor, 1.339)[1] * a.setting.exposure_s
     per_e = a.setting.analogue_gain * 255 / here.scenario.sensor.full_well_e
     expected = per_e * np.sqrt(electrons.mean() + here.scenario.sensor.read_noise_e**2)
-    assert noise_image(view)[..., 1].std() == pytest.approx(np.hypot(expected, 0.41), rel=0.03)
+    assert view.noise[..., 1].std() == pytest.approx(np.hypot(expected, 0.41), rel=0.03)
 
 
 EFFECTS = ["imaging.shadows=true", "snow.density_per_m3=200.0"]
@@ -169,7 +169,7 @@ def test_a_twist_blurs_and_shears_the_single_image():
     # the bow points up in the image: motion blur removes detail along the columns, rotation some along the rows
     along, across = (np.abs(np.diff(b, axis=k)).mean() / np.abs(np.diff(a, axis=k)).mean() for k in (0, 1))
     assert along < 0.8 and along < across
-    assert np.abs(noise_image(moving)).mean() < 5  # the decomposed image has the motion of the stereo pair
+    assert np.abs(moving.noise).mean() < 5  # the decomposed image has the motion of the stereo pair
 
 
 BAD_TWISTS = ["1,0,0", "1,0,0,0,0,x", "1,0,0,0,0,nan", ""]

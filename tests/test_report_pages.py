@@ -109,7 +109,7 @@ def study(folder):
 
 def agreement(folder):
     analysis = gate.analyse(folder)
-    write_report(analysis.study, analysis, folder / "study.html")
+    write_report(analysis, folder / "study.html")
     return folder / "study.html"
 
 

@@ -14,6 +14,7 @@ from twin.errors import TwinError
 
 if TYPE_CHECKING:
     from twin.app.look import ViewLayers
+    from twin.core.geometry import Array
     from twin.planning.summary import PlanSummary
     from twin.recordings.replay import ReplayOptions, ReplayResult
     from twin.report.run_result import RunResult
@@ -84,14 +85,16 @@ def plan(
         ScenarioError: the survey cannot be planned as described.
         TwinError: the picture cannot be written.
     """
-    from twin.app.outputs import writing
+    from twin.app.outputs import output_file, writing
     from twin.planning import drawing, summary
     from twin.world.mission import prepare
 
-    plan = summary.summarise(prepare(_scenario(scene, overrides, sections)))
-    if picture is not None:
-        with writing(Path(picture)):
-            drawing.draw(plan, Path(picture))
+    scenario = _scenario(scene, overrides, sections)
+    file = None if picture is None else output_file(Path(picture))
+    plan = summary.summarise(prepare(scenario))
+    if file is not None:
+        with writing(file):
+            drawing.draw(plan, file)
     return plan
 
 
@@ -100,6 +103,7 @@ def look(
     at_m: tuple[float, float, float] | None = None,
     sheet: str | Path | None = None,
     overrides: Overrides = (),
+    twist_body: Array | None = None,
     **sections: Any,
 ) -> ViewLayers:
     """Returns the stereo pair at one position, and every layer of light in its left image.
@@ -109,21 +113,25 @@ def look(
         at_m: position of the left camera in the world [m]; default: the centre of the survey area, at its altitude.
         sheet: PNG file to draw all layers into.
         overrides, sections: values of keys, as in `load_scenario`.
+        twist_body: (6,) [angular, linear] velocity of the body in its own axes during the exposure [rad/s, m/s];
+            default: at rest.
 
     Raises:
         ScenarioError: the survey cannot be prepared as described.
-        TwinError: the position is outside of the terrain or below it, or this machine cannot render.
+        TwinError: the position is outside of the terrain or below it, the scenario has no exposure time for the
+            velocity, the sheet cannot be written, or this machine cannot render.
     """
-    from twin.app import look as viewing
     from twin.app import look_sheet
-    from twin.app.outputs import writing
+    from twin.app.look import render_view
+    from twin.app.outputs import output_file, writing
     from twin.world.mission import prepare
 
-    mission = prepare(_scenario(scene, overrides, sections))
-    view = viewing.render_view(mission, at_m)
-    if sheet is not None:
-        with writing(Path(sheet)):
-            look_sheet.draw(mission.scenario, view, Path(sheet))
+    scenario = _scenario(scene, overrides, sections)
+    file = None if sheet is None else output_file(Path(sheet))
+    view = render_view(prepare(scenario), at_m, twist_body)
+    if file is not None:
+        with writing(file):
+            look_sheet.draw(scenario, view, file)
     return view
 
 
@@ -179,25 +187,16 @@ def study(file: str | Path, out: str | Path, jobs: int | None = None, resume: bo
     Raises:
         TwinError: the study is invalid, or the folder has other contents or cannot be written.
     """
-    from twin.app.study_command import open_engine
-    from twin.studies.progress import study_progress
-    from twin.studies.runner import Fleet, run_study
-    from twin.studies.study_file import load_study
+    from twin.app import study_command
 
-    with open_engine(jobs) as engine, study_progress(False) as progress:
-        return run_study(load_study(str(file)), Path(out).absolute(), resume, Fleet(engine, progress))
+    return study_command.fly_study(str(file), study_command.StudyOptions(Path(out), jobs, resume=resume))[0]
 
 
 def tune(file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False) -> TuningResult:
     """Searches the plan that a study file asks for; the arguments and errors are those of `study`."""
-    from twin.app.study_command import open_engine
-    from twin.studies.progress import study_progress
-    from twin.studies.runner import Fleet
-    from twin.studies.study_file import load_study
-    from twin.tuning import rounds
+    from twin.app import study_command
 
-    with open_engine(jobs) as engine, study_progress(False) as progress:
-        return rounds.tune(load_study(str(file)), Path(out).absolute(), resume, Fleet(engine, progress))
+    return study_command.fly_search(str(file), study_command.StudyOptions(Path(out), jobs, resume=resume))[0]
 
 
 def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None = None) -> ReplayResult:

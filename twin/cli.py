@@ -7,16 +7,18 @@ refused, missing system library or failed check of the machine; 130 interrupted 
 `twin view` returns the status of the viewer.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+from typer import Argument, Option
 
+from twin import api
 from twin.app import console, outputs
 from twin.app.termination import INTERRUPTED, sigterm_as_interrupt
 from twin.core.output_folder import sole_writer
@@ -39,183 +41,33 @@ reproductions = typer.Typer(
 )
 app.add_typer(reproductions, name="reproduce")
 
-# In help texts, a bracket is escaped, because Rich takes words in brackets for style tags.
-SceneArgument = Annotated[
-    str, typer.Argument(metavar="SCENE", help="Scenario: a name in scenes/ or the path of a TOML file.")
-]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run.")]
-RunsArgument = Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of two to eight runs.")]
-PageOption = Annotated[Path, typer.Option("--out", help="HTML page to write.")]
-SetOption = Annotated[
+# Arguments and options of several commands. In help texts, a bracket is escaped, because Rich takes words in brackets
+# for style tags.
+Scene = Annotated[str, Argument(metavar="SCENE", help="Scenario: a name in scenes/ or the path of a TOML file.")]
+RunFolder = Annotated[Path, Argument(metavar="RUN", help="Folder of a run.")]
+Overrides = Annotated[
     list[str],
-    typer.Option("--set", metavar="KEY=VALUE", help="Override a key of the scenario, as in plan.tracks=2; repeatable."),
+    Option("--set", metavar="KEY=VALUE", help="Override a key of the scenario, as in plan.tracks=2; repeatable."),
 ]
-SeedOption = Annotated[int | None, typer.Option("--seed", min=0, help="Seed of all random numbers.")]
-OutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
-PictureOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-plan.png.")]
-SheetOption = Annotated[Path | None, typer.Option("--out", help="PNG to write. Default: runs/NAME-look.png.")]
-QuickOption = Annotated[bool, typer.Option("--quick", help="Use smaller plans, images or selections of cases.")]
-WalksOption = Annotated[
-    int, typer.Option("--walks", min=64, help="Largest number of random walks for a value of light.")
-]
-PhaseOption = Annotated[
-    str,
-    typer.Option("--phase", help="Phase function for lamps, in model and reference: a value of water.phase_function."),
-]
-ResultsArgument = Annotated[Path, typer.Argument(metavar="FILE", help="results.json of `twin reproduce all`.")]
-ChapterPageOption = Annotated[Path | None, typer.Option("--page", help="Markdown page whose chapter is replaced.")]
-TurbidityOutOption = Annotated[Path, typer.Option("--out", help="Folder to write.")]
-AtOption = Annotated[
-    str | None,
-    typer.Option("--at", metavar="X,Y,Z", help="Position of the left camera \\[m]. Default: centre of the survey."),
-]
-TwistOption = Annotated[
-    str | None,
-    typer.Option(
-        "--twist",
-        metavar="VX,VY,VZ,WX,WY,WZ",
-        help="Velocity of the vehicle during the exposure: forward, left, up \\[m/s], and about these axes \\[deg/s]. "
-        "Default: at rest.",
-    ),
-]
-LiveOption = Annotated[bool, typer.Option("--live", help="Show the survey in Rerun while it runs.")]
-FitArgument = Annotated[
-    list[str] | None, typer.Argument(metavar="FILE", help="Studies of rendered surveys. Default: the built-in ones.")
-]
-ModelOption = Annotated[
-    Path, typer.Option("--out", help="Error model to write (TOML), for the key imaging.error_model.")
-]
-RunsOption = Annotated[Path, typer.Option("--runs", help="Folder of the rendered surveys; finished ones are reused.")]
-StudyArgument = Annotated[
-    str, typer.Argument(metavar="FILE", help="Study: a name in scenes/studies/ or the path of a TOML file.")
-]
-StudyOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/study-NAME.")]
-TuneOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: runs/tune-NAME.")]
-JobsOption = Annotated[
+RunOut = Annotated[Path | None, Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
+OutFolder = Annotated[Path, Option("--out", help="Folder to write.")]
+Quick = Annotated[bool, Option("--quick", help="Use smaller plans, images or selections of cases.")]
+Jobs = Annotated[
     int | None,
-    typer.Option(
-        "--jobs", min=1, max=1024, help="Parallel surveys, each a process or a SLURM job. Default: one per core."
-    ),
+    Option("--jobs", min=1, max=1024, help="Parallel surveys, each a process or a SLURM job. Default: one per core."),
 ]
-SchedulerOption = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the word slurm.",
-    ),
-]
-ResumeOption = Annotated[
-    bool, typer.Option("--resume", help="Run only surveys that are missing in the folder or failed.")
-]
-VerifyOption = Annotated[
-    int | None,
-    typer.Option(
-        "--verify",
-        min=0,
-        max=1000,
-        metavar="N",
-        help="Rendered surveys of a plan before it is recommended; 0: none. Default: tune.verify of the study.",
-    ),
-]
-CheckOption = Annotated[
-    int | None,
-    typer.Option(
-        "--verify",
-        min=0,
-        max=1000,
-        metavar="N",
-        help="Also fly rendered surveys for the N surrogate surveys closest to the limits. Default: none.",
-    ),
-]
-ExtrapolateOption = Annotated[
+Extrapolate = Annotated[
     bool,
-    typer.Option(
+    Option(
         "--extrapolate",
         help="Fly surrogate surveys outside the range of the error model's fit, with a warning, instead of refusing.",
     ),
 ]
-LinesOption = Annotated[bool, typer.Option("--live", help="Print a line for each finished survey.")]
-DatasetArgument = Annotated[
-    Path,
-    typer.Argument(
-        metavar="DATASET", help="Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3)."
-    ),
+AllowPlugins = Annotated[
+    bool, Option("--allow-plugins", help="Load plug-ins named as module:Class, which run code of any module.")
 ]
-CalibrationOption = Annotated[
-    Path | None,
-    typer.Option("--calibration", metavar="FILE", help="OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt."),
-]
-TruthOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--truth",
-        metavar="FILE|TOPIC",
-        help="True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
-    ),
-]
-TrueMapOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--true-map",
-        metavar="FILE",
-        help="True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.",
-    ),
-]
-TopicsOption = Annotated[
-    str | None,
-    typer.Option("--topics", metavar="LEFT,RIGHT", help="Image topics of a ROS 2 bag. Default: its only stereo pair."),
-]
-AidingOption = Annotated[
-    bool, typer.Option("--aiding/--no-aiding", help="Use recorded readings of pressure, attitude and DVL.")
-]
-EstimatorOption = Annotated[
-    str | None,
-    typer.Option(
-        "--estimator",
-        metavar="NAME",
-        help="Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
-    ),
-]
-AlignOption = Annotated[
-    str,
-    typer.Option("--align", metavar="NAME", help="Alignment with the truth before the comparison: first, se3 or none."),
-]
-BayerOption = Annotated[
-    str | None, typer.Option("--bayer", metavar="PATTERN", help="Raw images: RGGB, GRBG, GBRG or BGGR.")
-]
-PreviewOption = Annotated[
-    bool, typer.Option("--preview", help="Only draw the first stereo pair: matches, disparity, light before and after.")
-]
-ReplayOutOption = Annotated[
-    Path | None, typer.Option("--out", help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")
-]
-AllowPluginsOption = Annotated[
-    bool,
-    typer.Option("--allow-plugins", help="Load plug-ins named as module:Class, which run code of any module."),
-]
-KindArgument = Annotated[str, typer.Argument(metavar="KIND", help="controller, estimator, terrain or reader.")]
-PluginFolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="New folder; names the package.")]
-SummaryOption = Annotated[bool, typer.Option("--json", help="Print only a summary, as JSON.")]
-PlanJsonOption = Annotated[bool, typer.Option("--json", help="Print only the predicted properties, as JSON.")]
-StrictOption = Annotated[
-    bool, typer.Option("--strict", help="Exit with status 1 if a requirement is expected to be missed.")
-]
-OptionalRunArgument = Annotated[Path | None, typer.Argument(metavar="RUN", help="Folder of a run.")]
-FormatOption = Annotated[
-    list[str], typer.Option("--to", metavar="FORMAT", help="Format to write; repeatable, or separated by commas.")
-]
-ExportOutOption = Annotated[Path | None, typer.Option("--out", help="Folder to write. Default: RUN/export.")]
-CrsOption = Annotated[str | None, typer.Option("--crs", help="CRS of the exported coordinates, as in EPSG:32633.")]
-OriginOption = Annotated[
-    str | None,
-    typer.Option("--origin", metavar="E,N,H", help="Scene origin in --crs; H is its elevation \\[m], by default 0."),
-]
-JpegOption = Annotated[
-    int | None, typer.Option("--jpeg", metavar="QUALITY", help="Write images as JPEG of this quality, 1 to 100.")
-]
-ListOption = Annotated[bool, typer.Option("--list", help="List the formats.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print only the metrics, as JSON.")]
+MetricsJson = Annotated[bool, Option("--json", help="Print only the metrics, as JSON.")]
+SummaryJson = Annotated[bool, Option("--json", help="Print only a summary, as JSON.")]
 
 
 def main() -> None:
@@ -232,56 +84,44 @@ def main() -> None:
 
 
 @app.command()
-def demo(out: OutOption = None) -> None:
+def demo(out: RunOut = None) -> None:
     """Run a small complete survey (under 2 minutes) and print its key figures."""
-    result = _run_survey("quickstart", [], out, live=False)
-    console.print_metrics(result.metrics)
-    console.print_outputs(result.folder)
-    raise typer.Exit(exit_status(result))
+    _conclude(_run_survey("quickstart", [], out, live=False))
 
 
 @app.command()
 def run(
-    scene: SceneArgument,
-    overrides: SetOption = [],  # noqa: B006 (typer copies it)
-    seed: SeedOption = None,
-    out: OutOption = None,
-    live: LiveOption = False,
-    as_json: JsonOption = False,
-    extrapolate: ExtrapolateOption = False,
-    allow_plugins: AllowPluginsOption = False,
+    scene: Scene,
+    overrides: Overrides = [],  # noqa: B006 (typer copies it)
+    seed: Annotated[int | None, Option(min=0, help="Seed of all random numbers.")] = None,
+    out: RunOut = None,
+    live: Annotated[bool, Option("--live", help="Show the survey in Rerun while it runs.")] = False,
+    as_json: MetricsJson = False,
+    extrapolate: Extrapolate = False,
+    allow_plugins: AllowPlugins = False,
 ) -> None:
     """Run one survey and write its folder: map, trajectories, report, recording, metrics."""
     options = ([] if seed is None else [f"seed={seed}"]) + (["imaging.extrapolate=true"] if extrapolate else [])
-    result = _run_survey(scene, overrides + options, out, live, allow_plugins)
-    if as_json:
-        print(json.dumps(result.metrics, indent=1))
-    else:
-        console.print_metrics(result.metrics)
-        console.print_outputs(result.folder)
-    raise typer.Exit(exit_status(result))
+    _conclude(_run_survey(scene, overrides + options, out, live, allow_plugins), as_json)
 
 
 @app.command()
 def plan(
-    scene: SceneArgument,
-    overrides: SetOption = [],  # noqa: B006 (typer copies it)
-    out: PictureOption = None,
-    as_json: PlanJsonOption = False,
-    strict: StrictOption = False,
-    allow_plugins: AllowPluginsOption = False,
+    scene: Scene,
+    overrides: Overrides = [],  # noqa: B006 (typer copies it)
+    out: Annotated[Path | None, Option(help="PNG to write. Default: runs/NAME-plan.png.")] = None,
+    as_json: Annotated[bool, Option("--json", help="Print only the predicted properties, as JSON.")] = False,
+    strict: Annotated[
+        bool, Option("--strict", help="Exit with status 1 if a requirement is expected to be missed.")
+    ] = False,
+    allow_plugins: AllowPlugins = False,
 ) -> None:
     """Print the predicted properties of a survey plan over its floor and draw the plan, without simulation."""
-    from twin.planning import drawing
     from twin.planning import summary as plan_summary
-    from twin.scenario.file import load_scenario
-    from twin.world.mission import prepare
 
-    scenario = load_scenario(scene, overrides, allow_plugins)
-    file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-plan.png"))
-    summary = plan_summary.summarise(prepare(scenario))
-    with outputs.writing(file):
-        drawing.draw(summary, file)
+    scenario = api.load_scenario(scene, overrides, allow_plugins)
+    file = out or Path(f"runs/{outputs.file_stem(scenario.name)}-plan.png")
+    summary = api.plan(scenario, file)
     if as_json:
         print(json.dumps(plan_summary.as_json(summary, str(file)), indent=1))
     else:
@@ -292,140 +132,123 @@ def plan(
 
 @app.command()
 def look(
-    scene: SceneArgument,
-    overrides: SetOption = [],  # noqa: B006 (typer copies it)
-    at: AtOption = None,
-    twist: TwistOption = None,
-    out: SheetOption = None,
-    as_json: SummaryOption = False,
-    allow_plugins: AllowPluginsOption = False,
+    scene: Scene,
+    overrides: Overrides = [],  # noqa: B006 (typer copies it)
+    at: Annotated[
+        str | None,
+        Option(metavar="X,Y,Z", help="Position of the left camera \\[m]. Default: centre of the survey."),
+    ] = None,
+    twist: Annotated[
+        str | None,
+        Option(
+            metavar="VX,VY,VZ,WX,WY,WZ",
+            help="Velocity of the vehicle during the exposure: forward, left, up \\[m/s], and about these axes "
+            "\\[deg/s]. Default: at rest.",
+        ),
+    ] = None,
+    out: Annotated[Path | None, Option(help="PNG to write. Default: runs/NAME-look.png.")] = None,
+    as_json: SummaryJson = False,
+    allow_plugins: AllowPlugins = False,
 ) -> None:
     """Render the stereo pair at one position, draw its light components on one sheet, and print the image quality."""
     from twin.app import look as viewing
-    from twin.app import look_sheet
-    from twin.scenario.file import load_scenario
-    from twin.world.mission import prepare
 
     position_m = None if at is None else viewing.parse_position(at)
     twist_body = None if twist is None else viewing.parse_twist(twist)
-    scenario = load_scenario(scene, overrides, allow_plugins)
-    file = outputs.output_file(out or Path(f"runs/{outputs.file_stem(scenario.name)}-look.png"))
-    mission = prepare(scenario)
-    view = viewing.render_view(mission, position_m, twist_body)
-    with outputs.writing(file):
-        sheet = look_sheet.draw(mission.scenario, view, file)
-    quality = viewing.image_quality(view)
-    if as_json:
-        print(json.dumps({"name": mission.scenario.name, "sheet": str(sheet)} | quality, indent=1))
-    else:
-        console.print_table(f"View of {mission.scenario.name}", viewing.quality_rows(quality))
-        print(f"Sheet: {sheet}")
+    scenario = api.load_scenario(scene, overrides, allow_plugins)
+    file = out or Path(f"runs/{outputs.file_stem(scenario.name)}-look.png")
+    quality = viewing.image_quality(api.look(scenario, position_m, file, twist_body=twist_body))
+    tree = {"name": scenario.name, "sheet": str(file)} | quality
+    _show(as_json, tree, [(f"View of {scenario.name}", viewing.quality_rows(quality))], f"Sheet: {file}")
 
 
 @reproductions.command()
-def turbidity(out: TurbidityOutOption = Path("runs/turbidity"), as_json: SummaryOption = False) -> None:
+def turbidity(out: OutFolder = Path("runs/turbidity"), as_json: SummaryJson = False) -> None:
     """Render a block at five turbidities (Fig. 8 of Negahdaripour & Madjidi 2003) and plot contrast versus range."""
     from twin.reproduce import turbidity as experiment
 
-    outputs.output_file(out / "turbidity.png")
-    _require_rendering()
-    with sole_writer(out, used=True), outputs.writing(out):
+    with _results_folder(out, "turbidity.png"):
         summary = experiment.write(experiment.render_levels(), out)
-    if as_json:
-        print(json.dumps(summary, indent=1))
-    else:
-        console.print_table(f"Block at {summary['range_m']:.2f} m in green light", experiment.table(summary))
-        print(f"Sheet: {out / 'turbidity.png'}")
+    title = f"Block at {summary['range_m']:.2f} m in green light"
+    _show(as_json, summary, [(title, experiment.table(summary))], f"Sheet: {out / 'turbidity.png'}")
 
 
 @reproductions.command()
 def light(
-    out: TurbidityOutOption = Path("runs/light"),
-    quick: QuickOption = False,
-    walks: WalksOption = 1_500_000,
-    phase: PhaseOption = "sea",
-    as_json: SummaryOption = False,
+    out: OutFolder = Path("runs/light"),
+    quick: Quick = False,
+    walks: Annotated[int, Option(min=64, help="Largest number of random walks for a value of light.")] = 1_500_000,
+    phase: Annotated[
+        str, Option(help="Phase function for lamps, in model and reference: a value of water.phase_function.")
+    ] = "sea",
+    as_json: SummaryJson = False,
 ) -> None:
     """Compare the light of lamps and sun in the images with a Monte Carlo simulation of any order of scattering."""
     from twin.reproduce import daylight
     from twin.reproduce import light as comparison
 
     outputs.output_file(out / "light.png")
-    selection = comparison.QUICK if quick else comparison.ALL
-    found = list(comparison.cells(selection, walks, phase))
+    found = list(comparison.cells(comparison.QUICK if quick else comparison.ALL, walks, phase))
     under_sun = list(daylight.daylight_cells(daylight.QUICK_DAYLIGHT if quick else daylight.ALL_DAYLIGHT, walks))
     with sole_writer(out, used=True), outputs.writing(out):
         summary = comparison.write(found, out) | {"daylight": daylight.write_daylight(under_sun, out)}
-    if as_json:
-        print(json.dumps(summary, indent=1))
-    else:
-        console.print_table("Light model and reference, green band", comparison.table(found))
-        console.print_table("Daylight, light model and reference, green band", daylight.daylight_table(under_sun))
-        print(f"Sheet: {out / 'light.png'}")
+    tables = [
+        ("Light model and reference, green band", comparison.table(found)),
+        ("Daylight, light model and reference, green band", daylight.daylight_table(under_sun)),
+    ]
+    _show(as_json, summary, tables, f"Sheet: {out / 'light.png'}")
 
 
-def _reproduce(name: str, out: Path, quick: bool, as_json: bool) -> None:
-    """Runs one experiment of the paper, and prints its tables or, as JSON, its results."""
-    from twin.reproduce.catalogue import EXPERIMENTS
+def _add_experiment(name: str, folder: str, text: str) -> None:
+    """Adds a command that runs one experiment of the paper, and prints its tables or, as JSON, its results."""
 
-    outputs.output_file(out / f"{name}.json")
-    _require_rendering()
-    with sole_writer(out, used=True), outputs.writing(out):
-        exhibit = EXPERIMENTS[name](out, quick)
-    if as_json:
-        print(json.dumps(exhibit.as_dict(), indent=1))
-        return
-    for table in exhibit.tables:
-        console.print_table(table.title, list(table.rows))
-    print(f"Figures: {', '.join(str(out / figure.file) for figure in exhibit.figures)}")
+    @reproductions.command(name, help=text)
+    def command(out: OutFolder = Path("runs") / folder, quick: Quick = False, as_json: SummaryJson = False) -> None:
+        from twin.reproduce.catalogue import EXPERIMENTS
+
+        with _results_folder(out, f"{name}.json"):
+            exhibit = EXPERIMENTS[name](out, quick)
+        figures = ", ".join(str(out / figure.file) for figure in exhibit.figures)
+        tables = [(table.title, list(table.rows)) for table in exhibit.tables]
+        _show(as_json, exhibit.as_dict(), tables, f"Figures: {figures}")
 
 
-@reproductions.command()
-def paper(
-    out: TurbidityOutOption = Path("runs/paper-mission"), quick: QuickOption = False, as_json: SummaryOption = False
-) -> None:
-    """Fly the paper's mission of 25 tracks with and without alignment (Figs. 4 to 7); takes hours without --quick."""
-    _reproduce("paper", out, quick, as_json)
-
-
-@reproductions.command()
-def tank1(
-    out: TurbidityOutOption = Path("runs/tank1"), quick: QuickOption = False, as_json: SummaryOption = False
-) -> None:
-    """Survey objects in a tank with 130 stereo pairs on parallel legs (Figs. 9 and 10)."""
-    _reproduce("tank1", out, quick, as_json)
-
-
-@reproductions.command()
-def tank2(
-    out: TurbidityOutOption = Path("runs/tank2"), quick: QuickOption = False, as_json: SummaryOption = False
-) -> None:
-    """Survey objects in a tank with 61 stereo pairs on two loops that touch at the start (Figs. 11 and 12)."""
-    _reproduce("tank2", out, quick, as_json)
-
-
-@reproductions.command()
-def budget(
-    out: TurbidityOutOption = Path("runs/budget"), quick: QuickOption = False, as_json: SummaryOption = False
-) -> None:
-    """Measure the time of each module and compare it with the paper's budget at 30 Hz (section IV)."""
-    _reproduce("budget", out, quick, as_json)
+for _name, _folder, _text in (
+    (
+        "paper",
+        "paper-mission",
+        "Fly the paper's mission of 25 tracks with and without alignment (Figs. 4 to 7); takes hours without --quick.",
+    ),
+    ("tank1", "tank1", "Survey objects in a tank with 130 stereo pairs on parallel legs (Figs. 9 and 10)."),
+    (
+        "tank2",
+        "tank2",
+        "Survey objects in a tank with 61 stereo pairs on two loops that touch at the start (Figs. 11 and 12).",
+    ),
+    (
+        "budget",
+        "budget",
+        "Measure the time of each module and compare it with the paper's budget at 30 Hz (section IV).",
+    ),
+):
+    _add_experiment(_name, _folder, _text)
 
 
 @reproductions.command("all")
-def all_experiments(out: TurbidityOutOption = Path("runs/reproduce"), quick: QuickOption = False) -> None:
+def all_experiments(out: OutFolder = Path("runs/reproduce"), quick: Quick = False) -> None:
     """Run all experiments and write one page with every table and figure."""
     from twin.reproduce import catalogue
 
-    outputs.output_file(out / catalogue.PAGE_FILE)
-    _require_rendering()
-    with sole_writer(out, used=True), outputs.writing(out):
+    with _results_folder(out, catalogue.PAGE_FILE):
         catalogue.run_all(out, quick, report=console.print_error)
     print(f"Page: {out / catalogue.PAGE_FILE}")
 
 
 @reproductions.command()
-def chapter(file: ResultsArgument, page: ChapterPageOption = None) -> None:
+def chapter(
+    file: Annotated[Path, Argument(metavar="FILE", help="results.json of `twin reproduce all`.")],
+    page: Annotated[Path | None, Option(help="Markdown page whose chapter is replaced.")] = None,
+) -> None:
     """Print the chapter of docs/paper.md that shows the results of `twin reproduce all`, or replace it in a page."""
     from twin.reproduce import catalogue, page_chapter
 
@@ -439,121 +262,159 @@ def chapter(file: ResultsArgument, page: ChapterPageOption = None) -> None:
 
 @app.command("fit-surrogate")
 def fit_surrogate(
-    files: FitArgument = None,
-    out: ModelOption = Path("error_model.toml"),
-    runs: RunsOption = Path("runs/fit-surrogate"),
-    jobs: JobsOption = None,
+    files: Annotated[
+        list[str] | None, Argument(metavar="FILE", help="Studies of rendered surveys. Default: the built-in ones.")
+    ] = None,
+    out: Annotated[Path, Option(help="Error model to write (TOML), for the key imaging.error_model.")] = Path(
+        "error_model.toml"
+    ),
+    runs: Annotated[Path, Option(help="Folder of the rendered surveys; finished ones are reused.")] = Path(
+        "runs/fit-surrogate"
+    ),
+    jobs: Jobs = None,
 ) -> None:
     """Fit the error model of the surrogate to rendered surveys; finished surveys are reused."""
     from twin.app import fit_command
 
     outputs.output_file(out)
     outputs.output_file(runs / "study", "--runs")
-    raise typer.Exit(fit_command.run(files or [], out, runs, jobs))
+    fit_command.run(files or [], out, runs, jobs)
 
 
-@app.command()
-def study(
-    file: StudyArgument,
-    out: StudyOutOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    resume: ResumeOption = False,
-    live: LinesOption = False,
-    as_json: SummaryOption = False,
-    verify: CheckOption = None,
-    extrapolate: ExtrapolateOption = False,
-    allow_plugins: AllowPluginsOption = False,
-) -> None:
-    """Run the surveys of a study and estimate the probability that a survey meets the requirements."""
-    from twin.app import study_command
+def _add_study_command(name: str, text: str, verify_text: str) -> None:
+    """Adds the command `study` or `tune`, which have the same options."""
 
-    if not scheduler:
-        _require_rendering()
-    options = study_command.StudyOptions(
-        out, jobs, scheduler, resume, live, as_json, verify, extrapolate, allow_plugins
-    )
-    raise typer.Exit(study_command.run(file, options))
+    @app.command(name, help=text)
+    def command(
+        file: Annotated[
+            str, Argument(metavar="FILE", help="Study: a name in scenes/studies/ or the path of a TOML file.")
+        ],
+        out: Annotated[Path | None, Option(help=f"Folder to write. Default: runs/{name}-NAME.")] = None,
+        jobs: Jobs = None,
+        scheduler: Annotated[
+            str | None,
+            Option(
+                metavar="ADDRESS",
+                help="Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the "
+                "word slurm.",
+            ),
+        ] = None,
+        resume: Annotated[
+            bool, Option("--resume", help="Run only surveys that are missing in the folder or failed.")
+        ] = False,
+        live: Annotated[bool, Option("--live", help="Print a line for each finished survey.")] = False,
+        as_json: SummaryJson = False,
+        verify: Annotated[int | None, Option(min=0, max=1000, metavar="N", help=verify_text)] = None,
+        extrapolate: Extrapolate = False,
+        allow_plugins: AllowPlugins = False,
+    ) -> None:
+        from twin.app import study_command
+
+        if not scheduler:
+            _require_rendering()
+        options = study_command.StudyOptions(out, jobs, scheduler, resume, live, verify, extrapolate, allow_plugins)
+        raise typer.Exit({"study": study_command.study, "tune": study_command.tune}[name](file, options, as_json))
 
 
-@app.command()
-def tune(
-    file: StudyArgument,
-    out: TuneOutOption = None,
-    jobs: JobsOption = None,
-    scheduler: SchedulerOption = None,
-    resume: ResumeOption = False,
-    live: LinesOption = False,
-    as_json: SummaryOption = False,
-    verify: VerifyOption = None,
-    extrapolate: ExtrapolateOption = False,
-    allow_plugins: AllowPluginsOption = False,
-) -> None:
-    """Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario."""
-    from twin.app import study_command
-
-    if not scheduler:
-        _require_rendering()
-    options = study_command.StudyOptions(
-        out, jobs, scheduler, resume, live, as_json, verify, extrapolate, allow_plugins
-    )
-    raise typer.Exit(study_command.tune(file, options))
+_add_study_command(
+    "study",
+    "Run the surveys of a study and estimate the probability that a survey meets the requirements.",
+    "Also fly rendered surveys for the N surrogate surveys closest to the limits. Default: none.",
+)
+_add_study_command(
+    "tune",
+    "Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario.",
+    "Rendered surveys of a plan before it is recommended; 0: none. Default: tune.verify of the study.",
+)
 
 
 @app.command()
 def replay(
-    dataset: DatasetArgument,
-    calibration: CalibrationOption = None,
-    truth: TruthOption = None,
-    align: AlignOption = "first",
-    bayer: BayerOption = None,
-    out: ReplayOutOption = None,
-    preview: PreviewOption = False,
-    topics: TopicsOption = None,
-    estimator: EstimatorOption = None,
-    aiding: AidingOption = True,
-    true_map: TrueMapOption = None,
-    as_json: JsonOption = False,
-    allow_plugins: AllowPluginsOption = False,
+    dataset: Annotated[
+        Path,
+        Argument(
+            metavar="DATASET", help="Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3)."
+        ),
+    ],
+    calibration: Annotated[
+        Path | None, Option(metavar="FILE", help="OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt.")
+    ] = None,
+    truth: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE|TOPIC",
+            help="True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
+        ),
+    ] = None,
+    align: Annotated[
+        str, Option(metavar="NAME", help="Alignment with the truth before the comparison: first, se3 or none.")
+    ] = "first",
+    bayer: Annotated[str | None, Option(metavar="PATTERN", help="Raw images: RGGB, GRBG, GBRG or BGGR.")] = None,
+    out: Annotated[Path | None, Option(help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")] = None,
+    preview: Annotated[
+        bool,
+        Option("--preview", help="Only draw the first stereo pair: matches, disparity, light before and after."),
+    ] = False,
+    topics: Annotated[
+        str | None,
+        Option(metavar="LEFT,RIGHT", help="Image topics of a ROS 2 bag. Default: its only stereo pair."),
+    ] = None,
+    estimator: Annotated[
+        str | None,
+        Option(
+            metavar="NAME",
+            help="Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
+        ),
+    ] = None,
+    aiding: Annotated[
+        bool, Option("--aiding/--no-aiding", help="Use recorded readings of pressure, attitude and DVL.")
+    ] = True,
+    true_map: Annotated[
+        Path | None,
+        Option(
+            metavar="FILE",
+            help="True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.",
+        ),
+    ] = None,
+    as_json: MetricsJson = False,
+    allow_plugins: AllowPlugins = False,
 ) -> None:
     """Run the estimators on recorded stereo images and write a run folder: map, trajectories, report, recording."""
-    from twin.recordings import preview as previewing
     from twin.recordings import replay as recorded
     from twin.scenario.file import plugin_error
 
     if estimator is not None and ":" in estimator and not allow_plugins:
         raise plugin_error("--estimator", estimator, "estimators")
-    alignment, pattern = recorded.alignment_name(align), recorded.bayer_pattern(bayer)
-    pair = recorded.image_topics(topics)
     options = recorded.ReplayOptions(
-        calibration, truth, alignment, pattern, topics=pair, estimator=estimator, aiding=aiding,
-        true_map=true_map,
+        calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer),
+        topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
     )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:
-        file = outputs.output_file(out or Path(f"runs/{name}-preview.png"))
-        if file.suffix.lower() not in (".png", ""):
-            raise TwinError("--out", f"{file.suffix[:20]!r} is not the suffix of a sheet", ".png")
-        opened = recorded.open_dataset(dataset, options)
-        light = previewing.light_of(opened)
-        with outputs.writing(file):
-            previewing.draw(opened, light, file)
-        console.print_table(f"First pair of {opened.name}", previewing.rows(opened, light))
-        print(f"Sheet: {file}")
+        _preview(dataset, options, outputs.output_file(out or Path(f"runs/{name}-preview.png")))
         return
     folder = outputs.new_folder(out) if out is not None else outputs.unused_folder(Path("runs") / f"{name}-replay")
     with console.replay_bar() as progress:
         result = recorded.replay(dataset, folder, options, progress)
-    if as_json:
-        print(json.dumps(result.metrics, indent=1))
-    else:
-        console.print_metrics(result.metrics)
-        console.print_outputs(result.folder)
-    raise typer.Exit(exit_status(result))
+    _conclude(result, as_json)
+
+
+def _preview(dataset: Path, options: Any, file: Path) -> None:
+    """Draws the first stereo pair of a data set and prints its measures."""
+    from twin.recordings import preview as previewing
+    from twin.recordings import replay as recorded
+
+    if file.suffix.lower() not in (".png", ""):
+        raise TwinError("--out", f"{file.suffix[:20]!r} is not the suffix of a sheet", ".png")
+    opened = recorded.open_dataset(dataset, options)
+    light = previewing.light_of(opened)
+    with outputs.writing(file):
+        previewing.draw(opened, light, file)
+    _show(False, None, [(f"First pair of {opened.name}", previewing.rows(opened, light))], f"Sheet: {file}")
 
 
 @app.command()
-def report(folder: RunArgument) -> None:
+def report(folder: RunFolder) -> None:
     """Write the report of a run again, from the files in its folder."""
     from twin.report.survey_page import write_report
 
@@ -562,7 +423,11 @@ def report(folder: RunArgument) -> None:
 
 
 @app.command()
-def compare(folders: RunsArgument, out: PageOption = Path("runs/compare.html"), as_json: SummaryOption = False) -> None:
+def compare(
+    folders: Annotated[list[Path], Argument(metavar="RUN...", help="Folders of two to eight runs.")],
+    out: Annotated[Path, Option(help="HTML page to write.")] = Path("runs/compare.html"),
+    as_json: SummaryJson = False,
+) -> None:
     """Compare runs: a table of metrics with differences from the first run, overlaid curves, one HTML page."""
     from twin.report import comparison
 
@@ -571,15 +436,11 @@ def compare(folders: RunsArgument, out: PageOption = Path("runs/compare.html"), 
     with outputs.writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(comparison.render(runs), encoding="utf-8")
-    if as_json:
-        print(json.dumps(comparison.as_json(runs), indent=1))
-    else:
-        console.print_table("Comparison", comparison.text_rows(runs))
-        print(f"Page: {file}")
+    _show(as_json, comparison.as_json(runs), [("Comparison", comparison.text_rows(runs))], f"Page: {file}")
 
 
 @app.command()
-def view(folder: RunArgument) -> None:
+def view(folder: RunFolder) -> None:
     """Open the recording of a run in Rerun."""
     from twin.report.recording import open_viewer
 
@@ -588,7 +449,10 @@ def view(folder: RunArgument) -> None:
 
 
 @app.command("new-plugin")
-def new_plugin(kind: KindArgument, folder: PluginFolderArgument) -> None:
+def new_plugin(
+    kind: Annotated[str, Argument(metavar="KIND", help="controller, estimator, terrain or reader.")],
+    folder: Annotated[Path, Argument(metavar="DIR", help="New folder; names the package.")],
+) -> None:
     """Write a package with a working plug-in (controller, estimator, terrain or reader) and its test."""
     from twin.plugin import skeleton
 
@@ -602,14 +466,21 @@ def new_plugin(kind: KindArgument, folder: PluginFolderArgument) -> None:
 
 @app.command()
 def export(
-    folder: OptionalRunArgument = None,
-    to: FormatOption = [],  # noqa: B006 (typer copies it)
-    out: ExportOutOption = None,
-    crs: CrsOption = None,
-    origin: OriginOption = None,
-    jpeg: JpegOption = None,
-    show_list: ListOption = False,
-    allow_plugins: AllowPluginsOption = False,
+    folder: Annotated[Path | None, Argument(metavar="RUN", help="Folder of a run.")] = None,
+    to: Annotated[
+        list[str], Option(metavar="FORMAT", help="Format to write; repeatable, or separated by commas.")
+    ] = [],  # noqa: B006 (typer copies it)
+    out: Annotated[Path | None, Option(help="Folder to write. Default: RUN/export.")] = None,
+    crs: Annotated[str | None, Option(help="CRS of the exported coordinates, as in EPSG:32633.")] = None,
+    origin: Annotated[
+        str | None,
+        Option(metavar="E,N,H", help="Scene origin in --crs; H is its elevation \\[m], by default 0."),
+    ] = None,
+    jpeg: Annotated[
+        int | None, Option(metavar="QUALITY", help="Write images as JPEG of this quality, 1 to 100.")
+    ] = None,
+    show_list: Annotated[bool, Option("--list", help="List the formats.")] = False,
+    allow_plugins: AllowPlugins = False,
 ) -> None:
     """Write a run in the formats of other programs: data sets, camera models, truth, maps."""
     from twin.exports import command as export_command
@@ -649,7 +520,7 @@ def schema() -> None:
     print(json.dumps(Scenario.model_json_schema(), indent=1))
 
 
-def exit_status(result: RunResult | ReplayResult) -> int:
+def exit_status(result: "RunResult | ReplayResult") -> int:
     """Returns the exit status of a survey or a replay.
 
     130 if it was interrupted; 1 if aborted for another reason, degraded, or if it misses a requirement; otherwise 0.
@@ -662,11 +533,9 @@ def exit_status(result: RunResult | ReplayResult) -> int:
 
 def _run_survey(
     scene: str, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False
-) -> RunResult:
+) -> "RunResult":
     """Loads and runs one survey with a progress bar; returns its result."""
-    from twin.scenario.file import load_scenario
-
-    scenario = load_scenario(scene, overrides, allow_plugins)
+    scenario = api.load_scenario(scene, overrides, allow_plugins)
     _require_rendering()
     from twin import survey  # imported here because it needs OpenGL
 
@@ -674,6 +543,35 @@ def _run_survey(
     folder = outputs.run_folder(scenario) if out is None else outputs.new_folder(out)
     with console.progress_bar() as progress:
         return survey.run(scenario, folder, progress, live)
+
+
+def _conclude(result: "RunResult | ReplayResult", as_json: bool = False) -> NoReturn:
+    """Prints the result of a survey or replay and ends the program with its exit status."""
+    if as_json:
+        print(json.dumps(result.metrics, indent=1))
+    else:
+        console.print_metrics(result.metrics)
+        console.print_outputs(result.folder)
+    raise typer.Exit(exit_status(result))
+
+
+def _show(as_json: bool, tree: Any, tables: Iterable[tuple[str, list[tuple[str, ...]]]], last_line: str) -> None:
+    """Prints values as JSON, or else titled tables and a line."""
+    if as_json:
+        print(json.dumps(tree, indent=1))
+        return
+    for title, rows in tables:
+        console.print_table(title, rows)
+    print(last_line)
+
+
+@contextmanager
+def _results_folder(out: Path, file: str) -> Iterator[None]:
+    """Locks a folder while results are written to it; checks the path of their main file and the rendering before."""
+    outputs.output_file(out / file)
+    _require_rendering()
+    with sole_writer(out, used=True), outputs.writing(out):
+        yield
 
 
 def _require_rendering() -> None:

@@ -43,28 +43,29 @@ def accept_any_text() -> None:
 
 
 @contextmanager
-def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
-    """Shows the progress bar of a survey if stderr is a terminal; yields the function that updates it."""
+def _bar(task: str, *columns: TextColumn) -> Iterator[Callable[..., None]]:
+    """Shows a progress bar if stderr is a terminal; yields the function that updates its fields."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield lambda _: None
+        yield lambda **_: None
         return
-    stage, note = TextColumn("{task.description:>7}"), TextColumn("{task.fields[note]}")
-    with Bar(stage, BarColumn(), TaskProgressColumn(), note, console=console) as bar:
-        task = bar.add_task("survey", total=1.0, note="")
-        yield lambda now: bar.update(task, completed=now.share, description=now.stage, note=progress_note(now))
+    with Bar(TextColumn("{task.description:>7}"), BarColumn(), TaskProgressColumn(), *columns, console=console) as bar:
+        shown = bar.add_task(task, total=1.0, note="")
+        yield lambda **fields: bar.update(shown, **fields)
+
+
+@contextmanager
+def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
+    """Shows the progress bar of a survey if stderr is a terminal; yields the function that updates it."""
+    with _bar("survey", TextColumn("{task.fields[note]}")) as update:
+        yield lambda now: update(completed=now.share, description=now.stage, note=progress_note(now))
 
 
 @contextmanager
 def replay_bar() -> Iterator[Callable[[str, float], None]]:
     """Shows a progress bar if stderr is a terminal; yields the function that updates it with stage and fraction."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda stage, share: None
-        return
-    with Bar(TextColumn("{task.description:>7}"), BarColumn(), TaskProgressColumn(), console=console) as bar:
-        task = bar.add_task("replay", total=1.0)
-        yield lambda stage, share: bar.update(task, completed=share, description=stage)
+    with _bar("replay") as update:
+        yield lambda stage, share: update(completed=share, description=stage)
 
 
 def progress_note(now: SurveyProgress) -> str:

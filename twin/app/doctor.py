@@ -26,19 +26,12 @@ _SPHERE = """
 
 
 class Check(NamedTuple):
-    """Result of one check.
-
-    Args:
-        name: subject of the check.
-        ok: whether the check passed.
-        found: version, size or error message.
-        remedy: command or action that fixes a failure.
-    """
+    """Result of one check."""
 
     name: str
     ok: bool
-    found: str
-    remedy: str = ""
+    found: str  #: version, size or error message
+    remedy: str = ""  #: command or action that fixes a failure
 
     def __str__(self) -> str:
         line = f"{'ok' if self.ok else 'FAILED':<8} {self.name}: {self.found}"
@@ -46,36 +39,33 @@ class Check(NamedTuple):
 
 
 def check_machine(folder: Path) -> list[Check]:
-    """Returns the results of all checks.
-
-    Args:
-        folder: folder below which runs are written, for the check of free disk space.
-    """
-    return [_python(), *(_package(name) for name in _PACKAGES), check_rendering(), _disk(folder), _processors()]
+    """Returns the results of all checks; `folder` is the one below which runs are written."""
+    free_gb = shutil.disk_usage(folder).free / 1e9
+    remedy = f"free {_ENOUGH_DISK_GB:g} GB, or choose another disk with --out"
+    return [
+        Check("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer"),
+        *(_package(name) for name in _PACKAGES),
+        check_rendering(),
+        Check("disk", free_gb >= _ENOUGH_DISK_GB, f"{free_gb:.1f} GB free", remedy),
+        Check("processors", True, f"{os.cpu_count()} ({platform.machine()})"),
+    ]
 
 
 def check_rendering() -> Check:
     """Returns the result of rendering an image with OpenGL, without a display, in a separate process."""
+    from twin.scenes.gl import INSTALL_LINE
+
+    remedy = INSTALL_LINE if os.geteuid() == 0 else f"sudo {INSTALL_LINE}"
     try:
         command = [sys.executable, "-P", "-m", "twin.app.doctor"]
         probe = subprocess.run(command, capture_output=True, text=True, timeout=_PROBE_LIMIT_S, check=False)
     except subprocess.TimeoutExpired:
-        return Check("OpenGL", False, f"rendering did not finish within {_PROBE_LIMIT_S} s", _gl_remedy())
+        return Check("OpenGL", False, f"rendering did not finish within {_PROBE_LIMIT_S} s", remedy)
     if probe.returncode == 0:
         return Check("OpenGL", True, probe.stdout.strip())
     lines = probe.stderr.strip().splitlines()
     found = lines[-1] if lines else f"rendering failed with exit status {probe.returncode}"
-    return Check("OpenGL", False, found, _gl_remedy())
-
-
-def _gl_remedy() -> str:
-    from twin.scenes.gl import INSTALL_LINE
-
-    return INSTALL_LINE if os.geteuid() == 0 else f"sudo {INSTALL_LINE}"
-
-
-def _python() -> Check:
-    return Check("Python", sys.version_info >= (3, 11), platform.python_version(), "install Python 3.11 or newer")
+    return Check("OpenGL", False, found, remedy)
 
 
 def _package(name: str) -> Check:
@@ -85,21 +75,8 @@ def _package(name: str) -> Check:
         return Check(name, False, "not installed", f"{sys.executable} -m pip install {name}")
 
 
-def _disk(folder: Path) -> Check:
-    free_gb = shutil.disk_usage(folder).free / 1e9
-    remedy = f"free {_ENOUGH_DISK_GB:g} GB, or choose another disk with --out"
-    return Check("disk", free_gb >= _ENOUGH_DISK_GB, f"{free_gb:.1f} GB free", remedy)
-
-
-def _processors() -> Check:
-    return Check("processors", True, f"{os.cpu_count()} ({platform.machine()})")
-
-
 def render_test_image() -> str:
-    """Renders a white sphere and checks that the image is not black.
-
-    Returns:
-        The name of the OpenGL renderer and the value of the environment variable MUJOCO_GL, as text.
+    """Renders a white sphere; returns the name of the OpenGL renderer and the value of MUJOCO_GL as text.
 
     Raises:
         TwinError: OpenGL is missing.

@@ -23,7 +23,7 @@ DEFAULT_STUDIES = (
 )  # fmt: skip
 
 
-def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) -> int:
+def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) -> None:
     """Runs the rendered surveys of the studies, fits the error model to their statistics and writes the model.
 
     Args:
@@ -31,9 +31,6 @@ def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) ->
         out: TOML file to which the error model is written.
         runs: folder of the rendered surveys; finished surveys are reused.
         jobs: number of processes that fly surveys; None for one per core.
-
-    Returns:
-        The exit status, 0.
 
     Raises:
         TwinError: a study is invalid, or too few surveys are complete.
@@ -53,4 +50,3 @@ def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) ->
     rows: list[tuple[str, ...]] = [(name, f"{value:.1%}") for name, value in fitted.misfit.items()]
     console.print_table(f"Fit to {fitted.n_surveys} surveys", rows)
     print(f"Error model: {out}")
-    return 0

@@ -13,6 +13,7 @@ from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.imaging.scene.renderer import NEAR_M
 from twin.imaging.stereo_camera import AT_REST, DecomposedImage, StereoCapture
+from twin.judge.summary_statistics import finite_tree
 from twin.report.wording import DASH, percent
 from twin.world.mission import Mission
 from twin.world.rendered_world import RenderedWorld
@@ -33,17 +34,17 @@ _LABELS = {
 
 
 class ViewLayers(NamedTuple):
-    """Stereo pair at one pose, with the light components of the left image.
+    """Stereo pair at one pose, with the light components of the left image."""
 
-    Args:
-        world_from_left: (4, 4) pose of the left camera.
-        stereo_pair: the stereo pair, with noise.
-        decomposed: the left image without noise, with albedo, depth, exposure and light components.
-    """
-
-    world_from_left: Array
-    stereo_pair: StereoCapture
+    world_from_left: Array  #: (4, 4) pose of the left camera
+    stereo_pair: StereoCapture  #: the stereo pair, with noise
+    #: the left image without noise, with albedo, depth, exposure and light components
     decomposed: DecomposedImage
+
+    @property
+    def noise(self) -> Array:
+        """Returns the noise (H, W, 3) of the left image [grey levels of 8 bits]."""
+        return self.stereo_pair.left.astype(np.float64) - self.decomposed.noise_free
 
 
 def render_view(
@@ -79,12 +80,7 @@ def render_view(
 
 def parse_position(text: str) -> tuple[float, float, float]:
     """Returns the position (x, y, z) [m] of a text X,Y,Z. Raises TwinError unless it is three finite numbers."""
-    try:
-        x, y, z = (float(part) for part in text.split(","))
-    except ValueError:
-        raise TwinError("--at", f"{text!r} is not a position", "X,Y,Z of the left camera [m], as in 0.5,-1,2") from None
-    if not np.isfinite([x, y, z]).all():
-        raise TwinError("--at", f"{text!r} is not a position", "finite numbers")
+    x, y, z = _numbers(text, "--at", "position", "X,Y,Z of the left camera [m], as in 0.5,-1,2")
     return x, y, z
 
 
@@ -94,51 +90,47 @@ def parse_twist(text: str) -> Array:
     Raises:
         TwinError: the text is not six finite numbers.
     """
-    try:
-        values = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        values = np.empty(0)
-    if len(values) != 6 or not np.isfinite(values).all():
-        raise TwinError(
-            "--twist", f"{text!r} is not a velocity", "VX,VY,VZ,WX,WY,WZ [m/s, deg/s], as in 0.5,0,0,0,0,20"
-        )
+    values = _numbers(text, "--twist", "velocity", "VX,VY,VZ,WX,WY,WZ [m/s, deg/s], as in 0.5,0,0,0,0,20")
     return np.concatenate([np.deg2rad(values[3:]), values[:3]])
+
+
+def _numbers(text: str, option: str, meaning: str, allowed: str) -> list[float]:
+    """Returns the numbers of a text, separated by commas; there are as many as in the example at the end of `allowed`.
+
+    Raises:
+        TwinError: the text has another number of numbers, or one that is not finite.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = []
+    if len(values) != allowed.split()[-1].count(",") + 1 or not np.isfinite(values).all():
+        raise TwinError(option, f"{text!r} is not a {meaning}", allowed)
+    return values
 
 
 def _check_rig(mission: Mission, world_from_left: Array) -> None:
     """Raises TwinError unless both cameras and all lamps are over the terrain, at least `NEAR_M` above the floor."""
-    rig = mission.rig
+    rig, lamps = mission.rig, mission.scenario.lamps
     world_from_body = world_from_left @ geometry.inverse(rig.body_from_camera)
-    cameras = [world_from_left[:3, 3], (world_from_left @ rig.left_from_right)[:3, 3]]
-    for name, position in zip(("the left camera", "the right camera"), cameras, strict=True):
-        _check_above(mission, "--at", name, position, world_from_left)
-    for k, lamp in enumerate(mission.scenario.lamps):
-        position = geometry.transform(world_from_body, np.array([lamp.position_m]))[0]
-        _check_above(mission, f"lamps.{k}.position_m", f"lamp {k}", position, world_from_left)
-
-
-def _check_above(mission: Mission, field: str, name: str, position: Array, world_from_left: Array) -> None:
-    """Raises TwinError unless a position is over the terrain and at least `NEAR_M` above the sea floor.
-
-    Args:
-        mission: the survey.
-        field, name: option or scenario key, and name of the camera or lamp, for the error.
-        position: (3,) position of the camera or lamp in the world [m].
-        world_from_left: (4, 4) pose of the left camera, from which the error computes the lowest allowed `--at`.
-    """
+    positions = {
+        ("--at", "the left camera"): world_from_left[:3, 3],
+        ("--at", "the right camera"): (world_from_left @ rig.left_from_right)[:3, 3],
+    } | {
+        (f"lamps.{k}.position_m", f"lamp {k}"): geometry.transform(world_from_body, np.array([lamp.position_m]))[0]
+        for k, lamp in enumerate(lamps)
+    }
     terrain = mission.terrain
-    x, y, z = position
-    floor_m = float(terrain.height_at(x, y))
-    if np.isnan(floor_m):
-        raise TwinError(
-            field, f"{name} at ({x:g}, {y:g}) is outside the terrain",
-            f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m",
-        )  # fmt: skip
-    if z < floor_m + NEAR_M:
-        lift = world_from_left[2, 3] + floor_m + NEAR_M - z
-        raise TwinError(
-            field, f"{name} at z {z:.3f} m is not above the sea floor ({floor_m:.3f} m)", f"--at ...,{lift:.2f} or more"
-        )
+    for (field, name), (x, y, z) in positions.items():
+        floor_m = float(terrain.height_at(x, y))
+        if np.isnan(floor_m):
+            inside = (
+                f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m"
+            )
+            raise TwinError(field, f"{name} at ({x:g}, {y:g}) is outside the terrain", inside)
+        if z < floor_m + NEAR_M:
+            lowest = f"--at ...,{world_from_left[2, 3] + floor_m + NEAR_M - z:.2f} or more"
+            raise TwinError(field, f"{name} at z {z:.3f} m is not above the sea floor ({floor_m:.3f} m)", lowest)
 
 
 def image_quality(view: ViewLayers) -> dict[str, Any]:
@@ -153,32 +145,29 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
         `texture_snr`: median local standard deviation of the image without noise / standard deviation of the noise; a
         low value limits matching.
     """
-    a = view.decomposed
+    a, left = view.decomposed, view.stereo_pair.left
     signal = a.components.total.astype(np.float64) * a.gain if a.linear else a.noise_free / 255
     side = max(3, round(signal.shape[1] * WINDOW_SHARE) | 1)
     mean = cv2.blur(signal, (side, side))
     local_sigma = np.sqrt(np.maximum(cv2.blur(signal**2, (side, side)) - mean**2, 0))
-    noise = noise_image(view).std(axis=(0, 1)) / 255
+    noise, level = view.noise.std(axis=(0, 1)) / 255, left.mean(axis=(0, 1)) / 255
+    backscatter, total = (x.mean(axis=(0, 1), dtype=np.float64) for x in (a.components.backscatter, a.components.total))
+    quality: dict[str, Any] = {
+        "at_m": view.world_from_left[:3, 3],
+        "depth_median_m": np.median(view.stereo_pair.depth_left),
+    }
+    if a.raw is not None:
+        quality |= {"exposure_ms": 1000 * a.setting.exposure_s, "analogue_gain": a.setting.analogue_gain}
     with np.errstate(divide="ignore", invalid="ignore"):
-        values = {
-            "gray_level": view.stereo_pair.left.mean(axis=(0, 1)) / 255,
+        quality |= {
+            "gray_level": level,
             "contrast": np.median(local_sigma / mean, axis=(0, 1)),
-            "veil_share": a.components.backscatter.mean(axis=(0, 1), dtype=np.float64)
-            / a.components.total.mean(axis=(0, 1), dtype=np.float64),
-            "saturated_share": (view.stereo_pair.left >= SATURATED).mean(axis=(0, 1)),
-            "snr": view.stereo_pair.left.mean(axis=(0, 1)) / 255 / noise,
+            "veil_share": backscatter / total,
+            "saturated_share": (left >= SATURATED).mean(axis=(0, 1)),
+            "snr": level / noise,
             "texture_snr": np.median(local_sigma, axis=(0, 1)) / noise,
         }
-    range_m = float(np.median(view.stereo_pair.depth_left))
-    position = {"at_m": view.world_from_left[:3, 3].tolist(), "depth_median_m": _number(range_m)}
-    return position | _exposure(a) | {name: [_number(v) for v in bands] for name, bands in values.items()}
-
-
-def _exposure(decomposed: DecomposedImage) -> dict[str, float]:
-    """Returns exposure time [ms] and analogue gain of a physical sensor; empty without a section [sensor]."""
-    if decomposed.raw is None:
-        return {}
-    return {"exposure_ms": 1000 * decomposed.setting.exposure_s, "analogue_gain": decomposed.setting.analogue_gain}
+    return finite_tree(quality)
 
 
 def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
@@ -189,12 +178,3 @@ def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
         for name, label in _LABELS.items()
     ]
     return [("", "red", "green", "blue"), *rows]
-
-
-def noise_image(view: ViewLayers) -> Array:
-    """Returns the image noise (H, W, 3): left image minus the same image without noise [grey levels of 8 bits]."""
-    return view.stereo_pair.left.astype(np.float64) - view.decomposed.noise_free
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

@@ -12,7 +12,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from twin.app.look import ViewLayers, noise_image
+from twin.app.look import ViewLayers
 from twin.imaging.light.optics import range_of
 from twin.report.style import FIGURE_STYLE
 from twin.report.wording import DASH
@@ -25,22 +25,14 @@ _SHADOW = {"facecolor": "#00000088", "edgecolor": "none", "pad": 2.0}
 
 
 class Panel(NamedTuple):
-    """One panel of the contact sheet.
-
-    Args:
-        title: name of the displayed quantity.
-        unit: unit of the values.
-        values: values whose minimum, median and maximum are printed; those that are not finite are ignored.
-        picture: (H, W, 3) colours from 0 to 1, or (H, W) values for the colour map.
-        note: text in the corner of the picture.
-        colours: name of the colour map, and the values at its lower and upper end.
-    """
+    """One panel of the contact sheet."""
 
     title: str
     unit: str
-    values: NDArray[Any]
-    picture: NDArray[Any]
-    note: str = ""
+    values: NDArray[Any]  #: values whose minimum, median and maximum are printed, apart from those that are not finite
+    picture: NDArray[Any]  #: (H, W, 3) colours from 0 to 1, or (H, W) values for the colour map
+    note: str = ""  #: text in the corner of the picture
+    #: name of the colour map, and the values at its lower and upper end
     colours: tuple[str, float, float] = ("viridis", 0.0, 1.0)
 
 
@@ -79,15 +71,16 @@ def _headline(scenario: Scenario, view: ViewLayers) -> str:
 
 
 def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
-    a, stereo_pair = view.decomposed, view.stereo_pair
-    assert stereo_pair.right is not None
-    noise = noise_image(view)
+    a, left, right, noise = view.decomposed, view.stereo_pair.left, view.stereo_pair.right, view.noise
+    assert right is not None
     range_m = range_of(a.depth, scenario.believed_rig())
+    known_m = range_m[np.isfinite(range_m)]
+    ends_m = (float(known_m.min()), float(known_m.max())) if known_m.size else (0.0, 1.0)
     reach = max(3 * noise.std(), 1.0)
     panels = [
-        Panel("left", "grey level", stereo_pair.left, stereo_pair.left / 255),
-        Panel("right", "grey level", stereo_pair.right, stereo_pair.right / 255),
-        Panel("range", "m", range_m, range_m, colours=("viridis_r", *_ends(range_m))),
+        Panel("left", "grey level", left, left / 255),
+        Panel("right", "grey level", right, right / 255),
+        Panel("range", "m", range_m, range_m, colours=("viridis_r", *ends_m)),
         Panel("albedo", "1", a.albedo / 255, a.albedo / 255),
         _light("light on the sea floor", "lx", a.components.floor_lx, 0.0),
         _light("direct signal", "cd/m2", a.components.direct, a.gain, a.linear),
@@ -109,7 +102,7 @@ def _light(
     linear: bool = True,
     percentile: float = SHOWN_PERCENTILE,
 ) -> Panel:
-    """Returns the colour panel of one light component.
+    """Returns the colour panel of one light component (H, W, 3).
 
     A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
     Any other component is scaled so that its `percentile` is white; the note of the panel then gives the scale factor,
@@ -117,13 +110,10 @@ def _light(
     black, with the note "none".
 
     Args:
-        title, unit: name and unit of the component.
-        layer: (H, W, 3) values of the component.
         gain: image brightness (fraction of full scale) per unit of the component; 0 if the image does not
             contain the component.
         linear: whether the image is proportional to the radiance; if not, the note of the panel states that the
             brightness is that before tone curve and white balance.
-        percentile: percentile of the values that determines the scale, 0 to 100.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
     if top <= 0:
@@ -167,8 +157,3 @@ def _in_numbers(values: NDArray[Any]) -> str:
 def _short(value: float) -> str:
     """Returns the value with three significant digits, or as an integer if its magnitude is 100 or more."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
-
-
-def _ends(values: NDArray[np.float64]) -> tuple[float, float]:
-    finite = values[np.isfinite(values)]
-    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)

@@ -65,10 +65,7 @@ def writing(path: Path, option: str = "--out") -> Iterator[None]:
 
 
 def file_stem(name: str) -> str:
-    """Returns the name of a scenario or study for use in a file name.
-
-    Path separators and NUL characters are replaced by "_", and the name is cut off after 100 bytes.
-    """
+    """Returns a name for use in a file name: with "_" for path separators and NUL, cut off after 100 bytes."""
     text = "".join("_" if character in "/\\\0" else character for character in name)
     return text.encode("utf-8", "replace")[:_STEM_BYTES].decode("utf-8", "ignore")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
@@ -16,10 +16,12 @@ from twin.engines.engine import Engine, LocalEngine, default_jobs
 from twin.errors import TwinError
 from twin.studies import agreement, rendered_check, report, wording
 from twin.studies.progress import study_progress
+from twin.studies.rendered_check import RenderedCheck
 from twin.studies.runner import Fleet, StudyResult, run_study
 from twin.studies.study_file import Study, load_study
 from twin.tuning import rounds, tuning_report
 from twin.tuning.candidates import tuning_config
+from twin.tuning.rounds import TuningResult
 
 SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
@@ -33,7 +35,6 @@ class StudyOptions(NamedTuple):
         scheduler: where the surveys run (`open_engine`).
         resume: run only the surveys whose results are missing in the folder, and those that failed.
         live: print a line for each finished survey.
-        as_json: print only a summary, as JSON.
         verify: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune:
             number of rendered surveys of a plan before it is recommended; None: `tune.verify` of the study file.
         extrapolate: fly surrogate surveys outside the fitted range of the error model.
@@ -45,14 +46,9 @@ class StudyOptions(NamedTuple):
     scheduler: str | None = None
     resume: bool = False
     live: bool = False
-    as_json: bool = False
     verify: int | None = None
     extrapolate: bool = False
     allow_plugins: bool = False
-
-    def engine(self) -> AbstractContextManager[Engine]:
-        """Returns a context manager that yields the engine selected by these options; see `open_engine`."""
-        return open_engine(self.jobs, self.scheduler)
 
 
 @contextmanager
@@ -84,54 +80,72 @@ def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterat
         engine.pool.close()
 
 
-def run(file: str, options: StudyOptions) -> int:
-    """Runs a study and prints its results; returns the exit status.
+@contextmanager
+def _fleet(options: StudyOptions) -> Iterator[Fleet]:
+    with open_engine(options.jobs, options.scheduler) as engine, study_progress(options.live) as progress:
+        yield Fleet(engine, progress)
+
+
+def fly_study(file: str, options: StudyOptions) -> tuple[StudyResult, RenderedCheck | None]:
+    """Runs a study and, if the options ask for it, checks it by rendered surveys; writes the results.
 
     Raises:
         TwinError: the study file or an option is invalid; no survey was run.
     """
     study = load(file, options)
-    folder = _folder(options, "study", study)  # workers run in other folders
-    with options.engine() as engine, study_progress(options.live) as progress:
-        result = run_study(study, folder, options.resume, Fleet(engine, progress))
-        checked = None
-        if options.verify and not result.interrupted:
-            checked = rendered_check.check(result.analysis, options.verify, folder, Fleet(engine, progress))
+    folder = _folder(options, "study", study)
+    with _fleet(options) as fleet:
+        result = run_study(study, folder, options.resume, fleet)
+        if not options.verify or result.interrupted:
+            return result, None
+        return result, rendered_check.check(result.analysis, options.verify, folder, fleet)
+
+
+def fly_search(file: str, options: StudyOptions) -> tuple[TuningResult, Path]:
+    """Optimises a survey plan as the study file defines; returns the result and the folder of its report.
+
+    Raises:
+        TwinError: the study file or an option is invalid; no survey was run.
+    """
+    study = load(file, options)
+    if options.verify is not None:
+        config = tuning_config(study).model_copy(update={"verify": options.verify})
+        study = study.model_copy(update={"tune": config})
+    folder = _folder(options, "tune", study)
+    with _fleet(options) as fleet:
+        result = rounds.tune(study, folder, options.resume, fleet)
+    with sole_writer(folder, used=True):
+        tuning_report.write_tuning_report(result, folder)
+    return result, folder
+
+
+def study(file: str, options: StudyOptions, as_json: bool = False) -> int:
+    """Runs a study and prints its results, or only a summary as JSON; returns the exit status."""
+    result, checked = fly_study(file, options)
+    folder = result.page.parent
     for error in result.write_errors:
         console.print_error(f"{folder}: {error}; free some disk space and continue with --resume")
-    if options.as_json:
-        identity = {"name": study.name, "out": str(folder), "throughput": result.throughput._asdict()}
+    if as_json:
+        identity = {"name": result.analysis.study.name, "out": str(folder), "throughput": result.throughput}
         identity |= {} if checked is None else {"rendered_check": rendered_check.summary(checked)}
         print(json.dumps(report.summary(result.analysis, identity), indent=1))
     else:
-        _print_result(study, result)
+        _print_result(result)
         if checked is not None:
             print(checked.sentence())
-    if checked is not None and checked.interrupted:
-        return checked.exit_status
-    return exit_status(result) or (0 if checked is None else checked.exit_status)
+    if checked is None:
+        return exit_status(result)
+    return checked.exit_status if checked.interrupted else exit_status(result) or checked.exit_status
 
 
-def tune(file: str, options: StudyOptions) -> int:
-    """Optimises a survey plan as the study file defines, and prints the result.
+def tune(file: str, options: StudyOptions, as_json: bool = False) -> int:
+    """Runs a search and prints its result, or only a summary as JSON.
 
     Returns:
         The exit status: 130 if interrupted; 1 if no plan is recommended; 0 otherwise.
-
-    Raises:
-        TwinError: the study file or an option is invalid; no survey was run.
     """
-    study = load(file, options)
-    config = tuning_config(study)
-    if options.verify is not None:
-        config = config.model_copy(update={"verify": options.verify})
-        study = study.model_copy(update={"tune": config})
-    folder = _folder(options, "tune", study)
-    with options.engine() as engine, study_progress(options.live) as progress:
-        result = rounds.tune(study, folder, options.resume, Fleet(engine, progress))
-    with sole_writer(folder, used=True):
-        tuning_report.write_tuning_report(result, folder)
-    if options.as_json:
+    result, folder = fly_search(file, options)
+    if as_json:
         print(json.dumps(tuning_report.summary(result), indent=1))
     else:
         print(tuning_report.headline(result))
@@ -144,19 +158,14 @@ def tune(file: str, options: StudyOptions) -> int:
 
 
 def load(file: str, options: StudyOptions) -> Study:
-    """Returns the study of a file, with `imaging.extrapolate` set if the options ask for it.
-
-    Raises:
-        TwinError: the study file is invalid.
-    """
+    """Returns the study of a file, with `imaging.extrapolate` set if the options ask for it."""
     study = load_study(file, options.allow_plugins)
-    if not options.extrapolate:
-        return study
-    return study.model_copy(update={"set": study.set | {"imaging.extrapolate": True}})
+    changes = {"imaging.extrapolate": True} if options.extrapolate else {}
+    return study.model_copy(update={"set": study.set | changes})
 
 
 def _folder(options: StudyOptions, command: str, study: Study) -> Path:
-    """Returns the absolute path of the folder to write: `options.out`, or by default runs/COMMAND-NAME of the study.
+    """Returns the absolute path of the folder to write, because workers run in other folders.
 
     Raises:
         TwinError: the path can neither exist nor be created, or cannot be written.
@@ -166,20 +175,16 @@ def _folder(options: StudyOptions, command: str, study: Study) -> Path:
     return folder.absolute()
 
 
-def _print_result(study: Study, result: StudyResult) -> None:
+def _print_result(result: StudyResult) -> None:
     analysis = result.analysis
     print(wording.headline(analysis))
     for line in wording.answer_lines(analysis):
         print(f"- {line}")
     rows = [
-        (
-            wording.metric_name(metric.name),
-            wording.metric_interval(metric.name, metric.median),
-            wording.metric_interval(metric.name, metric.bound),
-        )
-        for metric in analysis.metric_summaries
+        (wording.metric_name(one.name), *(wording.metric_interval(one.name, i) for i in (one.median, one.bound)))
+        for one in analysis.metric_summaries
     ]
-    console.print_table(f"{study.name}: median and 95 % bound of the surveys", rows)
+    console.print_table(f"{analysis.study.name}: median and 95 % bound of the surveys", rows)
     if (compared := agreement.agreement(analysis)) is not None:
         console.print_table(agreement.verdict_line(compared), agreement.table(compared))
     if analysis.refusal_reasons:
