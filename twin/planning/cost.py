@@ -16,35 +16,21 @@ from twin.world.mission import Mission
 
 
 class ComputingCost(NamedTuple):
-    """Estimated computing cost of a survey.
+    """Estimated computing cost of a survey."""
 
-    Args:
-        wall_s: processor time on an idle 2-core machine [s].
-        memory_mb: peak memory [MB].
-        disk_mb: disk space of the run folder [MB].
-    """
-
-    wall_s: float
-    memory_mb: float
-    disk_mb: float
+    wall_s: float  #: processor time on an idle 2-core machine [s]
+    memory_mb: float  #: peak memory [MB]
+    disk_mb: float  #: disk space of the run folder [MB]
 
 
 class _Coefficients(NamedTuple):
-    """Coefficients of a cost (time, memory or disk) that is linear in the numbers of frames and keyframes.
+    """Coefficients of a cost (time, memory or disk) that is linear in the numbers of frames and keyframes."""
 
-    Args:
-        start: fixed cost of start and report.
-        frame: cost per frame.
-        frame_mpx: additional cost per frame for each megapixel of the image.
-        keyframe: cost per keyframe.
-        keyframe_mpx: additional cost per keyframe for each megapixel of the image.
-    """
-
-    start: float
-    frame: float = 0.0
-    frame_mpx: float = 0.0
-    keyframe: float = 0.0
-    keyframe_mpx: float = 0.0
+    start: float  #: fixed cost of start and report
+    frame: float = 0.0  #: cost per frame
+    frame_mpx: float = 0.0  #: additional cost per frame for each megapixel of the image
+    keyframe: float = 0.0  #: cost per keyframe
+    keyframe_mpx: float = 0.0  #: additional cost per keyframe for each megapixel of the image
 
     def total(self, n_frames: int, n_keyframes: int, megapixels: float) -> float:
         """Returns the cost of a survey with images of `megapixels` each."""
@@ -66,39 +52,24 @@ _FACE_MB, _MESH_TEXEL_MB = 80e-6, 4e-6  #: memory of a mesh floor [MB], per tria
 
 
 def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
-    """Returns the estimated computing cost of simulating a mission.
-
-    Args:
-        mission: the survey.
-        n_keyframes: number of its keyframes.
-    """
+    """Returns the estimated computing cost of simulating a mission with this number of keyframes."""
     megapixels = mission.rig.width_px * mission.rig.height_px / 1e6
-    n_frames = mission.n_frames
+    size = mission.n_frames, n_keyframes, megapixels
     if mission.scenario.imaging.fidelity == "surrogate":
-        return ComputingCost(
-            _SURROGATE_S.total(n_frames, n_keyframes, megapixels), _SURROGATE_MB,
-            _SURROGATE_DISK_MB.total(n_frames, n_keyframes, megapixels),
-        )  # fmt: skip
-    window = n_keyframes * min(1.0, (mission.scenario.estimator_settings().window_tracks + 1) / len(mission.tracks))
-    texels = mission.terrain.texture.size / 3
-    floor_mb = _NODE_MB * mission.terrain.height_m.size + _TEXEL_MB * texels + _mesh_mb(mission) + _walls_mb(mission)
-    return ComputingCost(
-        _RENDERED_S.total(n_frames, n_keyframes, megapixels),
-        _RENDERED_MB.total(n_frames, round(window), megapixels) + _IMAGES_MB_PER_MPX * megapixels + floor_mb,
-        _RENDERED_DISK_MB.total(n_frames, n_keyframes, megapixels),
-    )
+        return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB, _SURROGATE_DISK_MB.total(*size))
+    window = round(n_keyframes * min(1.0, (mission.scenario.estimate.window_tracks + 1) / len(mission.tracks)))
+    memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
+    return ComputingCost(_RENDERED_S.total(*size), memory_mb + _floor_mb(mission), _RENDERED_DISK_MB.total(*size))
 
 
-def _walls_mb(mission: Mission) -> float:
-    """Returns the memory of the texture of the walls of the floor and of its weights [MB]."""
-    walls = mission.terrain.walls
-    return 0.0 if walls is None else _WALL_CELL_MB * len(walls.weights) + _WALL_TEXEL_MB * walls.texture.size / 3
-
-
-def _mesh_mb(mission: Mission) -> float:
-    """Returns the memory of the triangles and the textures of a mesh floor [MB]; 0 for any other floor."""
-    if mission.mesh_floor is None:
-        return 0.0
-    tiles, textures = mission.mesh_floor.tiles
-    n_faces = sum(len(tile.placed.model.levels[0].mesh.faces) for tile in tiles)
-    return _FACE_MB * n_faces + _MESH_TEXEL_MB * len(textures.texels) * 3 / 4
+def _floor_mb(mission: Mission) -> float:
+    """Returns the memory of the height grid, its texture, the walls with theirs, and a mesh floor [MB]."""
+    terrain, walls = mission.terrain, mission.terrain.walls
+    floor_mb = _NODE_MB * terrain.height_m.size + _TEXEL_MB * (terrain.texture.size / 3)
+    if mission.mesh_floor is not None:
+        tiles, textures = mission.mesh_floor.tiles
+        n_faces = sum(len(tile.placed.model.levels[0].mesh.faces) for tile in tiles)
+        floor_mb += _FACE_MB * n_faces + _MESH_TEXEL_MB * len(textures.texels) * 3 / 4
+    if walls is not None:
+        floor_mb += _WALL_CELL_MB * len(walls.weights) + _WALL_TEXEL_MB * walls.texture.size / 3
+    return floor_mb

@@ -48,19 +48,18 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
 
     Outlined markers show overlaps that are more than `OVERLAP_TOLERANCE` below the required one.
     """
-    floor, required = summary.floor, required_overlaps(summary.mission)
-    t = summary.mission.terrain
+    floor, t = summary.floor, summary.mission.terrain
+    along, across = required_overlaps(summary.mission)
     axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))
     axes.add_patch(_area(summary.mission, ec=COLOURS["limit"], ls="--", fill=False, linewidth=1.4))
     pairs = (
-        ("along", "o", 14, floor.along_position_m, floor.overlap_along, required.along),
-        ("across", "D", 9, floor.across_position_m, floor.overlap_across, required.across),
+        ("along", "o", 14, floor.along_position_m, floor.overlap_along, along),
+        ("across", "D", 9, floor.across_position_m, floor.overlap_across, across),
     )
     short_label = "less than required"
     for name, marker, size, position, values, least in pairs:
-        shown = axes.scatter(
-            *position.T, s=size, c=values, marker=marker, cmap="viridis", vmin=0, vmax=1, label=f"overlap {name}"
-        )
+        colours = {"c": values, "cmap": "viridis", "vmin": 0, "vmax": 1}
+        shown = axes.scatter(*position.T, s=size, marker=marker, label=f"overlap {name}", **colours)
         short = values < least - OVERLAP_TOLERANCE
         if short.any():
             style = {"facecolors": "none", "edgecolors": COLOURS["limit"], "linewidths": 0.8}

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 from twin.controllers.forecast import Forecast, forecast
+from twin.core.geometry import Array
 from twin.imaging.light.spectra import provenance_of
 from twin.judge.require import judge_requirements
 from twin.judge.summary_statistics import finite_tree
@@ -25,17 +26,17 @@ DISPARITY_SIGMA_PX = 0.1
 OVERLAP_TOLERANCE = 0.01
 #: For each survey pattern: the name of a swath, and the swaths of one track.
 _SWATHS = {"lawnmower": ("leg", "two legs"), "loops": ("loop", "a loop")}
-#: For each property of the images over the floor: its label, and the function that formats its value.
-_PROPERTIES: dict[str, tuple[str, Callable[[float | None], str]]] = {
-    "altitude_m": ("altitude above the floor", length),
-    "clearance_m": ("clearance", length),
-    "footprint_across_m": ("footprint across", length),
-    "footprint_along_m": ("footprint along", length),
-    "gsd_m": ("ground sample distance", length),
-    "overlap_along": ("overlap along", percent),
-    "overlap_across": ("overlap across (sidelap)", percent),
-    "stereo_share": ("floor seen by both cameras", percent),
-    "height_sigma_m": ("expected sigma of height", length),
+#: For each property of the images over the floor: its label, and the functions that format and return its values.
+_PROPERTIES: dict[str, tuple[str, Callable[[float | None], str], Callable[[PlanSummary], Array]]] = {
+    "altitude_m": ("altitude above the floor", length, lambda s: s.floor.altitude_m),
+    "clearance_m": ("clearance", length, lambda s: s.floor.clearance_m),
+    "footprint_across_m": ("footprint across", length, lambda s: s.floor.footprint_m[:, 0]),
+    "footprint_along_m": ("footprint along", length, lambda s: s.floor.footprint_m[:, 1]),
+    "gsd_m": ("ground sample distance", length, lambda s: s.floor.gsd_m),
+    "overlap_along": ("overlap along", percent, lambda s: s.floor.overlap_along),
+    "overlap_across": ("overlap across (sidelap)", percent, lambda s: s.floor.overlap_across),
+    "stereo_share": ("floor seen by both cameras", percent, lambda s: s.floor.stereo_share),
+    "height_sigma_m": ("expected sigma of height", length, lambda s: s.error.sigma_m),
 }
 #: The error model counts as extrapolated beyond this multiple of the largest Cramér-Rao bound to which it was fitted.
 _EXTRAPOLATED = 1.5
@@ -69,6 +70,11 @@ class PlanSummary:
         """Returns whether all requirements that can be predicted are expected to be met."""
         return all(r["passed"] for r in self.require.values())
 
+    @property
+    def hold_s(self) -> float:
+        """Returns the time of station keeping [s]."""
+        return self.mission.scenario.control.hold_s * len(self.mission.tracks)
+
 
 def summarise(mission: Mission) -> PlanSummary:
     """Returns the summary of a mission, computed without a simulation."""
@@ -76,10 +82,10 @@ def summarise(mission: Mission) -> PlanSummary:
     floor = forecast_over_floor(mission)
     error = expected_error(mission, floor)
     predicted = _predicted_metrics(floor, error)
-    limits = {name: limit for name, limit in mission.scenario.require.items() if _known(name, predicted)}
-    require = judge_requirements(limits, predicted)
-    expected = (*_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
-    warnings = (*(note.removesuffix(".") for note in mission.terrain.hole_notes), *expected)
+    known = {f"{section}.{key}" for section, metrics in predicted.items() for key in metrics}
+    require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
+    holes = (note.removesuffix(".") for note in mission.terrain.hole_notes)
+    warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
     return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
 
 
@@ -106,95 +112,70 @@ def _predicted_metrics(floor: FloorForecast, error: ExpectedError) -> dict[str, 
     }
 
 
-def _known(name: str, predicted: dict[str, dict[str, float | None]]) -> bool:
-    """Returns whether a metric, named `section.key`, is among the predicted ones."""
-    section, _, key = name.partition(".")
-    return key in predicted.get(section, {})
+def _missed(require: dict[str, dict[str, Any]]) -> Iterator[str]:
+    """Yields a sentence for each requirement that the plan is expected to miss."""
+    for name, r in require.items():
+        if not r["passed"]:
+            expected, limit = with_unit(name, r["value"]), with_unit(name, r["limit"])
+            yield f"{name} is expected to miss its limit: {expected} expected, limit {limit}"
 
 
-def _missed(require: dict[str, dict[str, Any]]) -> list[str]:
-    """Returns a sentence for each requirement that the plan is expected to miss."""
-    return [
-        f"{name} is expected to miss its limit: {with_unit(name, r['value'])} expected, "
-        f"limit {with_unit(name, r['limit'])}"
-        for name, r in require.items()
-        if not r["passed"]
-    ]
-
-
-class RequiredOverlap(NamedTuple):
-    """Required overlaps, as fractions of the image sides along and across the swath."""
-
-    along: float
-    across: float
-
-
-def required_overlaps(mission: Mission) -> RequiredOverlap:
+def required_overlaps(mission: Mission) -> tuple[float, float]:
     """Returns the required overlaps as fractions of the image sides along and across the swath.
 
     The overlap along is converted: the scenario gives it as a fraction of the image width (see `frames_per_keyframe`).
     """
     plan, required = mission.plan, mission.scenario.plan
     along = 1 - (1 - required.overlap_along) * plan.footprint_m[0] / plan.side_along_m
-    return RequiredOverlap(max(0.0, along), required.overlap_across)
+    return max(0.0, along), required.overlap_across
 
 
-def _short_overlap(mission: Mission, floor: FloorForecast) -> list[str]:
-    """Returns a sentence for each direction in which the 5th percentile of the overlap is insufficient.
-
-    See `OVERLAP_TOLERANCE`.
-    """
-    required = required_overlaps(mission)
-    found = (
-        ("along the swaths", spread(floor.overlap_along).p05, required.along),
-        ("between swaths", spread(floor.overlap_across).p05, required.across),
-    )
-    return [
-        f"{SHORT_PERCENT:g} % of the keyframes have an overlap {where} below {percent(p05)} over the floor; "
-        f"{percent(limit)} is required"
-        for where, p05, limit in found
-        if p05 is not None and p05 < limit - OVERLAP_TOLERANCE
-    ]
+def _short_overlap(mission: Mission, floor: FloorForecast) -> Iterator[str]:
+    """Yields a sentence for each direction in which the 5th percentile of the overlap is insufficient."""
+    found = (("along the swaths", floor.overlap_along), ("between swaths", floor.overlap_across))
+    for (where, overlap), limit in zip(found, required_overlaps(mission), strict=True):
+        p05 = spread(overlap).p05
+        if p05 is not None and p05 < limit - OVERLAP_TOLERANCE:
+            yield (
+                f"{SHORT_PERCENT:g} % of the keyframes have an overlap {where} below {percent(p05)} over the floor; "
+                f"{percent(limit)} is required"
+            )
 
 
-def _limits_of_validity(mission: Mission, error: ExpectedError) -> list[str]:
-    """Returns a sentence for each limit of validity of the plan that applies to a mission.
+def _limits_of_validity(mission: Mission, error: ExpectedError) -> Iterator[str]:
+    """Yields a sentence for each limit of validity of the plan that applies to a mission.
 
     These are that the expected error is extrapolated, that it leaves out effects, and that the plan leaves out objects.
     """
-    sentences = []
+    scenario = mission.scenario
     if error.bound_px > _EXTRAPOLATED * error.fitted_bound_px:
-        sentences.append(
+        yield (
             f"the expected error is extrapolated: matching precision {error.bound_px:.3g} px, error model fitted up to "
             f"{error.fitted_bound_px:.3g} px"
         )
-    scenario = mission.scenario
-    given = {
-        "[port]": scenario.port.kind != "none",
-        "[calibration_error]": scenario.calibration_error != type(scenario.calibration_error)(),
-    }
-    if any(given.values()):
-        sections = ", ".join(name for name, present in given.items() if present)
-        sentences.append(f"the expected error does not include the effects of {sections}")
+    sections = ["[port]"] if scenario.port.kind != "none" else []
+    if scenario.calibration_error != type(scenario.calibration_error)():
+        sections.append("[calibration_error]")
+    if sections:
+        yield f"the expected error does not include the effects of {', '.join(sections)}"
     if mission.objects and scenario.imaging.fidelity != "rendered":
-        sentences.append("the surrogate surveys the bare sea floor, and so does this plan: both leave out [[objects]]")
-    return sentences
+        yield "the surrogate surveys the bare sea floor, and so does this plan: both leave out [[objects]]"
 
 
 def rows(summary: PlanSummary) -> list[tuple[str, str]]:
     """Returns the properties of the plan as text: pairs (name, value with unit)."""
-    f, mission = summary.plane, summary.mission
+    f, mission, error = summary.plane, summary.mission, summary.error
     width_m, height_m = f.footprint_m
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]
-    tracks = len(mission.tracks)
-    hold_s = mission.scenario.control.hold_s * tracks
+    included = "included" if mission.scenario.imaging.fidelity == "rendered" else "not included"
+    objects = f"{len(mission.objects)}, {included} in the properties over the floor"
     return [
-        (f"tracks L, {of_track} each", f"{tracks}"),
+        (f"tracks L, {of_track} each", f"{len(mission.tracks)}"),
         ("frames per keyframe N", f"{f.n_frames_per_keyframe}"),
         (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
         ("keyframes", f"{f.n_keyframes}"),
         ("frames", f"{mission.n_frames}"),
-        ("time", f"{f.duration_s + hold_s:.0f} s, of which {hold_s:.0f} s station keeping"),
+        ("time", f"{f.duration_s + summary.hold_s:.0f} s, of which {summary.hold_s:.0f} s station keeping"),
         ("path", length(f.path_m)),
         ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
         ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {length(f.swath_spacing_m)} between {swath}s"),
@@ -202,77 +183,53 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ("on the reference plane: overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("on the reference plane: disparity", f"{f.disparity_px:.1f} px"),
         ("water", provenance_of(mission.scenario.water)),
-        *([("objects", _objects_text(mission))] if mission.objects else []),
+        *([("objects", objects)] if mission.objects else []),
         ("coverage of the area by both cameras", percent(summary.floor.coverage)),
-        ("expected LE90 of the map", _expected_le90(summary)),
-        ("simulation", cost_text(summary.cost)),
+        (
+            "expected LE90 of the map",
+            f"{length(error.percentile_m(90))} where mapped, {percent(error.completeness)} of the view",
+        ),
+        ("simulation", _cost_text(summary.cost)),
     ]
 
 
-def _objects_text(mission: Mission) -> str:
-    """Returns the number of objects, and whether the properties over the floor include them, as text."""
-    included = "included" if mission.scenario.imaging.fidelity == "rendered" else "not included"
-    return f"{len(mission.objects)}, {included} in the properties over the floor"
-
-
-def _expected_le90(summary: PlanSummary) -> str:
-    """Returns the expected LE90 and completeness of the map as text."""
-    return f"{length(summary.error.percentile_m(90))} where mapped, {percent(summary.error.completeness)} of the view"
-
-
-def cost_text(cost: ComputingCost) -> str:
+def _cost_text(cost: ComputingCost) -> str:
     """Returns the computing cost as text."""
-    minutes, disk = cost.wall_s / 60, cost.disk_mb
+    minutes = cost.wall_s / 60
     time = f"{cost.wall_s:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
-    return f"about {time} on 2 cores, {cost.memory_mb / 1000:.1f} GB of memory, {disk:.0f} MB of disk"
+    return f"about {time} on 2 cores, {cost.memory_mb / 1000:.1f} GB of memory, {cost.disk_mb:.0f} MB of disk"
 
 
 def floor_rows(summary: PlanSummary) -> list[tuple[str, ...]]:
     """Returns a header and the image properties over the floor: label, minimum, 5th percentile, median, maximum."""
     table: list[tuple[str, ...]] = [("", "minimum", "5 %", "median", "maximum")]
     for key, values in floor_spreads(summary).items():
-        label, write = _PROPERTIES[key]
+        label, write, _ = _PROPERTIES[key]
         table.append((label, *(write(v) for v in values)))
     return table
 
 
 def floor_spreads(summary: PlanSummary) -> dict[str, Spread]:
     """Returns the spread of each image property over the floor, by its JSON key."""
-    f = summary.floor
-    values = {
-        "altitude_m": f.altitude_m,
-        "clearance_m": f.clearance_m,
-        "footprint_across_m": f.footprint_m[:, 0],
-        "footprint_along_m": f.footprint_m[:, 1],
-        "gsd_m": f.gsd_m,
-        "overlap_along": f.overlap_along,
-        "overlap_across": f.overlap_across,
-        "stereo_share": f.stereo_share,
-        "height_sigma_m": summary.error.sigma_m,
-    }
-    return {key: spread(v) for key, v in values.items()}
+    return {key: spread(values_of(summary)) for key, (_, _, values_of) in _PROPERTIES.items()}
 
 
 def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
     """Returns the summary as a JSON object: lengths in metres, fractions from 0 to 1, missing values null.
 
-    Args:
-        summary: the summary of the plan.
-        picture: path of the drawing of the plan, which is the value of "picture".
+    `picture` is the path of the drawing of the plan.
     """
-    mission, error = summary.mission, summary.error
-    plane = summary.plane._asdict()
-    hold_s = mission.scenario.control.hold_s * len(mission.tracks)
+    mission, plane = summary.mission, summary.plane._asdict()
     return finite_tree(
         {
             "schema": "twin.plan/1",
             "name": mission.scenario.name,
             "objects": len(mission.objects),
             "water": provenance_of(mission.scenario.water),
-            "plan": plane | {"duration_s": plane["duration_s"] + hold_s, "n_frames": mission.n_frames},
+            "plan": plane | {"duration_s": plane["duration_s"] + summary.hold_s, "n_frames": mission.n_frames},
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,
-            "expected": _predicted_metrics(summary.floor, error),
+            "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,
             "cost": summary.cost._asdict(),
             "warnings": list(summary.warnings),
