@@ -74,7 +74,7 @@ def load(
     covered = share = None
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
-        from twin.terrains.draped_image import lay_orthophoto
+        from twin.terrains.draped_orthophoto import lay_orthophoto
 
         covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
         share = float(covered.mean())

@@ -9,9 +9,9 @@ from twin.core import geometry, threads
 from twin.imaging.scene import mesh_raster
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 from twin.imaging.scene.sway import swayed
-from twin.terrains.objects.mesh import Mesh, mesh_of
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.coloured_mesh import Mesh, mesh_of
 from twin.terrains.objects.parts import PART_FACES, UNKNOWN, Parts, parts_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import box
 from twin.terrains.objects.shapes import SHAPES, build_shape
 

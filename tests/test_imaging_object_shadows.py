@@ -11,8 +11,8 @@ from twin.imaging.light.shadows import Shadows
 from twin.imaging.scene.mesh_raster import ObjectView
 from twin.imaging.scene.object_shadows import ObjectShadows
 from twin.imaging.scene.object_view import ObjectRenderer, Objects
-from twin.terrains.objects.mesh import mesh_of
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.coloured_mesh import mesh_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import sphere
 
 W, H, FOCAL = 160, 120, 150.0

@@ -11,8 +11,8 @@ from twin.imaging.scene import object_view
 from twin.imaging.scene.mesh_raster import DrawnMesh, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.scenes.gl import mujoco
-from twin.terrains.objects.mesh import Mesh, mesh_of
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.coloured_mesh import Mesh, mesh_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import box, sphere
 from twin.terrains.objects.shapes import SHAPES, build_shape
 

@@ -18,7 +18,7 @@ from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.imaging.scene.renderer import Renderer
 from twin.scenes.builder import build
 from twin.terrains import TextureSource
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.shapes import build_shape
 
 W, H, VFOV = 160, 120, 45.0

@@ -10,7 +10,7 @@ from twin.core.records import StereoRig
 from twin.imaging.scene import object_view, sway
 from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.imaging.scene.sway import largest_displacement_m, swayed
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.shapes import build_shape
 
 #: A narrow view, so that a plane of its frustum is nearly vertical.

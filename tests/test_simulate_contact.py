@@ -15,8 +15,8 @@ from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.contact import CENTRE_M, HALF_M, floor_field, touches_floor
 from twin.surrogate import surrogate_world
 from twin.terrains import Terrain
-from twin.terrains.objects.mesh import mesh_of
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.coloured_mesh import mesh_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import sphere
 from twin.world.mission import prepare
 from twin.world.obstacles import Obstacles

@@ -14,12 +14,12 @@ from twin import terrains
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario, TerrainConfig
 from twin.terrains.ground_cover import COVERS
-from twin.terrains.objects import mesh_file, placement
+from twin.terrains.objects import mesh_file, scattering
+from twin.terrains.objects.coloured_mesh import Mesh
 from twin.terrains.objects.detail import levels_of
 from twin.terrains.objects.floor_mesh import tiles_of
-from twin.terrains.objects.mesh import Mesh
 from twin.terrains.objects.mesh_header import face_count
-from twin.terrains.objects.model import model_of
+from twin.terrains.objects.placed_object import model_of
 from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world.objects import load_objects
 
@@ -175,7 +175,7 @@ CONE = model_of(mesh_file._mesh(*(lambda c: (c.vertices, c.faces, np.full((len(c
 
 def scattered(seed=1, taken=(), **keys):
     config = ObjectConfig(shape="boulder", **({"per_m2": 1.0, "size_m": 0.3} | keys))
-    return placement.place(2, config, [CONE], reef(), taken, seed)
+    return scattering.place(2, config, [CONE], reef(), taken, seed)
 
 
 def test_scattered_objects_have_the_density_and_do_not_overlap():
@@ -205,7 +205,7 @@ def test_scattered_objects_stand_on_their_ground(ground, steep):
     for item in scattered(on=ground):
         x, y = item.world_from_object[:2, 3, None]
         reach_m = 0.3 / np.sqrt(2) / 2
-        assert (placement.slope_deg(reef(), x, y, reach_m)[0] >= placement.STEEP_DEG) == steep
+        assert (scattering.slope_deg(reef(), x, y, reach_m)[0] >= scattering.STEEP_DEG) == steep
 
 
 def test_placement_is_seeded():
@@ -246,12 +246,12 @@ def test_the_shapes_and_covers_of_scenarios_are_those_that_can_be_built():
 
 def test_objects_are_sunk_and_perpendicular_to_the_floor():
     config = ObjectConfig(shape="boulder", position_m=(0.0, 0.0), size_m=0.4, sunk=0.25)
-    item = placement.place(0, config, [CONE], PLANE, [], 1)[0]
+    item = scattering.place(0, config, [CONE], PLANE, [], 1)[0]
     np.testing.assert_allclose(item.corners_m()[:, 2].min(), -0.1, atol=1e-6)
     floor = terrains.Terrain(
         np.tile(np.linspace(0, 2, 21, dtype=np.float32), (21, 1)), 0.2, -2.0, -2.0, np.zeros((4, 4, 3), np.uint8), 1.0
     )
-    tilted = placement.place(0, config.model_copy(update={"upright": False}), [CONE], floor, [], 1)[0]
+    tilted = scattering.place(0, config.model_copy(update={"upright": False}), [CONE], floor, [], 1)[0]
     axis = tilted.world_from_object[:3, 2] / tilted.scale
     np.testing.assert_allclose(axis, np.array([-0.5, 0, 1]) / np.sqrt(1.25), atol=1e-6)
     np.testing.assert_allclose(tilted.world_from_object[:3, 3], [0, 0, 1] - 0.1 * axis, atol=1e-6)

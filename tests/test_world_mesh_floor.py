@@ -20,8 +20,8 @@ from twin.scenario.file import find_scene, load_scenario
 from twin.scenes.gl import mujoco
 from twin.surrogate import matchability
 from twin.terrains.objects import mesh_file
+from twin.terrains.objects.coloured_mesh import Mesh, joined
 from twin.terrains.objects.floor_mesh import divided, levelled, tiles_of
-from twin.terrains.objects.mesh import Mesh, joined
 from twin.terrains.objects.mesh_file import TexturedMesh
 from twin.world import mesh_floor, top_surface
 from twin.world.mesh_floor import floor_surface

@@ -9,8 +9,8 @@ from twin.core import geometry
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError
 from twin.scenario.file import dump_toml, load_scenario
-from twin.terrains.objects.mesh import mesh_of
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.coloured_mesh import mesh_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import sphere
 from twin.terrains.objects.shapes import build_shape
 from twin.world.mission import prepare

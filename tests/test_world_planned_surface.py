@@ -13,8 +13,8 @@ from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
 from twin.surrogate.surrogate_world import SurrogateWorld
 from twin.terrains import Terrain, TextureSource
-from twin.terrains.objects.mesh import mesh_of
-from twin.terrains.objects.model import PlacedObject, model_of
+from twin.terrains.objects.coloured_mesh import mesh_of
+from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import box
 from twin.world.floor_forecast import forecast_over_floor, planned_surface
 from twin.world.mission import prepare

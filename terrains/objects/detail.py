@@ -12,28 +12,22 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.terrains.objects.mesh import Mesh, median_edge_m
+from twin.terrains.objects.coloured_mesh import Mesh, median_edge_m
 from twin.terrains.objects.parts import Parts, parts_of
 
 FEWEST_FACES = 64  #: a level with at most this many triangles is the last one
 
 
 class Level(NamedTuple):
-    """One level of detail.
+    """One level of detail."""
 
-    Args:
-        mesh: the mesh; its positions are stored column by column, as the rasterizer reads them.
-        cell_m: side of the cells in which vertices were merged; 0 for the full mesh.
-        parts: bounds of the parts of the mesh.
-    """
-
-    mesh: Mesh
-    cell_m: float
-    parts: Parts
+    mesh: Mesh  #: its positions are stored column by column, as the rasterizer reads them
+    cell_m: float  #: side of the cells in which vertices were merged; 0 for the full mesh
+    parts: Parts  #: bounds of the parts of the mesh
 
 
 def level_of(mesh: Mesh, cell_m: float) -> Level:
-    """Returns a mesh as a level of detail; see `Level` for the arguments."""
+    """Returns a mesh as a level of detail."""
     return Level(mesh._replace(vertices_m=np.asfortranarray(mesh.vertices_m)), cell_m, parts_of(mesh))
 
 
@@ -61,36 +55,33 @@ def clustered(mesh: Mesh, cell_m: float) -> Mesh:
 
     Triangles that then have two corners in one cell are removed, and of equal triangles all but one.
     """
-    cells = np.floor((mesh.vertices_m - mesh.vertices_m.min(axis=0)) / cell_m).astype(np.int64)
-    _, vertex_of, count = np.unique(_numbers(cells), return_inverse=True, return_counts=True)
+    vertex_of, colours, positions = _clusters(mesh, cell_m)
     faces = vertex_of[mesh.faces]
     a, b, c = faces.T
     faces = faces[(a != b) & (b != c) & (c != a)]
-    _, kept = np.unique(_numbers(_smallest_first(faces)), return_index=True)
-    faces = faces[np.sort(kept)]
-    positions = _means(mesh.vertices_m, vertex_of, count)
-    colours = _means(mesh.colours, vertex_of, count)
-    return Mesh(positions.astype(np.float32), faces.astype(np.int32), np.rint(colours).astype(np.uint8))
+    smallest_first = np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    _, kept = np.unique(_numbers(smallest_first), return_index=True)
+    return Mesh(positions.astype(np.float32), faces[np.sort(kept)].astype(np.int32), colours)
 
 
 def cell_colours(mesh: Mesh, cell_m: float) -> NDArray[np.uint8]:
     """Returns the mean colour (n, 3) of the vertices in the cubic cell of side `cell_m` of each vertex."""
+    vertex_of, colours, _ = _clusters(mesh, cell_m)
+    return colours[vertex_of]
+
+
+def _clusters(mesh: Mesh, cell_m: float) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.float64]]:
+    """Returns the number (n,) of the cell of each vertex, and mean colour and position (k, 3) of each cell."""
     cells = np.floor((mesh.vertices_m - mesh.vertices_m.min(axis=0)) / cell_m).astype(np.int64)
-    _, vertex_of, count = np.unique(_numbers(cells), return_inverse=True, return_counts=True)
-    return np.rint(_means(mesh.colours, vertex_of, count)).astype(np.uint8)[vertex_of]
-
-
-def _smallest_first(faces: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Returns the faces (m, 3) with their smallest vertex number first, in the same cyclic order."""
-    return np.take_along_axis(faces, (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3, axis=1)
+    _, cell_of, count = np.unique(_numbers(cells), return_inverse=True, return_counts=True)
+    colours, positions = (
+        np.stack([np.bincount(cell_of, column, len(count)) / count for column in values.T.astype(np.float64)], axis=1)
+        for values in (mesh.colours, mesh.vertices_m)
+    )
+    return cell_of, np.rint(colours).astype(np.uint8), positions
 
 
 def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
     """Returns a number (n,) for each triple (n, 3) of integers >= 0; only equal triples have equal numbers."""
     size = triples.max(axis=0, initial=0) + 1
     return (triples[:, 0] * size[1] + triples[:, 1]) * size[2] + triples[:, 2]
-
-
-def _means(values: NDArray[np.floating | np.integer], group: NDArray[np.int64], count: NDArray[np.int64]):
-    """Returns the mean (k, 3) of the values (n, 3) of each group."""
-    return np.stack([np.bincount(group, column, len(count)) / count for column in values.T.astype(np.float64)], axis=1)

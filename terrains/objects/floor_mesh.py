@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
+from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.detail import cell_colours, level_of
-from twin.terrains.objects.mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.mesh_file import MAX_FACES, TexturedMesh
-from twin.terrains.objects.model import ObjectModel, PlacedObject
+from twin.terrains.objects.placed_object import ObjectModel, PlacedObject
 from twin.terrains.objects.texture_pyramid import Textures, textures_of
 
 TILE_M = 1.0  #: side of a tile; larger if there were more than MAX_TILES tiles

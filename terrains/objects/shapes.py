@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.terrains.objects import organisms, things
-from twin.terrains.objects.mesh import Mesh
+from twin.terrains.objects.coloured_mesh import Mesh
 
 
 class Shape(NamedTuple):

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.terrains.objects.mesh import Mesh, mesh_of
+from twin.terrains.objects.coloured_mesh import Mesh, mesh_of
 from twin.terrains.objects.primitives import Array, box, mottled, noise, resampled, sphere, turned
 
 

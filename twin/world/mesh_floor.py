@@ -24,8 +24,8 @@ from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_m
 from twin.imaging.scene.object_view import Objects, draw_objects
 from twin.scenario.model import Scenario
 from twin.terrains.holes import known_nodes
+from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
-from twin.terrains.objects.mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
 from twin.terrains.terrain import texture_shape
 from twin.world.top_surface import (

@@ -26,7 +26,7 @@ from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, Source
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import imu_rate_hz
-from twin.terrains.objects.model import PlacedObject
+from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects

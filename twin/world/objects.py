@@ -12,8 +12,8 @@ from twin import terrains
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario
 from twin.terrains.objects.mesh_file import read_mesh
-from twin.terrains.objects.model import ObjectModel, PlacedObject, model_of
-from twin.terrains.objects.placement import place
+from twin.terrains.objects.placed_object import ObjectModel, PlacedObject, model_of
+from twin.terrains.objects.scattering import place
 from twin.terrains.objects.shapes import SHAPES, build_shape
 from twin.world.scenario_checks import keys_without_effect
 

@@ -15,8 +15,8 @@ from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig
 from twin.terrains import Terrain
-from twin.terrains.objects.model import PlacedObject
-from twin.terrains.objects.placement import disc_of
+from twin.terrains.objects.placed_object import PlacedObject
+from twin.terrains.objects.scattering import disc_of
 from twin.world.planned_images import planned_references
 
 VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up

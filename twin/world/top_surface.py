@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from twin.core.records import Array, MapGrid
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 from twin.terrains import Terrain
-from twin.terrains.objects.model import PlacedObject
+from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.terrain import MAX_NODES
 
 Layer = NDArray[np.float32]

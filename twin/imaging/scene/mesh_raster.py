@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from twin.core.threads import in_row_bands
 from twin.kernels import kernel
-from twin.terrains.objects.mesh import Mesh
+from twin.terrains.objects.coloured_mesh import Mesh
 from twin.terrains.objects.parts import PART_FACES, UNKNOWN, Parts
 
 Array = NDArray[np.float64]

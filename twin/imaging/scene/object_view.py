@@ -14,8 +14,8 @@ from twin.imaging.scene.mesh_texture import TexturedSurface, paint_textures
 from twin.imaging.scene.sway import largest_displacement_m, swayed
 from twin.terrains.objects.detail import Level
 from twin.terrains.objects.floor_mesh import FloorTiles
-from twin.terrains.objects.model import PlacedObject
 from twin.terrains.objects.parts import UNKNOWN
+from twin.terrains.objects.placed_object import PlacedObject
 
 Array = NDArray[np.float64]
 Depth = NDArray[np.float32]

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.terrains.objects.mesh import Mesh
-from twin.terrains.objects.model import PlacedObject
+from twin.terrains.objects.coloured_mesh import Mesh
+from twin.terrains.objects.placed_object import PlacedObject
 
 Array = NDArray[np.float64]
 

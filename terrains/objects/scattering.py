@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig
-from twin.terrains.objects.model import ObjectModel, PlacedObject
+from twin.terrains.objects.placed_object import ObjectModel, PlacedObject
 from twin.terrains.terrain import Terrain
 
 STEEP_DEG = 15.0  #: a floor less steep than this counts as sand; about half the angle of repose of sand

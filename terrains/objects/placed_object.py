@@ -7,30 +7,23 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
+from twin.terrains.objects.coloured_mesh import Mesh, extent, is_closed, standing
 from twin.terrains.objects.detail import Level, levels_of
-from twin.terrains.objects.mesh import Mesh, extent, is_closed, standing
 
 
 class ObjectModel(NamedTuple):
     """Shape that several objects share, or a tile of a mesh floor.
 
     A shape stands on the plane z = 0 and is centred at x = y = 0; a tile has world coordinates.
-
-    Args:
-        levels: levels of detail, finest first.
-        low_m, high_m: (3,) minimum and maximum corner of the bounding box.
-        centre_m, radius_m: centre (3,) and radius of a bounding sphere.
-        sways: whether the object bends in the current.
-        closed: whether the mesh encloses a volume, so that only triangles that face the viewer are seen.
     """
 
-    levels: tuple[Level, ...]
-    low_m: Array
+    levels: tuple[Level, ...]  #: levels of detail, finest first
+    low_m: Array  #: (3,) minimum and maximum corner of the bounding box
     high_m: Array
-    centre_m: Array
+    centre_m: Array  #: (3,) centre and radius of a bounding sphere
     radius_m: float
-    sways: bool = False
-    closed: bool = False
+    sways: bool = False  #: whether the object bends in the current
+    closed: bool = False  #: whether the mesh encloses a volume, so that only triangles that face the viewer are seen
 
     @property
     def size_m(self) -> float:
@@ -39,21 +32,13 @@ class ObjectModel(NamedTuple):
 
 
 class PlacedObject(NamedTuple):
-    """One object in the world.
-
-    Args:
-        model: shape of the object.
-        world_from_object: (4, 4) pose, with its rotation multiplied by the scale.
-        scale: size in the world divided by the size of the model.
-        group: number, from 0, of the object's entry in `[[objects]]`; -1 for a tile of a mesh floor.
-        phase: phase of its sway [rad].
-    """
+    """One object in the world."""
 
     model: ObjectModel
-    world_from_object: Array
-    scale: float
-    group: int
-    phase: float = 0.0
+    world_from_object: Array  #: (4, 4) pose, with its rotation multiplied by the scale
+    scale: float  #: size in the world divided by the size of the model
+    group: int  #: number, from 0, of the object's entry in `[[objects]]`; -1 for a tile of a mesh floor
+    phase: float = 0.0  #: phase of its sway [rad]
 
     @property
     def centre_m(self) -> Array:
@@ -67,15 +52,19 @@ class PlacedObject(NamedTuple):
 
     def corners_m(self) -> Array:
         """Returns the corners (8, 3) of the bounding box in the world [m]; the box has the axes of the object."""
-        pick = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], bool)
-        corners = np.where(pick, self.model.high_m, self.model.low_m)
+        corners = np.where(np.array(list(np.ndindex(2, 2, 2)), bool), self.model.high_m, self.model.low_m)
         return corners @ self.world_from_object[:3, :3].T + self.world_from_object[:3, 3]
 
 
 def model_of(mesh: Mesh, sways: bool = False) -> ObjectModel:
     """Returns the model of a mesh, moved so that it stands at the origin."""
     mesh = standing(mesh)
-    low, high = extent(mesh)
+    return model_with(levels_of(mesh), sways, is_closed(mesh))
+
+
+def model_with(levels: tuple[Level, ...], sways: bool = False, closed: bool = False) -> ObjectModel:
+    """Returns the model with these levels of detail, whose first has the full geometry."""
+    low, high = extent(levels[0].mesh)
     centre = (low + high) / 2
-    radius_m = float(np.linalg.norm(mesh.vertices_m - centre, axis=1).max())
-    return ObjectModel(levels_of(mesh), low, high, centre, radius_m, sways, is_closed(mesh))
+    radius_m = float(np.linalg.norm(levels[0].mesh.vertices_m - centre, axis=1).max())
+    return ObjectModel(levels, low, high, centre, radius_m, sways, closed)
