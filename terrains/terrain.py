@@ -8,8 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from twin.core.geometry import Array
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
+
+Index = NDArray[np.int64]
 
 #: Limits set by memory: the model for rendering takes about 400 bytes per node and 9 bytes per texel.
 MAX_NODES = 6_000_000
@@ -119,7 +122,7 @@ class Terrain:
         north_west = h00 + v * (h10 - h00) + u * (h11 - h10)
         return np.where(inside, np.where(u >= v, south_east, north_west), np.nan)
 
-    def _cells(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[NDArray[np.generic], ...]:
+    def _cells(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Index, Index, Array, Array, NDArray[np.bool_]]:
         """Returns row and column of the cells of points, their positions east and north in them; whether inside."""
         ny, nx = self.height_m.shape
         x, y = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))

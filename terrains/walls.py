@@ -64,7 +64,7 @@ def wall_weights(
     steep = normals[..., 2] <= STEEP_COSINE
     if not steep.any():
         return None
-    near = maximum_filter(steep, 3)  # the others have no weights
+    near = np.asarray(maximum_filter(steep, 3), np.bool_)  # the others have no weights
     if draped is not None:
         near &= ~_cells_with(draped, near.shape)
     row, col = np.nonzero(near)

@@ -11,27 +11,15 @@ from twin.core.geometry import Array
 
 
 class Mesh(NamedTuple):
-    """Triangles with one colour per vertex, counter-clockwise as seen from outside.
+    """Triangles with one colour per vertex, counter-clockwise as seen from outside."""
 
-    Args:
-        vertices_m: (n, 3) float32 positions in the axes of the object, z up.
-        faces: (m, 3) int32 vertex numbers.
-        colours: (n, 3) uint8 albedo, 255 = white.
-    """
-
-    vertices_m: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    colours: NDArray[np.uint8]
+    vertices_m: NDArray[np.float32]  #: (n, 3) positions in the axes of the object, z up
+    faces: NDArray[np.int32]  #: (m, 3) vertex numbers
+    colours: NDArray[np.uint8]  #: (n, 3) albedo, 255 = white
 
 
 def mesh_of(vertices_m: ArrayLike, faces: ArrayLike, albedo: ArrayLike) -> Mesh:
-    """Returns a mesh, with its albedo as 8-bit colours.
-
-    Args:
-        vertices_m: (n, 3) positions.
-        faces: (m, 3) vertex numbers.
-        albedo: (3,) or (n, 3) albedo from 0 to 1, limited to this range.
-    """
+    """Returns a mesh of vertices (n, 3) and faces (m, 3) with the albedo (3,) or (n, 3), limited to 0 to 1."""
     vertices = np.asarray(vertices_m, np.float64)
     colours = np.broadcast_to(np.clip(np.asarray(albedo, np.float64), 0, 1) * 255, vertices.shape)
     return Mesh(
@@ -85,8 +73,8 @@ def extent(mesh: Mesh) -> tuple[Array, Array]:
 def median_edge_m(mesh: Mesh) -> float:
     """Returns the median length of the edges of the triangles [m].
 
-    Edges shorter than a millionth of the largest extent, as degenerate triangles have, do not count; if all edges are
-    shorter, the result is that millionth.
+    Edges shorter than a millionth of the largest extent, as of degenerate triangles, count only if all are; then the
+    result is that millionth.
     """
     corners = mesh.vertices_m[mesh.faces]
     lengths_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)

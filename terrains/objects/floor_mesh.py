@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
+from twin.terrains.objects.coloured_mesh import Mesh, median_edge_m
 from twin.terrains.objects.detail import cell_colours, level_of
 from twin.terrains.objects.mesh_file import MAX_FACES, TexturedMesh
-from twin.terrains.objects.placed_object import ObjectModel, PlacedObject
+from twin.terrains.objects.placed_object import PlacedObject, model_with
 from twin.terrains.objects.texture_pyramid import Textures, textures_of
 
 TILE_M = 1.0  #: side of a tile; larger if there were more than MAX_TILES tiles
@@ -27,17 +27,11 @@ NO_GROUP = -1  #: `PlacedObject.group` of a tile
 
 
 class FloorTile(NamedTuple):
-    """Part of a mesh floor with one texture.
+    """Part of a mesh floor with one texture."""
 
-    Args:
-        placed: the triangles as an object.
-        texture: number of its texture in `FloorTiles.textures`; -1: the colours of the vertices.
-        uv: (n, 3) float32 texture coordinates of its vertices (across and down), and side of a texel there [m].
-    """
-
-    placed: PlacedObject
-    texture: int
-    uv: NDArray[np.float32]
+    placed: PlacedObject  #: the triangles as an object
+    texture: int  #: number of its texture in `FloorTiles.textures`; -1: the colours of the vertices
+    uv: NDArray[np.float32]  #: (n, 3) texture coordinates of its vertices (across, down), and side of a texel there [m]
 
 
 class FloorTiles(NamedTuple):
@@ -48,13 +42,10 @@ class FloorTiles(NamedTuple):
 
 
 def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
-    """Returns a mesh in metres with its upper side up, centred at x = y = 0.
+    """Returns a mesh as read from a file in metres with its upper side up, centred at x = y = 0.
 
     A mesh encloses a volume, or is an open sheet. Its triangles are turned over if the volume is negative, or if most
     of the area of a sheet, projected onto a level plane, faces down.
-
-    Args:
-        read: the mesh as read from a file.
     """
     vertices, faces = read.mesh.vertices_m.astype(np.float64) * scale, read.mesh.faces
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
@@ -169,15 +160,11 @@ def _tile(
 ) -> FloorTile:  # fmt: skip
     """Returns the tile of the triangles with the numbers `part`."""
     used, faces = np.unique(mesh.faces[part], return_inverse=True)
-    vertices, faces = mesh.vertices_m[used], np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
     kept = colours if texture < 0 else colours[:1]
-    full = level_of(Mesh(vertices, faces, kept[0][0][used]), 0.0)
+    faces = np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
+    full = level_of(Mesh(mesh.vertices_m[used], faces, kept[0][0][used]), 0.0)
     levels = tuple(full._replace(mesh=full.mesh._replace(colours=values[used]), cell_m=side) for values, side in kept)
-    low, high = extent(full.mesh)
-    centre = (low + high) / 2
-    radius_m = float(np.linalg.norm(vertices - centre, axis=1).max())
-    model = ObjectModel(levels, low, high, centre, radius_m)
-    return FloorTile(PlacedObject(model, np.eye(4), 1.0, NO_GROUP), texture, uv[used])
+    return FloorTile(PlacedObject(model_with(levels), np.eye(4), 1.0, NO_GROUP), texture, uv[used])
 
 
 def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
@@ -202,14 +189,10 @@ def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
 def _colour_levels(whole: TexturedMesh) -> list[tuple[NDArray[np.uint8], float]]:
     """Returns pairs of colours (n, 3) of the vertices and the side [m] of the cells over which they are averaged.
 
-    The first pair has the colours themselves and the side 0. The others have means over larger and larger cubic cells;
-    there are none if every triangle has a texture.
+    The first pair has the colours themselves and the side 0; there are no others if every triangle has a texture.
     """
     mesh = whole.mesh
-    levels = [(mesh.colours, 0.0)]
-    if (whole.texture >= 0).all():
-        return levels
-    cell_m = median_edge_m(mesh)
+    levels, cell_m = [(mesh.colours, 0.0)], np.inf if (whole.texture >= 0).all() else median_edge_m(mesh)
     while cell_m <= LARGEST_CELL_M:
         levels.append((cell_colours(mesh, cell_m), cell_m))
         cell_m *= np.sqrt(2)

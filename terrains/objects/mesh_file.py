@@ -153,10 +153,11 @@ def _coloured(part: Any, grey: Array, most_faces: int) -> Mesh:
         colours = _own_colours(part)
         return _mesh(part.vertices, part.faces, grey if colours is None else colours)
     image, uv = texture
-    divided: Any = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
-    while 0 < len(divided[1]) * 4 <= most_faces:
-        divided = trimesh.remesh.subdivide(*divided[:2], vertex_attributes=divided[2])
-    return _mesh(*divided[:2], _sampled(_rgb(image), divided[2]["uv"]))
+    vertices, faces, at = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
+    while 0 < len(faces) * 4 <= most_faces:
+        divided: Any = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=at)
+        vertices, faces, at = divided
+    return _mesh(vertices, faces, _sampled(_rgb(image), at["uv"]))
 
 
 def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.terrains.objects.coloured_mesh import Mesh, joined, mesh_of
-from twin.terrains.objects.primitives import Array, mottled, noise, resampled, sphere, tube, turned
+from twin.terrains.objects.primitives import Array, mottled, noise, quad_faces, resampled, sphere, tube, turned
 
 
 def brain_coral(albedo: Array, rng: np.random.Generator) -> Mesh:
@@ -115,6 +115,6 @@ def _blade(angle: float, albedo: Array, rng: np.random.Generator) -> Mesh:
     points = np.stack([c * x - s * y, s * x + c * y, z], axis=-1).reshape(-1, 3)
     node = np.arange(n_along * n_across).reshape(n_along, n_across)
     a, b, d, e = node[:-1, :-1], node[:-1, 1:], node[1:, 1:], node[1:, :-1]
-    faces = np.stack([a, b, d, a, d, e], axis=-1).reshape(-1, 3)
+    faces = quad_faces(a, b, d, e)
     midrib = np.exp(-((side.ravel() / 0.3) ** 2))
     return mesh_of(points, faces, mottled(albedo * (1 - 0.35 * midrib)[:, None], points, 0.15, rng))

@@ -11,6 +11,7 @@ Faces = NDArray[np.int64]
 #: Vertices (n, 3) and faces (m, 3), counter-clockwise as seen from outside.
 Surface = tuple[Array, Faces]
 
+WAVES = 20  #: plane waves per octave of noise
 SPHERE_DIVISIONS = 5  #: times that each of the 20 faces of an icosahedron is divided into four: 20,480 triangles
 
 
@@ -23,12 +24,7 @@ def sphere() -> Surface:
 
 
 def tube(path: Array, radius: Array, n_sides: int) -> Surface:
-    """Returns a tube with closed ends along a path.
-
-    Args:
-        path: (k, 3) points of the axis, no two consecutive ones equal.
-        radius: (k,) radius at each point.
-    """
+    """Returns a tube with closed ends along a path (k, 3) without equal consecutive points, with radii (k,)."""
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     across = np.cross(tangent[0], np.eye(3)[np.abs(tangent[0]).argmin()])
@@ -41,16 +37,11 @@ def tube(path: Array, radius: Array, n_sides: int) -> Surface:
     cos, sin = np.cos(angle)[:, None], np.sin(angle)[:, None]
     outwards = cos * acrosses[:, None] + sin * np.cross(tangent, acrosses)[:, None]
     rings = path[:, None] + radius[:, None, None] * outwards
-    vertices = np.concatenate([rings.reshape(-1, 3), path[:1], path[-1:]])
-    first, last = len(vertices) - 2, len(vertices) - 1
-    faces = ring_faces(len(path), n_sides)
-    side = np.arange(n_sides)
-    begin, end = side, (len(path) - 1) * n_sides + side
-    caps = [
-        np.stack([np.full(n_sides, first), np.roll(begin, -1), begin], axis=1),
-        np.stack([np.full(n_sides, last), end, np.roll(end, -1)], axis=1),
-    ]
-    return vertices, np.concatenate([faces, *caps])
+    begin = np.arange(n_sides)
+    end, first = begin + (len(path) - 1) * n_sides, np.full(n_sides, len(path) * n_sides)
+    caps = [[first, np.roll(begin, -1), begin], [first + 1, end, np.roll(end, -1)]]
+    faces = [ring_faces(len(path), n_sides), *(np.stack(cap, axis=1) for cap in caps)]
+    return np.concatenate([rings.reshape(-1, 3), path[:1], path[-1:]]), np.concatenate(faces)
 
 
 def ring_faces(n_rings: int, n_sides: int, closed: bool = False) -> Faces:
@@ -59,18 +50,20 @@ def ring_faces(n_rings: int, n_sides: int, closed: bool = False) -> Faces:
     With `closed`, there are triangles between the last and the first ring too.
     """
     ring = np.arange(n_rings * n_sides).reshape(n_rings, n_sides)
-    upper = np.roll(ring, -1, axis=0) if closed else ring[1:]
-    lower = ring if closed else ring[:-1]
-    right, upper_right = np.roll(lower, -1, axis=1), np.roll(upper, -1, axis=1)
-    return np.stack([lower, right, upper_right, lower, upper_right, upper], axis=-1).reshape(-1, 3)
+    lower, upper = (ring, np.roll(ring, -1, axis=0)) if closed else (ring[:-1], ring[1:])
+    return quad_faces(lower, np.roll(lower, -1, axis=1), np.roll(upper, -1, axis=1), upper)
+
+
+def quad_faces(a: Faces, b: Faces, c: Faces, d: Faces) -> Faces:
+    """Returns the triangles (m, 3) of quadrilaterals with the corners a, b, c, d, split from a to c."""
+    return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
 def turned(profile: Array, n_sides: int) -> Surface:
     """Returns a surface of revolution about z.
 
-    Args:
-        profile: (k, 2) radius and height along a closed outline, counter-clockwise with the radius to the right, all
-            radii positive.
+    `profile` (k, 2) has the radii, all positive, and heights along a closed outline, counter-clockwise with the radius
+    to the right.
     """
     angle = 2 * np.pi * np.arange(n_sides) / n_sides
     radius, height = profile[:, :1], profile[:, 1:]
@@ -87,12 +80,7 @@ def resampled(outline: Array, n: int) -> Array:
 
 
 def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
-    """Returns a box with its centre at the origin, each side divided into cells.
-
-    Args:
-        size: extents along x, y and z.
-        n: number of cells along x, y and z.
-    """
+    """Returns a box of extents `size` with its centre at the origin, its sides divided into `n` cells along x, y, z."""
     parts, faces, count = [], [], 0
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -102,8 +90,7 @@ def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
             points[..., i], points[..., j], points[..., axis] = a * size[i], b * size[j], end * size[axis]
             node = count + np.arange(a.size).reshape(a.shape)
             quads = [node[:-1, :-1], node[1:, :-1], node[1:, 1:], node[:-1, 1:]]
-            p, q, r, s = quads if end > 0 else quads[::-1]
-            faces.append(np.stack([p, q, r, p, r, s], axis=-1).reshape(-1, 3))
+            faces.append(quad_faces(*(quads if end > 0 else quads[::-1])))
             parts.append(points.reshape(-1, 3))
             count += a.size
     return np.concatenate(parts), np.concatenate(faces)
@@ -126,13 +113,10 @@ def noise(points: Array, coarsest: float, octaves: int, rng: np.random.Generator
     return total / np.sqrt(power)
 
 
-WAVES = 20  #: plane waves per octave of noise
-
-
 def mottled(albedo: Array, points: Array, contrast: float, rng: np.random.Generator) -> Array:
-    """Returns a random albedo (n, 3) at points (n, 3).
+    """Returns a random albedo (n, 3) at points (n, 3) with the mean `albedo`, (3,) or (n, 3).
 
-    Its mean is `albedo`, (3,) or (n, 3), and its relative standard deviation about `contrast`.
+    Its relative standard deviation is about `contrast`.
     """
     values = 0.7 * noise(points, 0.25, 4, rng, gain=0.8) + 0.7 * rng.standard_normal(len(points))
     return albedo * np.exp(contrast * values - contrast**2 / 2)[:, None]

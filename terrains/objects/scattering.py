@@ -29,13 +29,9 @@ class Disc(NamedTuple):
 
 
 def place(
-    number: int,
-    group: ObjectConfig,
-    models: Sequence[ObjectModel],
-    terrain: Terrain,
-    taken: Sequence[PlacedObject],
-    seed: int,
-) -> list[PlacedObject]:
+    number: int, group: ObjectConfig, models: Sequence[ObjectModel], terrain: Terrain,
+    taken: Sequence[PlacedObject], seed: int,
+) -> list[PlacedObject]:  # fmt: skip
     """Returns the objects of an entry of `[[objects]]`.
 
     Args:
@@ -46,13 +42,13 @@ def place(
         TwinError: an object with a given position reaches beyond the terrain; there would be no scattered object or too
             many, or they do not fit.
     """
-    rng = np.random.default_rng(np.random.SeedSequence([seed, number]))
-    if group.position_m is not None:
-        model = models[number % len(models)]
-        item = _at(number, group, model, float(_scales(group, [model], rng)[0]), group.position_m, terrain, rng)
-        _check_inside(item, terrain, f"objects.{number}.position_m")
-        return [item]
-    return _scattered(number, group, models, terrain, taken, rng)
+    entry = _Entry(number, group, terrain, np.random.default_rng(np.random.SeedSequence([seed, number])))
+    if group.position_m is None:
+        return entry.scattered(models, taken)
+    model = models[number % len(models)]
+    item = entry.at(model, float(entry.scales([model])[0]), group.position_m)
+    _check_inside(item, terrain, f"objects.{number}.position_m")
+    return [item]
 
 
 def disc_of(item: PlacedObject) -> Disc:
@@ -69,122 +65,117 @@ def slope_deg(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array
     return np.rad2deg(np.arctan(np.hypot(east, north) / (2 * reach_m)))
 
 
-def _scattered(
-    number: int, group: ObjectConfig, models: Sequence[ObjectModel], terrain: Terrain, taken: Sequence[PlacedObject],
-    rng: np.random.Generator,
-) -> list[PlacedObject]:  # fmt: skip
-    """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
-    field = f"objects.{number}.per_m2"
-    low, high = _region(group, terrain)
-    n = _count(group, terrain, low, high, field)
-    chosen = [models[k] for k in rng.integers(0, len(models), n)]
-    scales = _scales(group, chosen, rng)
-    discs = np.array([disc_of(item) for item in taken]).reshape(-1, 3)
-    own = np.zeros((n, 3))
-    items: list[PlacedObject] = []
-    for k in np.argsort([-scale * model.radius_m for scale, model in zip(scales, chosen, strict=True)], kind="stable"):
-        radius_m = float(scales[k]) * float(np.hypot(*(chosen[k].high_m - chosen[k].low_m)[:2]) / 2)
-        around = np.concatenate([discs, own[: len(items)]])
-        position = _free_position(group, terrain, (low + radius_m, high - radius_m), radius_m, around, rng)
-        if position is None:
-            problem = f"only {len(items)} of {n} objects fit without overlap"
-            raise TwinError(field, problem, "fewer or smaller objects, or a larger area")
-        own[len(items)] = [*position, radius_m]
-        items.append(_at(number, group, chosen[k], float(scales[k]), position, terrain, rng))
-    return items
+class _Entry(NamedTuple):
+    """An entry of `[[objects]]` on a terrain, with its random generator."""
 
+    number: int
+    group: ObjectConfig
+    terrain: Terrain
+    rng: np.random.Generator
 
-def _region(group: ObjectConfig, terrain: Terrain) -> tuple[Array, Array]:
-    """Returns the south-west and the north-east corner (2,) [m] of the area in which objects are scattered."""
-    low, high = np.array([terrain.west_m, terrain.south_m]), np.array([terrain.east_m, terrain.north_m])
-    if group.area_m is None:
-        return low, high
-    half, centre = np.array(group.area_m) / 2, np.array(group.centre_m)
-    return np.maximum(low, centre - half), np.minimum(high, centre + half)
+    def scattered(self, models: Sequence[ObjectModel], taken: Sequence[PlacedObject]) -> list[PlacedObject]:
+        """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
+        field = f"objects.{self.number}.per_m2"
+        low, high = self._region()
+        n = self._count(low, high, field)
+        chosen = [models[k] for k in self.rng.integers(0, len(models), n)]
+        scales = self.scales(chosen)
+        discs, own = np.array([disc_of(item) for item in taken]).reshape(-1, 3), np.zeros((n, 3))
+        items: list[PlacedObject] = []
+        sizes = [-scale * model.radius_m for scale, model in zip(scales, chosen, strict=True)]
+        for k in np.argsort(sizes, kind="stable"):
+            radius_m = float(scales[k]) * float(np.hypot(*(chosen[k].high_m - chosen[k].low_m)[:2]) / 2)
+            around = np.concatenate([discs, own[: len(items)]])
+            position = self._free_position(low + radius_m, high - radius_m, radius_m, around)
+            if position is None:
+                problem = f"only {len(items)} of {n} objects fit without overlap"
+                raise TwinError(field, problem, "fewer or smaller objects, or a larger area")
+            own[len(items)] = [*position, radius_m]
+            items.append(self.at(chosen[k], float(scales[k]), position))
+        return items
 
+    def scales(self, models: Sequence[ObjectModel]) -> Array:
+        """Returns the random scale (n,) of each object, its size divided by that of its model in `models` (n)."""
+        z, size_m = self.rng.standard_normal(len(models)), self.group.size_m
+        factor = np.exp(self.group.size_spread * np.clip(z, -SIZE_CUT_SIGMA, SIZE_CUT_SIGMA))
+        return np.array([1.0 if size_m is None else size_m / model.size_m for model in models]) * factor
 
-def _count(group: ObjectConfig, terrain: Terrain, low: Array, high: Array, field: str) -> int:
-    """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
+    def at(self, model: ObjectModel, scale: float, position_m: tuple[float, float]) -> PlacedObject:
+        """Returns an object at a position (x, y) [m].
 
-    Raises TwinError if there are none or too many.
-    """
-    assert group.per_m2 is not None
-    side = np.maximum(high - low, 0)
-    steps = [np.linspace(a, b, 201)[:-1] + (b - a) / 400 for a, b in zip(low, high, strict=True)]
-    x, y = np.meshgrid(*steps)
-    share = float(_on_ground(group, terrain, x, y, terrain.spacing_m).mean())
-    n = round(group.per_m2 * float(side.prod()) * share)
-    if n > MAX_SCATTERED:
-        raise TwinError(field, f"{group.per_m2:g}: {n} objects", f"at most {MAX_SCATTERED} objects")
-    if n == 0:
-        ground = {"anywhere": "of the area", "sand": "of sand", "slopes": "of slopes"}[group.on]
-        raise TwinError(field, f"no object on {side.prod() * share:.2f} m2 {ground}", "more, or another area or ground")
-    return n
+        Where the group gives no height, the object stands on the floor, sunk by a share of its height; where it gives
+        no heading, the heading is random. An object that is not upright is tilted to the normal of the floor.
+        """
+        (x, y), group, terrain = position_m, self.group, self.terrain
+        heading, phase = self.rng.uniform(0, 2 * np.pi, 2)
+        if group.heading_deg is not None:
+            heading = np.deg2rad(group.heading_deg)
+        reach_m = scale * float((model.high_m - model.low_m)[:2].max()) / 4
+        c, s = np.cos(heading), np.sin(heading)
+        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        if not group.upright:
+            rotation = _tilt(terrain, x, y, max(reach_m, terrain.spacing_m / 2)) @ rotation
+        if group.height_m is not None:
+            base = np.array([x, y, group.height_m])
+        else:
+            floor_m = _floor_under(terrain, x, y, 0.0 if not group.upright else reach_m)
+            base = np.array([x, y, floor_m]) - rotation[:, 2] * group.sunk * scale * model.high_m[2]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = scale * rotation, base
+        return PlacedObject(model, pose, float(scale), self.number, float(phase))
 
+    def _region(self) -> tuple[Array, Array]:
+        """Returns the south-west and the north-east corner (2,) [m] of the area in which objects are scattered."""
+        terrain, group = self.terrain, self.group
+        low, high = np.array([terrain.west_m, terrain.south_m]), np.array([terrain.east_m, terrain.north_m])
+        if group.area_m is None:
+            return low, high
+        half, centre = np.array(group.area_m) / 2, np.array(group.centre_m)
+        return np.maximum(low, centre - half), np.minimum(high, centre + half)
 
-def _on_ground(group: ObjectConfig, terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
-    """Returns whether the slope of the floor at each point is one on which the objects of a group may stand."""
-    if group.on == "anywhere":
-        return np.isfinite(terrain.height_at(x_m, y_m))
-    slope = slope_deg(terrain, x_m, y_m, reach_m)
-    return slope < STEEP_DEG if group.on == "sand" else slope >= STEEP_DEG
+    def _count(self, low: Array, high: Array, field: str) -> int:
+        """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
 
+        Raises TwinError if there are none or too many.
+        """
+        group = self.group
+        assert group.per_m2 is not None
+        area_m2 = float(np.maximum(high - low, 0).prod())
+        steps = [np.linspace(a, b, 201)[:-1] + (b - a) / 400 for a, b in zip(low, high, strict=True)]
+        x, y = np.meshgrid(*steps)
+        share = float(self._on_ground(x, y, self.terrain.spacing_m).mean())
+        n = round(group.per_m2 * area_m2 * share)
+        if n > MAX_SCATTERED:
+            raise TwinError(field, f"{group.per_m2:g}: {n} objects", f"at most {MAX_SCATTERED} objects")
+        if n == 0:
+            ground = {"anywhere": "of the area", "sand": "of sand", "slopes": "of slopes"}[group.on]
+            raise TwinError(field, f"no object on {area_m2 * share:.2f} m2 {ground}", "more, or another area or ground")
+        return n
 
-def _free_position(
-    group: ObjectConfig, terrain: Terrain, corners: tuple[Array, Array], radius_m: float, around: Array,
-    rng: np.random.Generator,
-) -> tuple[float, float] | None:  # fmt: skip
-    """Returns a random position (x, y) [m] where an object may stand; None if none is found.
+    def _on_ground(self, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
+        """Returns whether the slope of the floor at each point is one on which the objects of the group may stand."""
+        if self.group.on == "anywhere":
+            return np.isfinite(self.terrain.height_at(x_m, y_m))
+        slope = slope_deg(self.terrain, x_m, y_m, reach_m)
+        return slope < STEEP_DEG if self.group.on == "sand" else slope >= STEEP_DEG
 
-    The position lies between the south-west and the north-east of `corners`, at least `group.spacing_m` from the
-    centres of the circles `around` (n, 3): x, y, radius [m]. The circle of radius `radius_m` about it overlaps none of
-    these circles.
-    """
-    if (corners[0] >= corners[1]).any():
+    def _free_position(self, low: Array, high: Array, radius_m: float, around: Array) -> tuple[float, float] | None:
+        """Returns a random position (x, y) [m] where an object may stand; None if none is found.
+
+        The position lies between the corners `low` and `high`, at least `group.spacing_m` from the centres of the
+        circles `around` (n, 3): x, y, radius [m]. The circle of radius `radius_m` about it overlaps none of them.
+        """
+        if (low >= high).any():
+            return None
+        apart = np.maximum(around[:, 2] + radius_m, self.group.spacing_m)
+        for n in TRIES:
+            points = self.rng.uniform(low, high, (n, 2))
+            free = (np.hypot(*(points[:, None] - around[:, :2]).T).T >= apart).all(axis=1)
+            free &= self._on_ground(points[:, 0], points[:, 1], max(radius_m / 2, self.terrain.spacing_m))
+            if free.any():
+                x, y = points[free.argmax()]
+                return float(x), float(y)
         return None
-    apart = np.maximum(around[:, 2] + radius_m, group.spacing_m)
-    for n in TRIES:
-        points = rng.uniform(*corners, (n, 2))
-        free = (np.hypot(*(points[:, None] - around[:, :2]).T).T >= apart).all(axis=1)
-        free &= _on_ground(group, terrain, points[:, 0], points[:, 1], max(radius_m / 2, terrain.spacing_m))
-        if free.any():
-            x, y = points[free.argmax()]
-            return float(x), float(y)
-    return None
-
-
-def _scales(group: ObjectConfig, models: Sequence[ObjectModel], rng: np.random.Generator) -> Array:
-    """Returns the random scale (n,) of each object, its size divided by that of its model in `models` (n)."""
-    z = rng.standard_normal(len(models))
-    factor = np.exp(group.size_spread * np.clip(z, -SIZE_CUT_SIGMA, SIZE_CUT_SIGMA))
-    return np.array([1.0 if group.size_m is None else group.size_m / model.size_m for model in models]) * factor
-
-
-def _at(
-    number: int, group: ObjectConfig, model: ObjectModel, scale: float, position_m: tuple[float, float],
-    terrain: Terrain, rng: np.random.Generator,
-) -> PlacedObject:  # fmt: skip
-    """Returns an object at a position (x, y) [m].
-
-    Where the group gives no height, the object stands on the floor, sunk by a share of its height; where it gives no
-    heading, the heading is random. An object that is not upright is tilted to the normal of the floor.
-    """
-    x, y = position_m
-    heading, phase = rng.uniform(0, 2 * np.pi, 2)
-    if group.heading_deg is not None:
-        heading = np.deg2rad(group.heading_deg)
-    reach_m = scale * float((model.high_m - model.low_m)[:2].max()) / 4
-    rotation = _rotation(heading)
-    if not group.upright:
-        rotation = _tilt(terrain, x, y, max(reach_m, terrain.spacing_m / 2)) @ rotation
-    if group.height_m is not None:
-        base = np.array([x, y, group.height_m])
-    else:
-        floor_m = _floor_under(terrain, x, y, 0.0 if not group.upright else reach_m)
-        base = np.array([x, y, floor_m]) - rotation[:, 2] * group.sunk * scale * model.high_m[2]
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = scale * rotation, base
-    return PlacedObject(model, pose, float(scale), number, float(phase))
 
 
 def _floor_under(terrain: Terrain, x: float, y: float, reach_m: float) -> float:
@@ -192,11 +183,6 @@ def _floor_under(terrain: Terrain, x: float, y: float, reach_m: float) -> float:
     angle = np.arange(8) * np.pi / 4
     heights = terrain.height_at(np.append(x, x + reach_m * np.cos(angle)), np.append(y, y + reach_m * np.sin(angle)))
     return float(np.nanmin(heights)) if np.isfinite(heights).any() else np.nan
-
-
-def _rotation(heading: float) -> Array:
-    c, s = np.cos(heading), np.sin(heading)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _tilt(terrain: Terrain, x: float, y: float, reach_m: float) -> Array:

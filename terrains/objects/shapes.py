@@ -12,19 +12,12 @@ from twin.terrains.objects.coloured_mesh import Mesh
 
 
 class Shape(NamedTuple):
-    """Built-in shape.
+    """Built-in shape."""
 
-    Args:
-        build: makes a mesh of the shape from its albedo (3,) and a random generator.
-        albedo: usual albedo for R, G, B.
-        variants: number of different meshes that the objects of one entry of `[[objects]]` share.
-        sways: whether the object bends in the current.
-    """
-
-    build: Callable[..., Mesh]
-    albedo: tuple[float, float, float]
-    variants: int = 4
-    sways: bool = False
+    build: Callable[..., Mesh]  #: makes a mesh of the shape from its albedo (3,) and a random generator
+    albedo: tuple[float, float, float]  #: usual albedo for R, G, B
+    variants: int = 4  #: number of different meshes that the objects of one entry of `[[objects]]` share
+    sways: bool = False  #: whether the object bends in the current
 
 
 SHAPES = {
@@ -43,13 +36,9 @@ SHAPES = {
 
 
 def build_shape(name: str, albedo: tuple[float, float, float] | None, rng: np.random.Generator, **form: float) -> Mesh:
-    """Returns one mesh of a built-in shape.
+    """Returns one mesh of a built-in shape (key of SHAPES) with an albedo; None: the usual one.
 
-    Args:
-        name: key of SHAPES.
-        albedo: albedo for R, G, B; None: the usual one.
-        rng: random generator of the form and colour.
-        form: proportions of the shape, e.g. `width` of a pipe of length 1.
+    `form` are proportions of the shape, e.g. `width` of a pipe of length 1.
     """
     shape = SHAPES[name]
     return shape.build(np.array(shape.albedo if albedo is None else albedo), rng, **form)

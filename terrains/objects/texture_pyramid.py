@@ -11,15 +11,11 @@ from numpy.typing import NDArray
 
 
 class Textures(NamedTuple):
-    """Textures with their levels of resolution.
+    """Textures with their levels of resolution."""
 
-    Args:
-        texels: (n, 3) uint8 texels of all levels of all textures, row by row.
-        levels: (textures, levels, 3) int64: number of the first texel, rows and columns of each level, finest first; a
-            texture with fewer levels repeats its last one.
-    """
-
-    texels: NDArray[np.uint8]
+    texels: NDArray[np.uint8]  #: (n, 3) texels of all levels of all textures, row by row
+    #: (textures, levels, 3) number of the first texel, rows and columns of each level, finest first; a texture with
+    #: fewer levels repeats its last one
     levels: NDArray[np.int64]
 
 
