@@ -22,7 +22,7 @@ import twin
 from twin.datasets.euroc import EurocWriter
 from twin.recordings.replay import ReplayOptions
 from twin.report import comparison, survey_page
-from twin.reproduce import catalogue
+from twin.reproduce.exhibit import PAGE_FILE, read_all, write_all
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.report import write_report
 from twin.studies.results_log import ResultsLog
@@ -120,13 +120,13 @@ def tuned(folder):
 
 
 def reproduction(folder):
-    exhibits, quick = catalogue.read_all(Path(__file__).parents[1] / "docs" / "reproduction.json")
-    catalogue.write_all(exhibits, folder, quick)
+    exhibits, quick = read_all(Path(__file__).parents[1] / "docs" / "reproduction.json")
+    write_all(exhibits, folder, quick)
     for exhibit in exhibits:
         (folder / exhibit.name).mkdir()
         for figure in exhibit.figures:
             cv2.imwrite(str(folder / exhibit.name / figure.file), np.zeros((400, 1600), np.uint8))
-    return folder / catalogue.PAGE_FILE
+    return folder / PAGE_FILE
 
 
 KINDS = (survey, replay, compared, study, agreement, tuned, reproduction)

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from twin.cli import app
 from twin.errors import TwinError
 from twin.reproduce import catalogue
-from twin.reproduce.exhibit import Exhibit, Figure, make_table
+from twin.reproduce.exhibit import Exhibit, Figure, make_table, read_all, write_all
 from twin.reproduce.page_chapter import BEGIN, END, SHOWN, chapter, with_chapter
 from twin.reproduce.tank import TABLES
 
@@ -19,13 +19,13 @@ EXHIBIT = Exhibit("paper", "The paper's mission", "Flown once.", (TABLE,), (Figu
 
 
 def test_results_are_read_as_they_were_written_and_the_page_has_every_table_and_figure(tmp_path):
-    catalogue.write_all([EXHIBIT, EXHIBIT._replace(name="tank1", title="Tank")], tmp_path, quick=True)
-    exhibits, quick = catalogue.read_all(tmp_path / "results.json")
+    write_all([EXHIBIT, EXHIBIT._replace(name="tank1", title="Tank")], tmp_path, quick=True)
+    exhibits, quick = read_all(tmp_path / "results.json")
     assert quick and exhibits[0] == EXHIBIT and exhibits[1].title == "Tank"
     page = (tmp_path / "index.html").read_text()
     for text in ('src="paper/a.png"', 'src="tank1/a.png"', "A figure &amp; more.", "error &lt; 1", "with quick plans"):
         assert text in page, text
-    catalogue.write_all([EXHIBIT], tmp_path, quick=False)
+    write_all([EXHIBIT], tmp_path, quick=False)
     assert "with quick plans" not in (tmp_path / "index.html").read_text()
 
 
@@ -72,7 +72,7 @@ def test_a_page_without_the_markers_is_refused(page):
 
 
 def test_the_chapter_of_the_page_is_that_of_its_data_file():
-    exhibits, quick = catalogue.read_all(ROOT / "docs" / "reproduction.json")
+    exhibits, quick = read_all(ROOT / "docs" / "reproduction.json")
     page = (ROOT / "docs" / "paper.md").read_text()
     command = "twin reproduce chapter docs/reproduction.json --page docs/paper.md"
     assert with_chapter(page, chapter(exhibits, quick)) == page, f"run: {command}"
@@ -99,7 +99,7 @@ def test_a_bad_results_file_is_one_clear_line(tmp_path, contents, message):
     if contents is not None:
         file.write_text(contents)
     with pytest.raises(TwinError) as error:
-        catalogue.read_all(file)
+        read_all(file)
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
@@ -120,7 +120,7 @@ def test_a_command_prints_the_tables_or_json(tmp_path, monkeypatch):
 
 
 def test_the_chapter_is_printed_or_written(tmp_path):
-    catalogue.write_all([EXHIBIT], tmp_path, quick=False)
+    write_all([EXHIBIT], tmp_path, quick=False)
     page = tmp_path / "paper.md"
     page.write_text(f"{BEGIN}\n{END}\n")
     shown = CliRunner().invoke(app, ["reproduce", "chapter", str(tmp_path / "results.json")]).stdout

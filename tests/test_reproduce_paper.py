@@ -14,10 +14,9 @@ from twin.core.records import Trajectory
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.reproduce import paper_flight, paper_sheet
-from twin.reproduce.budget import FRAME_MS, KEYFRAME_MS, MODULES, N_FRAMES, budget_table, keyframe_load_ms
-from twin.reproduce.conclusion import finished
 from twin.reproduce.paper import CLAIMS, SHOWN_TRACKS, Flights, exhibit_of_flights, holes, scenarios
-from twin.reproduce.paper_flight import F2fNavigator, Flown
+from twin.reproduce.paper_budget import FRAME_MS, KEYFRAME_MS, MODULES, N_FRAMES, budget_table, keyframe_load_ms
+from twin.reproduce.paper_flight import F2fNavigator, Flown, finished_map
 
 
 def flown(seed=0):
@@ -154,7 +153,7 @@ def test_an_interrupted_alignment_ends_the_experiment():
 
     navigator = SimpleNamespace(finish=interrupt, abandon_alignment=lambda: setattr(navigator, "finish", lambda: None))
     with pytest.raises(KeyboardInterrupt):
-        finished(navigator, StageGuard())
+        finished_map(navigator, None, StageGuard())
 
 
 @pytest.mark.long

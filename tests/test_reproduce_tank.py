@@ -9,12 +9,10 @@ import pytest
 from twin.core import geometry
 from twin.core.records import StereoRig, SurveyResult, Trajectory
 from twin.reproduce import tank_survey
+from twin.reproduce.experiment_floors import OBJECTS, tank_floor
 from twin.reproduce.tank import TABLES, TITLES, flagged_share, sizes_table
-from twin.reproduce.tank_hidden import hidden_cells
-from twin.reproduce.tank_path import N_LOOP, STEP_M, lawnmower_path, two_loops_path
-from twin.reproduce.tank_scene import OBJECTS, tank_floor
-from twin.reproduce.tank_sizes import measure, true_size
-from twin.reproduce.tank_survey import closures, map_grid
+from twin.reproduce.tank_sizes import hidden_cells, measure, true_size
+from twin.reproduce.tank_survey import N_LOOP, STEP_M, closures, lawnmower_path, map_grid, two_loops_path
 
 GRID = map_grid(0.003)
 X, Y = np.meshgrid(*GRID.centres())
@@ -161,7 +159,7 @@ def test_the_estimators_start_at_the_planned_pose_and_not_at_the_true_one(name, 
 
     monkeypatch.setattr(tank_survey, "Navigator", navigator)
     monkeypatch.setattr(tank_survey, "tank_floor", lambda _: None)
-    monkeypatch.setattr(tank_survey, "image_vision", lambda *_: None)
+    monkeypatch.setattr(tank_survey, "image_vision", lambda *_: nullcontext())
     monkeypatch.setattr(tank_survey, "RenderedWorld", lambda *_: nullcontext())
     with pytest.raises(StartedError):
         tank_survey.survey_tank(name, tmp_path, tank_survey.QUICK)

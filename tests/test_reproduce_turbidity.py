@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from twin.imaging.light.illumination import illumination_of
-from twin.reproduce.block import BLOCK_M, CORE_M, HEIGHT_M, block_on_sand
+from twin.reproduce.experiment_floors import BLOCK_M, CORE_M, HEIGHT_M, block_on_sand
 from twin.reproduce.turbidity import SETTINGS, relative_contrast, render_levels, table, write
 from twin.scenario.file import load_scenario
 

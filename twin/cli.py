@@ -184,17 +184,16 @@ def light(
     as_json: SummaryJson = False,
 ) -> None:
     """Compare the light of lamps and sun in the images with a Monte Carlo simulation of any order of scattering."""
-    from twin.reproduce import daylight
-    from twin.reproduce import light as comparison
+    from twin.reproduce.light import compare
 
     outputs.output_file(out / "light.png")
-    found = list(comparison.cells(comparison.QUICK if quick else comparison.ALL, walks, phase))
-    under_sun = list(daylight.daylight_cells(daylight.QUICK_DAYLIGHT if quick else daylight.ALL_DAYLIGHT, walks))
+    found = compare(quick, walks, phase)
     with sole_writer(out, used=True), outputs.writing(out):
-        summary = comparison.write(found, out) | {"daylight": daylight.write_daylight(under_sun, out)}
+        summary = found.write(out)
+    lamps, daylight = (list(table.rows) for table in found.tables)
     tables = [
-        ("Light model and reference, green band", comparison.table(found)),
-        ("Daylight, light model and reference, green band", daylight.daylight_table(under_sun)),
+        ("Light model and reference, green band", lamps),
+        ("Daylight, light model and reference, green band", daylight),
     ]
     _show(as_json, summary, tables, f"Sheet: {out / 'light.png'}")
 
@@ -238,10 +237,11 @@ for _name, _folder, _text in (
 def all_experiments(out: OutFolder = Path("runs/reproduce"), quick: Quick = False) -> None:
     """Run all experiments and write one page with every table and figure."""
     from twin.reproduce import catalogue
+    from twin.reproduce.exhibit import PAGE_FILE
 
-    with _results_folder(out, catalogue.PAGE_FILE):
+    with _results_folder(out, PAGE_FILE):
         catalogue.run_all(out, quick, report=console.print_error)
-    print(f"Page: {out / catalogue.PAGE_FILE}")
+    print(f"Page: {out / PAGE_FILE}")
 
 
 @reproductions.command()
@@ -250,9 +250,10 @@ def chapter(
     page: Annotated[Path | None, Option(help="Markdown page whose chapter is replaced.")] = None,
 ) -> None:
     """Print the chapter of docs/paper.md that shows the results of `twin reproduce all`, or replace it in a page."""
-    from twin.reproduce import catalogue, page_chapter
+    from twin.reproduce import page_chapter
+    from twin.reproduce.exhibit import read_all
 
-    exhibits, quick = catalogue.read_all(file)
+    exhibits, quick = read_all(file)
     if page is None:
         print(page_chapter.chapter(exhibits, quick))
         return

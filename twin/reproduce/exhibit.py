@@ -1,32 +1,36 @@
-"""Results of one experiment as tables and figures, for the index page and the chapter of docs/paper.md."""
+"""Results of one experiment as tables and figures, and the files that hold the results of experiments."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Canvas
+
+from twin.core.records import MapGrid
+from twin.core.user_files import read_json
 from twin.errors import TwinError
+from twin.report.html import render_page
+from twin.report.style import FIGURE_STYLE
 
 SCHEMA = "twin.exhibit/1"
+RESULTS_FILE, PAGE_FILE = "results.json", "index.html"
 DASH = "-"
 
 Row = tuple[str, ...]
 
 
 class Table(NamedTuple):
-    """A table of the results of an experiment.
+    """A table of the results of an experiment."""
 
-    Args:
-        key: name of the table within its experiment.
-        title: heading.
-        rows: rows of text, the header first.
-    """
-
-    key: str
+    key: str  #: name of the table within its experiment
     title: str
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  #: rows of text, the header first
 
 
 class Figure(NamedTuple):
@@ -37,18 +41,11 @@ class Figure(NamedTuple):
 
 
 class Exhibit(NamedTuple):
-    """Results of one experiment.
+    """Results of one experiment."""
 
-    Args:
-        name: name of the experiment, as in `twin reproduce NAME`.
-        title: heading.
-        text: description of the experiment, in a few sentences.
-        tables, figures: the results.
-    """
-
-    name: str
+    name: str  #: name of the experiment, as in `twin reproduce NAME`
     title: str
-    text: str
+    text: str  #: description of the experiment, in a few sentences
     tables: tuple[Table, ...]
     figures: tuple[Figure, ...] = ()
 
@@ -58,13 +55,8 @@ class Exhibit(NamedTuple):
 
     def as_dict(self) -> dict[str, Any]:
         """Returns the results as the contents of a JSON file."""
-        return {
-            "name": self.name,
-            "title": self.title,
-            "text": self.text,
-            "tables": [table._asdict() for table in self.tables],
-            "figures": [figure._asdict() for figure in self.figures],
-        }
+        tables, figures = ([item._asdict() for item in items] for items in (self.tables, self.figures))
+        return self._asdict() | {"tables": tables, "figures": figures}
 
 
 def make_table(key: str, title: str, rows: Sequence[Sequence[str]]) -> Table:
@@ -72,19 +64,57 @@ def make_table(key: str, title: str, rows: Sequence[Sequence[str]]) -> Table:
     return Table(key, title, tuple(tuple(row) for row in rows))
 
 
-def write_exhibit(exhibit: Exhibit, folder: Path) -> None:
-    """Writes NAME.json to the folder of the experiment's figures, which is created if missing."""
-    folder.mkdir(parents=True, exist_ok=True)
-    contents = {"schema": SCHEMA} | exhibit.as_dict()
-    (folder / f"{exhibit.name}.json").write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
+@contextmanager
+def drawn(file: Path, width_in: float, height_in: float) -> Generator[Canvas]:
+    """Opens an empty figure in the style of the reports, and writes it to a PNG file at the end."""
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure = Canvas(figsize=(width_in, height_in))
+        yield figure
+        FigureCanvasAgg(figure).print_png(str(file))
 
 
-def exhibit_of(contents: Any, file: Path) -> Exhibit:
-    """Returns the exhibit in the contents of a JSON file.
+def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
+    """Returns west, east, south and north of a grid [m], for pictures of it."""
+    return grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
+
+
+def write_json(file: Path, contents: Any) -> None:
+    """Writes contents to a JSON file, whose folder is created if missing."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
+
+
+def write_exhibit(exhibit: Exhibit, folder: Path) -> Exhibit:
+    """Writes NAME.json to the folder of the experiment's figures, which is created if missing; returns the exhibit."""
+    write_json(folder / f"{exhibit.name}.json", {"schema": SCHEMA} | exhibit.as_dict())
+    return exhibit
+
+
+def write_all(exhibits: Sequence[Exhibit], folder: Path, quick: bool) -> None:
+    """Writes results.json and index.html to a folder, which is created if missing.
+
+    The page shows the figures from one subfolder per experiment, next to the page.
+    """
+    contents = {"schema": f"{SCHEMA}s", "quick": quick, "exhibits": [exhibit.as_dict() for exhibit in exhibits]}
+    write_json(folder / RESULTS_FILE, contents)
+    page = render_page("twin.reproduce", "index_page.html.j2", {"exhibits": exhibits, "quick": quick})
+    (folder / PAGE_FILE).write_text(page, encoding="utf-8")
+
+
+def read_all(file: Path) -> tuple[list[Exhibit], bool]:
+    """Returns the exhibits in a results.json, and whether they are those of the quick versions.
 
     Raises:
-        TwinError: the contents are not those of an exhibit.
+        TwinError: the file cannot be read or is not a results.json.
     """
+    contents = read_json(file, "", "results.json of `twin reproduce all`")
+    if not isinstance(contents, dict) or not isinstance(contents.get("exhibits"), list):
+        raise TwinError(str(file), "has no list of exhibits", "results.json of `twin reproduce all`")
+    return [_exhibit_of(entry, file) for entry in contents["exhibits"]], bool(contents.get("quick"))
+
+
+def _exhibit_of(contents: Any, file: Path) -> Exhibit:
+    """Returns the exhibit in the contents of a JSON file; raises TwinError if they are not those of an exhibit."""
     try:
         tables = tuple(make_table(t["key"], t["title"], t["rows"]) for t in contents["tables"])
         figures = tuple(Figure(f["file"], f["caption"]) for f in contents["figures"])

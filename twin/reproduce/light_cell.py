@@ -1,8 +1,11 @@
-"""Light of one pixel by the light model and by the Monte Carlo reference: records and functions of all comparisons."""
+"""Light by the light model and by the Monte Carlo reference in one situation: the records of all comparisons."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,64 +15,72 @@ from twin.imaging.light.water import Medium
 from twin.imaging.reference.pixel_light import BandWater, BatchMean
 
 GREEN, ALBEDO = 1, 128  # band that is compared, and albedo of the floor; 255 = white
+ROUND, MOST_WALKS = 8_000, 1_500_000  # walks (for a pixel: pairs) in a round; most walks for each value
 
 
-class ModelLight(NamedTuple):
-    """Light of a pixel by the light model.
+class Compared(NamedTuple):
+    """A quantity by the model and by the reference."""
 
-    Args:
-        direct: light of the floor that was not scattered between floor and camera [cd/m2].
-        blurred: forward-scattered light of the floor [cd/m2]; 0 if the scenario disables it.
-        veil: backscatter [cd/m2].
-        blur_near, blur_far: shares of the forward-scattered light that come from points of the floor within 2 px of the
-            pixel and beyond 40 px; NaN without forward scatter.
-    """
-
-    direct: float
-    blurred: float
-    veil: float
-    blur_near: float
-    blur_far: float
+    model: float
+    truth: BatchMean
+    unit: str = ""  #: end of its keys in the files, such as "_lx"
+    keys: tuple[str, ...] = ("model", "truth", "se")  #: the values that the files hold
 
     @property
-    def total(self) -> float:
-        """Returns the total radiance [cd/m2]."""
-        return self.direct + self.blurred + self.veil
+    def ratio(self) -> BatchMean:
+        """Returns model / truth, with the standard error of the truth."""
+        value = self.model / self.truth.value
+        return BatchMean(value, value * self.truth.standard_error / self.truth.value)
 
     @property
-    def sharp_share(self) -> float:
-        """Returns the share of the total that comes from the floor and was not scattered between floor and camera."""
-        return self.direct / self.total
+    def inverse_ratio(self) -> BatchMean:
+        """Returns truth / model, with its standard error; NaN if the model is 0."""
+        if not self.model:
+            return BatchMean(np.nan, np.nan)
+        return BatchMean(self.truth.value / self.model, self.truth.standard_error / self.model)
+
+    def over(self, other: Compared) -> Compared:
+        """Returns the quotient of two quantities, whose truths are independent."""
+        value = self.truth.value / other.truth.value
+        own, others = (one.truth.standard_error / one.truth.value for one in (self, other))
+        return Compared(self.model / other.model, BatchMean(value, float(value * np.hypot(own, others))))
+
+    def row(self, name: str) -> dict[str, float]:
+        """Returns the values for the files, by key."""
+        values = {
+            "model": (f"{name}_model{self.unit}", self.model),
+            "truth": (f"{name}_truth{self.unit}", self.truth.value),
+            "se": (f"{name}_truth_se", self.truth.standard_error),
+        }
+        return dict(values[key] for key in self.keys)
 
 
 class LightCell(NamedTuple):
-    """One cell of the comparison: conditions, light by the model, and light by the reference with standard errors.
+    """One cell of a comparison."""
 
-    Args:
-        water: Jerlov type.
-        height_m: height of the camera above the floor [m].
-        lamps: name of the lamp arrangement.
-        pixel: (column, row) [px].
-        model: light by the model.
-        total, direct: light by the reference [cd/m2], see `PixelLight`.
-        sharp_share: share of the total that comes from the floor and was not scattered between floor and camera.
-        veil, veil_once: light by the reference [cd/m2], see `PixelLight`.
-        blur_near, blur_far: shares of the blurred light whose point of the floor would, without scattering, be imaged
-            within 2 px of the pixel and beyond 40 px.
-    """
+    conditions: dict[str, Any]  #: water type, heights etc. by key in the files
+    light: dict[str, Compared]  #: quantities by key
 
-    water: str
-    height_m: float
-    lamps: str
-    pixel: tuple[int, int]
-    model: ModelLight
-    total: BatchMean
-    direct: BatchMean
-    sharp_share: BatchMean
-    veil: BatchMean
-    veil_once: BatchMean
-    blur_near: BatchMean
-    blur_far: BatchMean
+    @property
+    def row(self) -> dict[str, Any]:
+        """Returns the contents of the cell for the files, by key."""
+        return self.conditions | {key: x for name, one in self.light.items() for key, x in one.row(name).items()}
+
+
+def write_csv(cells: Sequence[LightCell], file: Path) -> list[dict[str, Any]]:
+    """Writes cells to a CSV file, in a folder that is created if missing; returns the rows."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    rows = [cell.row for cell in cells]
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.DictWriter(stream, list(rows[0]) if rows else [], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    return rows
+
+
+def text_of(mean: BatchMean, digits: str = ".3g") -> str:
+    """Returns a mean with its standard error as text; "-" if it is not known."""
+    return "-" if np.isnan(mean.value) else f"{mean.value:{digits}} +- {mean.standard_error:.1g}"
 
 
 def green_of(water: Medium) -> BandWater:

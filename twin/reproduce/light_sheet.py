@@ -8,51 +8,35 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from twin.imaging.reference.pixel_light import BatchMean
 from twin.report.figures import log_axis
-from twin.report.style import FIGURE_STYLE
+from twin.reproduce.exhibit import drawn
 from twin.reproduce.light_cell import LightCell
 
 MARKERS = {"leds": "o", "spots": "^"}
 OFFSET_M = 0.08  # horizontal distance between the markers of two pixels at the same height
 
 
-def draw(cells: Sequence[LightCell], file: Path) -> Path:
-    """Draws the figure, writes it to a PNG file and returns the path of the file."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(12.0, 7.5))
+def draw(cells: Sequence[LightCell], file: Path) -> None:
+    """Draws the figure to a PNG file."""
+    with drawn(file, 12.0, 7.5) as figure:
         grid = figure.subplots(2, 2)
         figure.suptitle(
             "Light model and Monte Carlo reference, green band; bars: two standard errors of the reference", fontsize=12
         )
-        _ratios(grid[0, 0], cells, "total light, model / reference", lambda cell: _over(cell.model.total, cell.total))
-        _ratios(grid[0, 1], cells, "veil, reference / model", lambda cell: _scaled(cell.veil, cell.model.veil))
+        _ratios(grid[0, 0], cells, "total light, model / reference", lambda cell: cell.light["total"].ratio)
+        _ratios(grid[0, 1], cells, "veil, reference / model", lambda cell: cell.light["veil"].inverse_ratio)
         _shares(grid[1, 0], cells)
         _blur(grid[1, 1], cells)
-        FigureCanvasAgg(figure).print_png(str(file))
-    return file
-
-
-def _over(model: float, truth: BatchMean) -> BatchMean:
-    """Returns model / truth with its standard error."""
-    value = model / truth.value
-    return BatchMean(value, value * truth.standard_error / truth.value)
-
-
-def _scaled(truth: BatchMean, model: float) -> BatchMean:
-    """Returns truth / model with its standard error; NaN if the model is 0."""
-    return BatchMean(truth.value / model, truth.standard_error / model) if model else BatchMean(np.nan, np.nan)
 
 
 def _series(cells: Sequence[LightCell]) -> list[tuple[str, tuple[float, float, float, float], list[LightCell]]]:
     """Returns name, colour and cells of each water type."""
-    waters = list(dict.fromkeys(cell.water for cell in cells))
+    waters = list(dict.fromkeys(cell.conditions["water"] for cell in cells))
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(waters)))
     return [
-        (water, tuple(shade), [cell for cell in cells if cell.water == water])
+        (water, tuple(shade), [cell for cell in cells if cell.conditions["water"] == water])
         for water, shade in zip(waters, shades, strict=True)
     ]
 
@@ -60,7 +44,7 @@ def _series(cells: Sequence[LightCell]) -> list[tuple[str, tuple[float, float, f
 def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[[LightCell], BatchMean]) -> None:
     for water, colour, own in _series(cells):
         for lamps, marker in MARKERS.items():
-            chosen = [cell for cell in own if cell.lamps == lamps]
+            chosen = [cell for cell in own if cell.conditions["lamps"] == lamps]
             found = [value(cell) for cell in chosen]
             axes.errorbar(
                 [_place_m(cell, chosen) for cell in chosen], [one.value for one in found],
@@ -76,16 +60,16 @@ def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[
 
 def _place_m(cell: LightCell, cells: Sequence[LightCell]) -> float:
     """Returns the abscissa of a cell [m]: the camera height, shifted for each pixel so that markers do not overlap."""
-    return cell.height_m + OFFSET_M * list(dict.fromkeys(other.pixel for other in cells)).index(cell.pixel)
+    pixels = [(one.conditions["column_px"], one.conditions["row_px"]) for one in (*cells, cell)]
+    return cell.conditions["height_m"] + OFFSET_M * list(dict.fromkeys(pixels)).index(pixels[-1])
 
 
 def _shares(axes: Axes, cells: Sequence[LightCell]) -> None:
     for _, colour, own in _series(cells):
         for cell in own:
-            axes.errorbar(
-                cell.sharp_share.value, cell.model.sharp_share, xerr=2 * cell.sharp_share.standard_error,
-                fmt=MARKERS[cell.lamps], color=colour, markersize=4,
-            )  # fmt: skip
+            model, truth = cell.light["sharp_share"][:2]
+            marker = MARKERS[cell.conditions["lamps"]]
+            axes.errorbar(truth.value, model, xerr=2 * truth.standard_error, fmt=marker, color=colour, markersize=4)
     axes.plot([0, 1], [0, 1], color="#9aa8b0", linewidth=1)
     axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="reference", ylabel="model", title="share of unscattered light")
 
@@ -93,9 +77,10 @@ def _shares(axes: Axes, cells: Sequence[LightCell]) -> None:
 def _blur(axes: Axes, cells: Sequence[LightCell]) -> None:
     for _, colour, own in _series(cells):
         for cell in own:
-            marker = MARKERS[cell.lamps]
-            axes.plot(cell.blur_near.value, cell.model.blur_near, marker, color=colour, markersize=4)
-            axes.plot(cell.blur_far.value, cell.model.blur_far, marker, color=colour, markersize=4, fillstyle="none")
+            for name, fill in (("blur_near", "full"), ("blur_far", "none")):
+                model, truth = cell.light[name][:2]
+                marker = MARKERS[cell.conditions["lamps"]]
+                axes.plot(truth.value, model, marker, color=colour, markersize=4, fillstyle=fill)
     axes.plot([1e-3, 1], [1e-3, 1], color="#9aa8b0", linewidth=1)
     axes.set(
         xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="reference", ylabel="model",

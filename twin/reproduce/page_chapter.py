@@ -37,11 +37,11 @@ def chapter(exhibits: Sequence[Exhibit], quick: bool) -> str:
         lines += [""] if name in described else ["", f"**{exhibit.title}.** {exhibit.text}", ""]
         described.add(name)
         lines += [f"*{table.title}*", ""]
-        lines += markdown(table)
+        lines += _markdown(table)
     return "\n".join([*lines, END])
 
 
-def markdown(table: Table) -> list[str]:
+def _markdown(table: Table) -> list[str]:
     """Returns the lines of a Markdown table."""
     header, *rows = [[cell.replace("|", "\\|") for cell in row] for row in table.rows]
     return [_line(header), _line(["---"] * len(header)), *map(_line, rows)]
@@ -52,15 +52,10 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def with_chapter(page: str, text: str, name: str = "page") -> str:
-    """Returns a page in which the markers and the text between them are replaced by the chapter.
-
-    Args:
-        page: contents of the page.
-        text: the chapter, including its markers.
-        name: name of the page in the error.
+    """Returns the contents of a page in which the markers and the text between them are replaced by the chapter.
 
     Raises:
-        TwinError: the page does not contain each marker exactly once, the begin marker first.
+        TwinError: the page, named `name`, does not contain each marker exactly once, the begin marker first.
     """
     first, last = page.find(BEGIN), page.find(END)
     if min(first, last) < 0 or last < first or page.count(BEGIN) != 1 or page.count(END) != 1:

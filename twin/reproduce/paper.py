@@ -26,9 +26,7 @@ FOOT_M = 0.3048
 SHOWN_TRACKS = (1, 2, 3, 4, 5, 11, 16, 21, 25)
 FIRST_TRACKS, FEW = 5, 3  # the paper distinguishes the first five tracks, and "a few" others with larger errors
 MEAN_RANGE_M = 8 * FOOT_M  # the paper relates its errors of elevation to this range
-#: Overrides of the scenarios of the coarse texture and of the full resolution.
-COARSE: tuple[str, ...] = ()
-FINE = ("navigation.aiding=[]",)
+FINE = ("navigation.aiding=[]",)  # overrides of the scenario at full resolution
 #: The quick plan: 25 tracks as far apart as the paper's, with legs of half a metre, at five frames per second and
 #: without rotation, as in the paper.
 QUICK = (
@@ -37,54 +35,50 @@ QUICK = (
 )  # fmt: skip
 
 
-class Flights(NamedTuple):
-    """The three flights: coarse texture, coarse texture without alignment, full resolution."""
+CAPTIONS = {
+    "paths": "Integrated frame-to-frame motion, and the path after alignment (Fig. 4).",
+    "tracks": "Position error of all keyframes so far, just before and after the global alignment at the end of a "
+    "track, for the tracks of Fig. 5.",
+    "errors": "Errors of position, height and heading along the path after alignment; dashed: ends of tracks (Fig. 6).",
+    "maps": "True elevation, map after alignment, map flown without alignment, and histogram of the absolute error "
+    "(Fig. 7).",
+}
 
-    coarse: Flown
-    unaligned: Flown
-    fine: Flown
+
+class Flights(NamedTuple):
+    """The three flights."""
+
+    coarse: Flown  #: over the coarse texture
+    unaligned: Flown  #: over the coarse texture, without alignment
+    fine: Flown  #: at full resolution
+
+    @property
+    def aligned(self) -> tuple[Flown, Flown]:
+        """Returns the flights with alignment: over the coarse texture and at full resolution."""
+        return self.coarse, self.fine
 
 
 class Claim(NamedTuple):
-    """A result that the paper states.
+    """A result that the paper states."""
 
-    Args:
-        label: name of the quantity.
-        paper: the paper's values, as text.
-        limit_m: the smallest of the paper's values [m]; a result below it is better than the paper's.
-        value_m: function that returns the value of a flight [m]; NaN if it is unknown.
-    """
-
-    label: str
-    paper: str
-    limit_m: float
-    value_m: Callable[[Flown], float]
+    label: str  #: name of the quantity
+    paper: str  #: the paper's values, as text
+    limit_m: float  #: the smallest of the paper's values; a result below it is better than the paper's
+    value_m: Callable[[Flown], float]  #: function that returns the value of a flight; NaN if it is unknown
 
 
 def run(folder: Path, quick: bool = False, settings: tuple[str, ...] = ()) -> Exhibit:
-    """Flies the mission and returns the results.
+    """Flies the mission and returns the results; writes paper.json and the figures to a folder, created if missing.
 
-    Writes paper.json and the figures to a folder, which is created if missing.
-
-    Args:
-        folder: folder to write.
-        quick: whether to fly the quick plan, with short legs and a low frame rate.
-        settings: further overrides of the scenarios, each "key=value".
+    The quick plan has short legs and a low frame rate. `settings` are further overrides of the scenarios ("key=value").
     """
-    coarse, fine = scenarios(quick, settings)
-    flights = fly(coarse, fine)
+    flights = fly(*scenarios(quick, settings))
     folder.mkdir(parents=True, exist_ok=True)
-    exhibit = exhibit_of_flights(flights, quick, figures=draw_figures(flights, folder))
-    write_exhibit(exhibit, folder)
-    return exhibit
+    return write_exhibit(exhibit_of_flights(flights, quick, figures=draw_figures(flights, folder)), folder)
 
 
 def fly(coarse: Scenario, fine: Scenario) -> Flights:
     """Flies the mission three times, in parallel on the available cores.
-
-    Args:
-        coarse: scenario of the flights over the coarse texture.
-        fine: scenario of the flight at full resolution.
 
     Raises:
         TwinError: a mission cannot be prepared, or no stereo pair became a keyframe.
@@ -98,14 +92,9 @@ def fly(coarse: Scenario, fine: Scenario) -> Flights:
 
 
 def scenarios(quick: bool, settings: tuple[str, ...] = ()) -> tuple[Scenario, Scenario]:
-    """Returns the scenarios of the mission: coarse texture and small images; fine texture and full-size images.
-
-    Args:
-        quick: whether to use the quick plan.
-        settings: further settings of both scenarios, each "key=value".
-    """
+    """Returns the scenarios of the mission: coarse texture and small images; fine texture and full-size images."""
     plan = (*(QUICK if quick else ()), *settings)
-    return load_scenario("paper_coarse", [*COARSE, *plan]), load_scenario("paper", [*FINE, *plan])
+    return load_scenario("paper_coarse", plan), load_scenario("paper", [*FINE, *plan])
 
 
 def draw_figures(flights: Flights, folder: Path) -> tuple[Figure, ...]:
@@ -115,15 +104,7 @@ def draw_figures(flights: Flights, folder: Path) -> tuple[Figure, ...]:
     paper_sheet.draw_tracks(aligned, SHOWN_TRACKS, folder / "paper_tracks.png")
     paper_sheet.draw_errors(aligned, folder / "paper_errors.png")
     paper_sheet.draw_maps(*flights, folder / "paper_maps.png")
-    return (
-        Figure("paper_paths.png", "Integrated frame-to-frame motion, and the path after alignment (Fig. 4)."),
-        Figure("paper_tracks.png", "Position error of all keyframes so far, just before and after the global "
-               "alignment at the end of a track, for the tracks of Fig. 5."),
-        Figure("paper_errors.png", "Errors of position, height and heading along the path after alignment; dashed: "
-               "ends of tracks (Fig. 6)."),
-        Figure("paper_maps.png", "True elevation, map after alignment, map flown without alignment, and histogram of "
-               "the absolute error (Fig. 7)."),
-    )  # fmt: skip
+    return tuple(Figure(f"paper_{name}.png", caption) for name, caption in CAPTIONS.items())
 
 
 def exhibit_of_flights(flights: Flights, quick: bool, figures: tuple[Figure, ...] = ()) -> Exhibit:
@@ -148,13 +129,13 @@ def _text(flights: Flights, quick: bool) -> str:
 
 CLAIMS = (
     Claim("largest position error, tracks 1 to 5", "about 1 ft = 0.30 m", FOOT_M,
-          lambda flown: _largest(_first_tracks(flown))),
+          lambda flown: _percentile(_first_tracks(flown), 100)),
     Claim("position error at the far end, worst track after the fifth", "2 to 4 ft = 0.61 to 1.22 m", 2 * FOOT_M,
-          lambda flown: _ranked(_far_ends(flown), 0)),
+          lambda flown: _far_end(flown, 0)),
     Claim(f"the same, without the {FEW} worst tracks", "at most 1.5 ft = 0.46 m", 1.5 * FOOT_M,
-          lambda flown: _ranked(_far_ends(flown), FEW)),
+          lambda flown: _far_end(flown, FEW)),
     Claim("largest error of elevation", "about 1.5 ft = 0.46 m", 1.5 * FOOT_M,
-          lambda flown: _largest(_height_errors(flown))),
+          lambda flown: _percentile(_height_errors(flown), 100)),
     Claim("error of elevation, 85 % of the map within", "0.6 ft = 0.18 m", 0.6 * FOOT_M,
           lambda flown: _percentile(_height_errors(flown), 85)),
 )  # fmt: skip
@@ -168,27 +149,26 @@ def claims_table(flights: Flights, quick: bool) -> Table:
     """
     rows: list[Row] = [("", "paper", "coarse texture", "full resolution", "better than the paper")]
     for claim in CLAIMS:
-        found = [claim.value_m(flown) for flown in (flights.coarse, flights.fine)]
-        better = [_better(value, claim.limit_m) for value in found]
-        rows.append((claim.label, claim.paper, *map(millimetres, found), " / ".join(better)))
+        rows.append(_claim_row(claim.label, claim.paper, claim.limit_m, [claim.value_m(f) for f in flights.aligned]))
     for claim, words, limit in ((CLAIMS[3], "20 %", 0.2), (CLAIMS[4], "7.5 %", 0.075)):
-        found = [claim.value_m(flown) / MEAN_RANGE_M for flown in (flights.coarse, flights.fine)]
-        better = [_better(value, limit) for value in found]
         label = f"{claim.label}, of the mean range 2.44 m".replace(" within", "")
-        rows.append((label, words, *(percent(value, 2) for value in found), " / ".join(better)))
+        shares = [claim.value_m(flown) / MEAN_RANGE_M for flown in flights.aligned]
+        rows.append(_claim_row(label, words, limit, shares, lambda share: percent(share, 2)))
     return make_table("claims", "The paper's results", [row[:-1] for row in rows] if quick else rows)
 
 
-def _better(value: float, limit: float) -> str:
-    """Returns whether a value is below a limit, as text; "-" if it is unknown."""
-    return DASH if np.isnan(value) else "yes" if value < limit else "no"
+def _claim_row(
+    label: str, paper: str, limit: float, values: list[float], text: Callable[[float], str] = millimetres
+) -> Row:
+    """Returns a row of `claims_table`; a value is better than the paper's if it is below the limit."""
+    better = [DASH if np.isnan(value) else "yes" if value < limit else "no" for value in values]
+    return label, paper, *map(text, values), " / ".join(better)
 
 
 def tracks_table(flights: Flights) -> Table:
     """Returns a table of the RMS position error of all keyframes so far, before and after alignments (Fig. 5)."""
-    header = ("track", "paper", "coarse, before", "coarse, after", "full resolution, before", "after")
-    rows: list[Row] = [header]
-    found = [{row["track"]: row for row in track_metrics(f.result, f.truth)} for f in (flights.coarse, flights.fine)]
+    rows: list[Row] = [("track", "paper", "coarse, before", "coarse, after", "full resolution, before", "after")]
+    found = [{row["track"]: row for row in track_metrics(f.result, f.truth)} for f in flights.aligned]
     for track in SHOWN_TRACKS:
         words = "about 0.30 m" if track <= FIRST_TRACKS else "up to 0.46 m, a few 0.61 to 1.22 m"
         values = [
@@ -202,13 +182,12 @@ def tracks_table(flights: Flights) -> Table:
 
 def path_table(flights: Flights) -> Table:
     """Returns a table of the RMS and largest errors along the path (Fig. 6)."""
-    rows: list[Row] = [("along the path", "paper", "coarse texture", "full resolution")]
-    both = [_errors(flights.coarse), _errors(flights.fine)]
-    f2f = [_errors(flown, "f2f") for flown in (flights.coarse, flights.fine)]
-    rows += [
-        ("position error, RMS / largest", "Fig. 6 (a)", *(_pair(e.distance_m) for e in both)),
-        ("height error, RMS / largest", "Fig. 6 (b)", *(_pair(e.position_m[:, 2]) for e in both)),
-        ("heading error, RMS / largest", "Fig. 6 (c)", *(_degrees(e.heading_rad) for e in both)),
+    final, f2f = ([_errors(flown, path) for flown in flights.aligned] for path in ("final", "f2f"))
+    rows: list[Row] = [
+        ("along the path", "paper", "coarse texture", "full resolution"),
+        ("position error, RMS / largest", "Fig. 6 (a)", *(_pair(e.distance_m) for e in final)),
+        ("height error, RMS / largest", "Fig. 6 (b)", *(_pair(e.position_m[:, 2]) for e in final)),
+        ("heading error, RMS / largest", "Fig. 6 (c)", *(_degrees(e.heading_rad) for e in final)),
         ("position error of F2F alone, RMS / largest", "Fig. 4 (a)", *(_pair(e.distance_m) for e in f2f)),
     ]
     return make_table("path", "Errors along the path after alignment", rows)
@@ -219,16 +198,16 @@ def map_table(flights: Flights) -> Table:
 
     For the flight without alignment, the table also has an error of the map and the distance from the planned path.
     """
-    rows: list[Row] = [("", "paper", "coarse texture", "full resolution")]
-    rows += [
+    unaligned, truth = flights.unaligned, flights.unaligned.truth
+    off_course_m = np.linalg.norm(truth.trajectory.positions - truth.reference, axis=1)
+    without = "flown without alignment:"
+    rows: list[Row] = [
+        ("", "paper", "coarse texture", "full resolution"),
         ("map after alignment: area without a height", "none seen in Fig. 7 (b)",
-         *(percent(holes(flown), 2) for flown in (flights.coarse, flights.fine))),
-        ("flown without alignment: area without a height", "holes in Fig. 7 (c)",
-         percent(holes(flights.unaligned), 2), DASH),
-        ("flown without alignment: 85 % of the map within", DASH,
-         millimetres(_percentile(_height_errors(flights.unaligned), 85)), DASH),
-        ("flown without alignment: distance from the planned path, largest", DASH,
-         millimetres(_off_course_m(flights.unaligned)), DASH),
+         *(percent(holes(flown), 2) for flown in flights.aligned)),
+        (f"{without} area without a height", "holes in Fig. 7 (c)", percent(holes(unaligned), 2), DASH),
+        (f"{without} 85 % of the map within", DASH, millimetres(_percentile(_height_errors(unaligned), 85)), DASH),
+        (f"{without} distance from the planned path, largest", DASH, millimetres(_percentile(off_course_m, 100)), DASH),
     ]  # fmt: skip
     return make_table("map", "The map with and without alignment", rows)
 
@@ -236,12 +215,6 @@ def map_table(flights: Flights) -> Table:
 def holes(flown: Flown) -> float:
     """Returns the share of the asked area that has no height in the map."""
     return float(np.isnan(flown.elevation.height_m[flown.truth.asked]).mean())
-
-
-def _off_course_m(flown: Flown) -> float:
-    """Returns the largest distance between the true and the planned position of a frame [m]."""
-    truth = flown.truth
-    return _largest(np.linalg.norm(truth.trajectory.positions - truth.reference, axis=1))
 
 
 def _errors(flown: Flown, path: str = "final") -> PathErrors:
@@ -254,25 +227,18 @@ def _first_tracks(flown: Flown) -> Array:
     return error_m[flown.truth.track[: len(error_m)] <= FIRST_TRACKS]
 
 
-def _far_ends(flown: Flown) -> list[float]:
-    """Returns the RMS position error at the far end of each track after the first five [m], the largest first."""
+def _far_end(flown: Flown, rank: int) -> float:
+    """Returns the RMS position error at the far end of a track after the first five [m], by rank (0: the largest)."""
     error_m = _errors(flown).distance_m
     tracks = range(FIRST_TRACKS + 1, flown.mission.plan.n_tracks + 1)
     found = [farthest_error_m(track, error_m, flown.truth) for track in tracks]
-    return sorted((value for value in found if value is not None), reverse=True)
+    values = sorted((value for value in found if value is not None), reverse=True)
+    return values[rank] if rank < len(values) else np.nan
 
 
 def _height_errors(flown: Flown) -> Array:
     error = height_error(flown.elevation, flown.truth)
     return np.abs(error[np.isfinite(error)])
-
-
-def _largest(values: Array) -> float:
-    return float(np.max(values)) if len(values) else np.nan
-
-
-def _ranked(values: list[float], rank: int) -> float:
-    return values[rank] if rank < len(values) else np.nan
 
 
 def _percentile(values: Array, percent: float) -> float:
@@ -281,10 +247,10 @@ def _percentile(values: Array, percent: float) -> float:
 
 def _pair(values_m: Array) -> str:
     """Returns RMS and largest absolute value of errors (n,) [m] as text."""
-    return f"{millimetres(float(np.sqrt(np.mean(values_m**2))))} / {millimetres(_largest(np.abs(values_m)))}"
+    return f"{millimetres(float(np.sqrt(np.mean(values_m**2))))} / {millimetres(_percentile(np.abs(values_m), 100))}"
 
 
 def _degrees(values_rad: Array) -> str:
     """Returns RMS and largest absolute value of angles (n,) as text [deg]."""
     size = np.rad2deg(np.abs(values_rad))
-    return f"{np.sqrt(np.mean(size**2)):.3f} / {_largest(size):.3f} deg"
+    return f"{np.sqrt(np.mean(size**2)):.3f} / {_percentile(size, 100):.3f} deg"

@@ -5,34 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from twin.judge.map_error import height_error
 from twin.judge.trajectory_errors import keyframe_errors_m, path_errors
 from twin.report.figures import hillshade, log_axis
-from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.style import COLOURS
+from twin.reproduce.exhibit import drawn, extent_of
 from twin.reproduce.paper_flight import Flown
 
 SHADES = ("#d55e00", "#0072b2")  # coarse texture, full resolution
 MAP_CELLS = 700  # longest side of a drawn map
 
 
-def _save(figure: Figure, file: Path) -> None:
-    FigureCanvasAgg(figure).print_png(str(file))
-
-
 def draw_paths(flights: Mapping[str, Flown], file: Path) -> None:
     """Draws the true, the F2F and the aligned path of each flight (Fig. 4)."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(12.0, 6.4))
-        for axes, (name, flown) in zip(
-            figure.subplots(1, len(flights), squeeze=False)[0], flights.items(), strict=True
-        ):
+    with drawn(file, 12.0, 6.4) as figure:
+        panels = figure.subplots(1, len(flights), squeeze=False)[0]
+        for axes, (name, flown) in zip(panels, flights.items(), strict=True):
             paths = (("truth", flown.truth.trajectory), ("f2f", flown.result.f2f), ("final", flown.result.final))
             for role, path in paths:
                 wide = {"linewidth": 4.0, "alpha": 0.35} if role == "truth" else {"linewidth": 0.9}
@@ -41,13 +33,11 @@ def draw_paths(flights: Mapping[str, Flown], file: Path) -> None:
             axes.set(title=name, xlabel="x [m]", ylabel="y [m]")
             axes.axis("equal")
             axes.legend(fontsize=8)
-        _save(figure, file)
 
 
 def draw_tracks(flights: Mapping[str, Flown], tracks: Sequence[int], file: Path) -> None:
     """Draws the errors of all keyframes up to the end of each track, before and after its alignment (Fig. 5)."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(12.0, 8.0))
+    with drawn(file, 12.0, 8.0) as figure:
         panels = figure.subplots(3, -(-len(tracks) // 3), squeeze=False).ravel()
         for axes, track in zip(panels, tracks, strict=False):
             for (name, flown), colour in zip(flights.items(), SHADES, strict=False):
@@ -57,7 +47,6 @@ def draw_tracks(flights: Mapping[str, Flown], tracks: Sequence[int], file: Path)
         panels[0].legend(fontsize=7)
         figure.supxlabel("keyframe")
         figure.supylabel("position error [mm]")
-        _save(figure, file)
 
 
 def _keyframe_errors(axes: Axes, flown: Flown, track: int, name: str, colour: str) -> None:
@@ -73,8 +62,7 @@ def _keyframe_errors(axes: Axes, flown: Flown, track: int, name: str, colour: st
 
 def draw_errors(flights: Mapping[str, Flown], file: Path) -> None:
     """Draws position, height and heading error along the path, with the ends of the tracks (Fig. 6)."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(12.0, 7.0))
+    with drawn(file, 12.0, 7.0) as figure:
         position, height, heading = figure.subplots(3, 1, sharex=True)
         for (name, flown), colour in zip(flights.items(), SHADES, strict=False):
             errors = path_errors(flown.result.final, flown.truth.trajectory)
@@ -92,13 +80,11 @@ def draw_errors(flights: Mapping[str, Flown], file: Path) -> None:
         height.set(ylabel="height error [mm]")
         heading.set(ylabel="heading error [deg]", xlabel="length of the true path [m]")
         position.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1.0))
-        _save(figure, file)
 
 
 def draw_maps(coarse: Flown, unaligned: Flown, fine: Flown, file: Path) -> None:
     """Draws the true floor, the maps of the three flights and the histograms of their errors (Fig. 7)."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(13.0, 8.6))
+    with drawn(file, 13.0, 8.6) as figure:
         panels = figure.subplots(2, 3)
         heights = coarse.truth.height_m
         scale = float(np.nanmin(heights)), float(np.nanmax(heights))
@@ -113,14 +99,12 @@ def draw_maps(coarse: Flown, unaligned: Flown, fine: Flown, file: Path) -> None:
             axes.set_title(title)
         _histogram(panels[1, 1], {"coarse texture": coarse, "full resolution": fine})
         _histogram(panels[1, 2], {"coarse texture": coarse, "flown without alignment": unaligned})
-        _save(figure, file)
 
 
 def _map(axes: Axes, flown: Flown, values: NDArray[np.floating], scale: tuple[float, float]) -> None:
     grid = flown.mission.grid
     step = max(1, -(-max(values.shape) // MAP_CELLS))
-    extent = grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
-    axes.imshow(hillshade(values[::step, ::step], "viridis", scale), extent=extent)
+    axes.imshow(hillshade(values[::step, ::step], "viridis", scale), extent=extent_of(grid))
     axes.set_facecolor("white")
     axes.grid(visible=False)
     axes.set(xlabel="x [m]", ylabel="y [m]")

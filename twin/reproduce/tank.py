@@ -13,9 +13,8 @@ from twin.judge.map_error import height_error
 from twin.judge.trajectory_errors import path_errors
 from twin.reproduce import tank_sheet
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
-from twin.reproduce.tank_hidden import hidden_cells
-from twin.reproduce.tank_scene import OBJECTS
-from twin.reproduce.tank_sizes import SizeRow, measure
+from twin.reproduce.experiment_floors import OBJECTS
+from twin.reproduce.tank_sizes import SizeRow, hidden_cells, measure
 from twin.reproduce.tank_survey import QUICK, TankSurvey, closures, height_errors, survey_tank
 
 Array = NDArray[np.floating]
@@ -25,15 +24,16 @@ WORST_SHARE = 0.2  # a bad cell counts as predicted if it is among this share of
 TITLES = {"tank1": "Tank test 1: 130 pairs on parallel legs", "tank2": "Tank test 2: two loops that touch at the start"}
 #: Keys of the tables of each experiment.
 TABLES = {"tank1": ("rows", "sizes", "map"), "tank2": ("rows", "closure", "sizes", "map")}
+_CAPTION = (
+    "Connections of the network over the mosaic, path before and after the global alignment, true and estimated "
+    "height, logarithm of the predicted standard deviation, and absolute error of the height."
+)
 
 
 def run(name: str, folder: Path, quick: bool = False) -> Exhibit:
-    """Surveys the tank and returns the results; writes NAME.json and NAME.png to a folder, created if missing.
+    """Surveys the tank ("tank1" or "tank2") and returns the results; writes NAME.json and NAME.png to a folder.
 
-    Args:
-        name: "tank1" or "tank2".
-        folder: folder to write.
-        quick: whether to take smaller images, of 320 x 240 pixels.
+    The quick version takes smaller images, of 320 x 240 pixels.
     """
     with tempfile.TemporaryDirectory(prefix="twin-") as images:
         survey = survey_tank(name, Path(images), QUICK if quick else ())
@@ -46,20 +46,10 @@ def run(name: str, folder: Path, quick: bool = False) -> Exhibit:
         "sizes": sizes_table(sizes),
         "map": _map_table(survey),
     }
-    folder.mkdir(parents=True, exist_ok=True)
+    shown, figures = tuple(tables[key] for key in TABLES[name]), (Figure(f"{name}.png", _CAPTION),)
+    exhibit = write_exhibit(Exhibit(name, TITLES[name], _text(survey), shown, figures), folder)
     tank_sheet.draw(TITLES[name], survey, folder / f"{name}.png")
-    exhibit = Exhibit(
-        name, TITLES[name], _text(survey), tuple(tables[key] for key in TABLES[name]),
-        (Figure(f"{name}.png", _CAPTION),),
-    )  # fmt: skip
-    write_exhibit(exhibit, folder)
     return exhibit
-
-
-_CAPTION = (
-    "Connections of the network over the mosaic, path before and after the global alignment, true and estimated "
-    "height, logarithm of the predicted standard deviation, and absolute error of the height."
-)
 
 
 def _text(survey: TankSurvey) -> str:
@@ -115,15 +105,14 @@ def sizes_table(sizes: Sequence[SizeRow]) -> Table:
         ("object", "along x, true / measured", "along y, true / measured", "height, true / measured", "largest error")
     ]
     for row in sizes:
-        pairs = [f"{1e3 * t:.1f} / {_mm(m)}" for t, m in zip(row.true, row.measured, strict=True)]
+        pairs = [
+            f"{1e3 * true:.1f} / {DASH if np.isnan(found) else f'{1e3 * found:.1f}'}"
+            for true, found in zip(row.true, row.measured, strict=True)
+        ]
         errors = np.abs(row.errors_m)
         known = errors[np.isfinite(errors)]
         rows.append((row.name, *pairs, f"{1e3 * known.max():.1f}" if known.size else DASH))
     return make_table("sizes", "Sizes of the objects in the map, at half of their height [mm]", rows)
-
-
-def _mm(value_m: float) -> str:
-    return DASH if np.isnan(value_m) else f"{1e3 * value_m:.1f}"
 
 
 def _map_table(survey: TankSurvey) -> Table:

@@ -4,48 +4,45 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm, Normalize
-from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
-from twin.report.style import COLOURS, FIGURE_STYLE
+from twin.report.style import COLOURS
+from twin.reproduce.exhibit import drawn, extent_of
 from twin.reproduce.tank_survey import TankSurvey, height_errors
 
 LEAST_M, LARGEST_M = 2e-4, 0.1  # limits of the logarithmic scale of sigma and error
 
 
-def draw(title: str, survey: TankSurvey, file: Path) -> Path:
-    """Draws the figure, writes it to a PNG file and returns the path of the file."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(13.0, 7.4))
+def draw(title: str, survey: TankSurvey, file: Path) -> None:
+    """Draws the figure to a PNG file."""
+    with drawn(file, 13.0, 7.4) as figure:
         figure.suptitle(title, fontsize=12)
         panels = figure.subplots(2, 3)
         _network(panels[0, 0], survey)
         _paths(panels[1, 0], survey)
-        heights = Normalize(-0.01, float(survey.truth.height_m.max()))
-        _raster(panels[0, 1], survey, survey.truth.height_m, ("true height [m]", "viridis", heights))
-        _raster(panels[1, 1], survey, survey.elevation.height_m, ("height in the map [m]", "viridis", heights))
-        scale = LogNorm(LEAST_M, LARGEST_M)
+        heights, scale = Normalize(-0.01, float(survey.truth.height_m.max())), LogNorm(LEAST_M, LARGEST_M)
         error = np.maximum(np.abs(height_errors(survey)), LEAST_M)
-        _raster(panels[0, 2], survey, survey.elevation.sigma_m, ("predicted sigma [m]", "magma", scale))
-        _raster(panels[1, 2], survey, error, ("absolute height error [m]", "magma", scale))
-        FigureCanvasAgg(figure).print_png(str(file))
-    return file
-
-
-def _extent(survey: TankSurvey) -> tuple[float, float, float, float]:
-    grid = survey.mission.grid
-    return grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m
+        for axes, values, title, cmap, norm in (
+            (panels[0, 1], survey.truth.height_m, "true height [m]", "viridis", heights),
+            (panels[1, 1], survey.elevation.height_m, "height in the map [m]", "viridis", heights),
+            (panels[0, 2], survey.elevation.sigma_m, "predicted sigma [m]", "magma", scale),
+            (panels[1, 2], error, "absolute height error [m]", "magma", scale),
+        ):
+            image = axes.imshow(values, extent=extent_of(survey.mission.grid), cmap=cmap, norm=norm)
+            axes.set(title=title)
+            axes.set_facecolor("#dfe6ea")  # cells without a value
+            axes.grid(visible=False)
+            bar = figure.colorbar(image, ax=axes, shrink=0.7)
+            if norm is scale:
+                bar.ax.yaxis.set_major_formatter("{x:g}")
 
 
 def _network(axes: Axes, survey: TankSurvey) -> None:
     links, positions = survey.result.links, survey.result.final.positions[survey.result.keyframe_rows]
-    axes.imshow(survey.elevation.mosaic, extent=_extent(survey))
+    axes.imshow(survey.elevation.mosaic, extent=extent_of(survey.mission.grid))
     ends = np.stack([positions[links.i, :2], positions[links.j, :2]], axis=1)
     axes.add_collection(LineCollection(list(ends), colors=COLOURS["f2f"], linewidths=0.5, alpha=0.7))
     axes.plot(*positions[:, :2].T, ".", markersize=3, color=COLOURS["online"])
@@ -65,17 +62,3 @@ def _paths(axes: Axes, survey: TankSurvey) -> None:
         axes.plot(*positions[:, :2].T, color=COLOURS[role], label=label, linewidth=width, alpha=alpha)
     axes.set(title="path of the left camera", xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.legend(fontsize=7, loc="upper right")
-
-
-def _raster(axes: Axes, survey: TankSurvey, values: NDArray[np.floating], style: tuple[str, str, Normalize]) -> None:
-    """Adds a raster of the map's grid; `style`: title, colour map, scale. Cells without a value are light grey."""
-    title, cmap, norm = style
-    image = axes.imshow(values, extent=_extent(survey), cmap=cmap, norm=norm)
-    axes.set(title=title)
-    axes.set_facecolor("#dfe6ea")
-    axes.grid(visible=False)
-    figure = axes.get_figure()
-    assert figure is not None
-    bar = figure.colorbar(image, ax=axes, shrink=0.7)
-    if isinstance(norm, LogNorm):
-        bar.ax.yaxis.set_major_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""Tank experiments: estimates from the images that a rig on an overhead track takes, compared with the truth."""
+"""Surveys of the tank: the images that a rig on an overhead track takes, which is not straight, and the estimates."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from twin.controllers.segments import Reference
 from twin.core import geometry
 from twin.core.interrupts import StageGuard
-from twin.core.records import ElevationMap, MapGrid, SurveyResult, Trajectory, Truth
+from twin.core.records import ElevationMap, MapGrid, SurveyResult, Truth
 from twin.core.timing import Stopwatch
 from twin.estimate.pipeline import Navigator
 from twin.judge.trajectory_errors import anchor
-from twin.reproduce.conclusion import finished, required_map
-from twin.reproduce.tank_path import RigPath, lawnmower_path, two_loops_path
-from twin.reproduce.tank_scene import tank_floor
+from twin.reproduce.experiment_floors import tank_floor
+from twin.reproduce.paper_flight import finished_map
 from twin.scenario.file import load_scenario
 from twin.session.assembly import image_vision
 from twin.simulate.kinematic_vehicle import KinematicVehicle
@@ -32,43 +31,88 @@ AREA_M = (2.0, 1.5)  # mapped area around the centre of the tank
 QUICK = ("rig.image_width_px=320", "rig.image_height_px=240", "estimate.patch_px=15", "map.cell_m=0.003")
 N_PAIRS = 130
 SEED = 1
+STEP_M, HEIGHT_M = 0.05, 1.524  # between frames; of the cameras above the floor (5 ft)
+LEG_M, LEG_SPACING_M, N_LEGS = 0.97, 0.25, 5
+N_LOOP = 30  # steps of one loop
+#: Bend of the track: the rig is displaced by up to BEND_M across it, within about BEND_WIDTH_M of x = BEND_AT_M.
+BEND_M, BEND_AT_M, BEND_WIDTH_M = 0.012, 0.2, 0.15
+JITTER_M, JITTER_RAD = 0.001, float(np.deg2rad(0.1))  # standard deviation of each axis
+
+
+class RigPath(NamedTuple):
+    """Path of the rig."""
+
+    planned_m: Array  #: (n, 3) positions of the left camera as read on the track
+    world_from_camera: Array  #: (n, 4, 4) true poses of the left camera
+    repeats: tuple[int, ...] = ()  #: numbers (from 0) of the frames that repeat frame 0
+
+    @property
+    def start(self) -> Array:
+        """Returns the planned pose (4, 4) of the left camera at the first frame: level, optical axis along -z."""
+        return geometry.pose(geometry.rotations_of_down_camera(np.zeros(1))[0], self.planned_m[0])
 
 
 @dataclass(frozen=True)
 class TankSurvey:
-    """A tank experiment: estimates and truth.
+    """A tank experiment: estimates and truth."""
 
-    Args:
-        mission: rig, floor and map grid.
-        path: path of the rig.
-        result: output of the estimators.
-        elevation: map along the final trajectory.
-        truth: true trajectory and floor.
-        ended: why the final alignment is missing; "" if it was done.
-    """
-
-    mission: Mission
+    mission: Mission  #: rig, floor and map grid
     path: RigPath
     result: SurveyResult
-    elevation: ElevationMap
+    elevation: ElevationMap  #: map along the final trajectory
     truth: Truth
-    ended: str = ""
+    ended: str = ""  #: why the final alignment is missing; "" if it was done
 
 
 class Closure(NamedTuple):
-    """Closure errors: distances between the estimated positions of the first frame and of a frame that repeats it [m].
+    """Closure errors: distances between the estimated positions of the first frame and of a frame that repeats it."""
 
-    Args:
-        frame: number of the frame that repeats the first, from 1.
-        before_m: closure error of the integrated frame-to-frame motion.
-        online_m: closure error of the online estimate, which registration with the mosaic corrects.
-        after_m: closure error after the global alignment.
-    """
+    frame: int  #: number of the frame that repeats the first, from 1
+    before_m: float  #: of the integrated frame-to-frame motion
+    online_m: float  #: of the online estimate, which registration with the mosaic corrects
+    after_m: float  #: after the global alignment
 
-    frame: int
-    before_m: float
-    online_m: float
-    after_m: float
+
+def lawnmower_path(n_pairs: int, seed: int) -> RigPath:
+    """Returns the path of the first test: up to 137 stereo pairs on parallel legs along x joined by half circles."""
+    turn_m = LEG_SPACING_M / 2
+    angle = np.linspace(0, np.pi, 181)[:-1]
+    turn = turn_m * np.column_stack([np.sin(angle), 1 - np.cos(angle)])
+    sides = [-1 if k % 2 else 1 for k in range(N_LEGS)]
+    south_m = -(N_LEGS - 1) / 2 * LEG_SPACING_M
+    parts = [
+        np.concatenate([[[-LEG_M / 2, 0.0]], turn + [LEG_M / 2, 0.0]]) * [side, 1] + [0.0, south_m + k * LEG_SPACING_M]
+        for k, side in enumerate(sides)
+    ]
+    points = np.concatenate(parts)
+    lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    along = STEP_M * np.arange(n_pairs)
+    return _rig_path(np.column_stack([np.interp(along, lengths, points[:, axis]) for axis in range(2)]), seed)
+
+
+def two_loops_path(seed: int) -> RigPath:
+    """Returns the path of the second test: two circles that touch at the start; frames 30 and 60 repeat frame 0."""
+    radius_m = N_LOOP * STEP_M / (2 * np.pi)
+    angle = 2 * np.pi * np.arange(N_LOOP + 1) / N_LOOP
+    loop = radius_m * np.column_stack([1 - np.cos(angle), np.sin(angle)])
+    path = _rig_path(np.concatenate([loop, loop[1:] * [-1, 1]]), seed)
+    poses = path.world_from_camera.copy()
+    repeats = N_LOOP, 2 * N_LOOP
+    poses[list(repeats)] = poses[0]
+    return RigPath(path.planned_m, poses, repeats)
+
+
+def _rig_path(xy: Array, seed: int) -> RigPath:
+    """Returns the path for planned positions `xy` (n, 2) [m]; true poses include the bend of the track and jitter."""
+    rng, n = np.random.default_rng(seed), len(xy)
+    planned = np.column_stack([xy, np.full(n, HEIGHT_M)])
+    bend = BEND_M * np.exp(-(((xy[:, 0] - BEND_AT_M) / BEND_WIDTH_M) ** 2))
+    position = planned + np.column_stack([np.zeros(n), bend, np.zeros(n)]) + rng.normal(0, JITTER_M, (n, 3))
+    level = geometry.rotations_of_down_camera(np.zeros(n))
+    turned = np.array([geometry.so3_exp(w) for w in rng.normal(0, JITTER_RAD, (n, 3))])
+    poses = np.tile(np.eye(4), (n, 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = level @ turned, position
+    return RigPath(planned, poses)
 
 
 def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: int = N_PAIRS) -> TankSurvey:
@@ -89,9 +133,11 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
     path = two_loops_path(SEED) if name == "tank2" else lawnmower_path(n_pairs, SEED)
     mission = tank_mission(settings)
     stopwatch, guard = Stopwatch(), StageGuard()
-    rig, estimator = mission.rig, mission.scenario.estimator_settings()
-    vision = image_vision(mission, folder, stopwatch)
+    rig, estimator, n = mission.rig, mission.scenario.estimator_settings(), len(path.planned_m)
+    still = np.zeros_like(path.planned_m)
+    reference = Reference(path.planned_m, still, np.zeros(n), still)
     with (
+        image_vision(mission, folder, stopwatch) as vision,
         RenderedWorld(mission, stopwatch) as world,
         Navigator(rig, estimator, path.start, vision=vision, stopwatch=stopwatch) as navigator,
     ):
@@ -99,14 +145,13 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
         assert isinstance(vehicle, KinematicVehicle)
         for k, pose in enumerate(path.world_from_camera):
             vehicle.world_from_body = pose @ geometry.inverse(rig.body_from_camera)
-            frame = world.observe(Step(_reference(path).row(k), keyframe=True, holding=False))
+            frame = world.observe(Step(reference.row(k), keyframe=True, holding=False))
             first = first or frame
             repeated = k in path.repeats
             navigator.update(replace(frame, left=first.left, right=first.right) if repeated else frame)
-        world.start_sequence(_sequence(path, rig.frame_rate_hz), 1)
-        result, truth = finished(navigator, guard), world.truth()
-        elevation = required_map(navigator, result, mission.grid, guard)
-    return TankSurvey(mission, path, result, elevation, truth, guard.cause)
+        world.start_sequence(FrameSequence(reference, np.ones(n, np.bool_), False, np.arange(n) / rig.frame_rate_hz), 1)
+        result, elevation = finished_map(navigator, mission.grid, guard)
+        return TankSurvey(mission, path, result, elevation, world.truth(), guard.cause)
 
 
 def height_errors(survey: TankSurvey) -> Array:
@@ -137,23 +182,7 @@ def map_grid(cell_m: float) -> MapGrid:
     return MapGrid(-(cols + 0.5) * cell_m, (rows + 0.5) * cell_m, cell_m, 2 * rows + 1, 2 * cols + 1)
 
 
-def _reference(path: RigPath) -> Reference:
-    """Returns the planned positions as a reference path with velocity 0."""
-    zeros = np.zeros_like(path.planned_m)
-    return Reference(path.planned_m, zeros, np.zeros(len(zeros)), zeros)
-
-
-def _sequence(path: RigPath, frame_rate_hz: float) -> FrameSequence:
-    """Returns the planned frames of a path."""
-    n = len(path.planned_m)
-    return FrameSequence(_reference(path), np.ones(n, np.bool_), False, np.arange(n) / frame_rate_hz)
-
-
 def closures(result: SurveyResult, repeats: Sequence[int]) -> list[Closure]:
     """Returns the closure errors of a survey at the frames (numbers from 0) that repeat frame 0."""
-    return [Closure(k + 1, *(_gap_m(path, k) for path in (result.f2f, result.online, result.final))) for k in repeats]
-
-
-def _gap_m(path: Trajectory, frame: int) -> float:
-    """Returns the distance between the positions of a frame and of frame 0 [m]."""
-    return float(np.linalg.norm(path.positions[frame] - path.positions[0]))
+    paths = (result.f2f.positions, result.online.positions, result.final.positions)
+    return [Closure(k + 1, *(float(np.linalg.norm(path[k] - path[0])) for path in paths)) for k in repeats]

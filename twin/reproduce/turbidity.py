@@ -1,11 +1,7 @@
-"""Reproduction of Fig. 8 of Negahdaripour & Madjidi (2003): simulated images of one object at five turbidity levels.
-
-In addition, contrast is computed as a function of range.
-"""
+"""One object at five turbidities (Fig. 8 of Negahdaripour & Madjidi 2003), and contrast as a function of range."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -19,8 +15,9 @@ from twin.core.records import StereoRig
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
 from twin.reproduce import turbidity_sheet
-from twin.reproduce.block import block_on_sand
-from twin.reproduce.turbidity_level import TurbidityLevel
+from twin.reproduce.exhibit import Exhibit, Figure, make_table, write_json
+from twin.reproduce.experiment_floors import block_on_sand
+from twin.reproduce.turbidity_sheet import TurbidityLevel
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
 from twin.world.mission import prepare
@@ -35,19 +32,23 @@ SETTINGS = (
     "plan.speed_mps=0.05", "rig.image_width_px=480", "rig.image_height_px=360", "terrain.kind=flat",
     "terrain.relief_m=0.0", "imaging.shadows=true",
 )  # fmt: skip
+QUICK = ("rig.image_width_px=240", "rig.image_height_px=180")
 RANGES_M: Array = np.arange(0.3, 12.01, 0.05)
+
+
+def run(folder: Path, quick: bool = False) -> Exhibit:
+    """Renders the block at all turbidities, writes turbidity.json and turbidity.png, and returns the results."""
+    results = write(render_levels(settings=QUICK if quick else ()), folder)
+    text = "A concrete block on rippled sand in water of Jerlov type II at five turbidities, lit by two lamps (Fig. 8)."
+    found = make_table("turbidity", f"Block at {results['range_m']:.2f} m in green light", table(results))
+    figure = Figure("turbidity.png", "Images, histograms, and contrast of fine detail against range.")
+    return Exhibit("turbidity", "Turbidity", text, (found,), (figure,))
 
 
 def render_levels(
     turbidities: Sequence[float] = TURBIDITIES, settings: Sequence[str] = (), ranges_m: Array = RANGES_M
 ) -> list[TurbidityLevel]:
-    """Returns the results at each turbidity: image of a block on sand, its quality, and the contrast at each range.
-
-    Args:
-        turbidities: values of `water.turbidity`.
-        settings: further overrides of the scenario, each "key=value".
-        ranges_m: (n,) ranges at which the contrast is computed [m].
-    """
+    """Returns the results at each `water.turbidity`, with further overrides of the scenario ("key=value")."""
     levels, floor = [], block_on_sand(seed=1)
     for turbidity in turbidities:
         scenario = load_scenario("reef", [*SETTINGS, f"water.turbidity={turbidity}", *settings])
@@ -65,13 +66,8 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     contrast C relative to its value C0 in clear water is therefore C / C0 = direct / (direct + forward + backscatter)
     (Duntley 1963, here for lamps that are fixed to the camera).
 
-    Args:
-        scenario: settings of the lamps and the camera.
-        illumination: water and daylight.
-        ranges_m: (n,) ranges at which the contrast is computed [m].
-
     Returns:
-        (n, 3) relative contrast for R, G, B.
+        (n, 3) relative contrast for R, G, B at the ranges (n,) [m].
     """
     rig: StereoRig = replace(scenario.believed_rig(), width_px=64, height_px=48)
     rig = replace(rig, focal_px=rig.focal_px * 64 / scenario.rig.image_width_px)
@@ -88,7 +84,7 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     return contrast
 
 
-def summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
+def _summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
     """Returns the contents of turbidity.json: water, image quality and contrast at each turbidity level."""
     names = ("gray_level", "contrast", "veil_share", "saturated_share", "snr", "texture_snr")
     return {
@@ -130,8 +126,7 @@ def table(summary: dict[str, Any]) -> list[tuple[str, ...]]:
 
 def write(levels: Sequence[TurbidityLevel], folder: Path) -> dict[str, Any]:
     """Writes turbidity.png and turbidity.json to a folder, which is created if missing; returns the summary."""
-    folder.mkdir(parents=True, exist_ok=True)
-    results = summary(levels)
-    (folder / "turbidity.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+    results = _summary(levels)
+    write_json(folder / "turbidity.json", results)
     turbidity_sheet.draw(levels, folder / "turbidity.png")
     return results

@@ -4,28 +4,47 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
+from twin.core.records import Image
+from twin.imaging.light.water import Medium
 from twin.report.figures import log_axis
-from twin.report.style import FIGURE_STYLE
-from twin.reproduce.turbidity_level import MIN_VISIBLE_CONTRAST, TurbidityLevel
+from twin.reproduce.exhibit import drawn
+from twin.scenario.model import Scenario
 
 BANDS = (("red", "#d55e00"), ("green", "#009e73"), ("blue", "#0072b2"))
 PANEL_IN = 3.1
+#: Contrast relative to clear water below which fine detail counts as invisible.
+MIN_VISIBLE_CONTRAST = 0.05
 
 
-def draw(levels: Sequence[TurbidityLevel], file: Path) -> Path:
-    """Draws the figure, writes it to a PNG file and returns the path of the file."""
+class TurbidityLevel(NamedTuple):
+    """Results for one turbidity level."""
+
+    scenario: Scenario  #: scenario with this turbidity
+    water: Medium  #: optical properties of the water
+    image: Image  #: (H, W, 3) image of the left camera
+    quality: dict[str, Any]  #: measures of the quality of `image`, see `twin.app.look.image_quality`
+    ranges_m: NDArray[np.float64]  #: (n,) ranges at which `contrast` is given
+    contrast: NDArray[np.float64]  #: (n, 3) contrast of fine detail relative to clear water for R, G, B
+
+    @property
+    def visibility_m(self) -> float | None:
+        """Returns the shortest range [m] with a green contrast below `MIN_VISIBLE_CONTRAST`; None if there is none."""
+        invisible = np.flatnonzero(self.contrast[:, 1] < MIN_VISIBLE_CONTRAST)
+        return float(self.ranges_m[invisible[0]]) if invisible.size else None
+
+
+def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
+    """Draws the figure to a PNG file."""
     height, width = levels[0].image.shape[:2]
     image_in = PANEL_IN * height / width
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Figure(figsize=(PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6))
+    with drawn(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
         grid = figure.add_gridspec(3, len(levels), height_ratios=[image_in, 1.6, 3.4])
         figure.suptitle(_title(levels), fontsize=12)
         top = max(_histogram_of(level.image, band).max() for level in levels for band in range(3))
@@ -33,8 +52,6 @@ def draw(levels: Sequence[TurbidityLevel], file: Path) -> Path:
             _picture(figure.add_subplot(grid[0, k]), level)
             _histogram(figure.add_subplot(grid[1, k]), level, top, first=k == 0)
         _curves(figure.add_subplot(grid[2, :]), levels)
-        FigureCanvasAgg(figure).print_png(str(file))
-    return file
 
 
 def _title(levels: Sequence[TurbidityLevel]) -> str:

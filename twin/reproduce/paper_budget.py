@@ -11,15 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import matplotlib
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure as Canvas
-
 from twin.judge.processing_budget import KEYFRAME_STAGES
 from twin.report.figures import log_axis
-from twin.report.style import COLOURS, FIGURE_STYLE
-from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, percent, write_exhibit
-from twin.reproduce.paper_flight import Flown, fly_aligned
+from twin.report.style import COLOURS
+from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, drawn, make_table, percent, write_exhibit
+from twin.reproduce.paper_flight import fly_aligned
 from twin.scenario.file import load_scenario
 
 RATE_HZ, N_FRAMES = 30.0, 15
@@ -30,23 +26,14 @@ PAPER_SIZE = ("rig.image_width_px=320", "rig.image_height_px=240")
 
 
 class Module(NamedTuple):
-    """A module of the paper's Fig. 2.
+    """A module of the paper's Fig. 2."""
 
-    Args:
-        label: name of the module.
-        stage: key of its stage in the stopwatch; "" if it is part of the stage of another module.
-        unit: name of the item that one call processes, such as "frame" or "pair".
-        paper: time of the module in the paper's words.
-        budget_ms: time available for one frame or keyframe at the paper's 30 Hz; None if the module has no limit.
-        per: "frame", "keyframe", "track" or "survey": unit to which the budget refers.
-    """
-
-    label: str
-    stage: str
-    unit: str
-    paper: str
-    budget_ms: float | None
-    per: str
+    label: str  #: name of the module
+    stage: str  #: key of its stage in the stopwatch; "" if it is part of the stage of another module
+    unit: str  #: name of the item that one call processes, such as "frame" or "pair"
+    paper: str  #: time of the module in the paper's words
+    budget_ms: float | None  #: time for one frame or keyframe at the paper's 30 Hz; None if the module has no limit
+    per: str  #: "frame", "keyframe", "track" or "survey": unit to which the budget refers
 
 
 MODULES = (
@@ -67,34 +54,23 @@ MODULES = (
 
 
 def run(folder: Path, quick: bool = False) -> Exhibit:
-    """Flies a part of the paper's mission and returns the results.
+    """Flies a part of the paper's mission (quick: one short track) and returns the results.
 
     Writes budget.json and budget.png to a folder, which is created if missing.
-
-    Args:
-        folder: folder to write.
-        quick: whether to fly one short track.
     """
     flown = fly_aligned(load_scenario("paper", [*(QUICK if quick else FULL), *PAPER_SIZE]))
-    folder.mkdir(parents=True, exist_ok=True)
     n_frames, n_keyframes = len(flown.result.online), len(flown.result.keyframe_rows)
-    table = budget_table(flown.stages, n_frames, n_keyframes)
-    draw(flown.stages, n_keyframes, folder / "budget.png")
-    caption = "Time of each module per frame or keyframe; red: what the paper's 30 Hz leave for it."
-    exhibit = Exhibit(
-        "budget", "Processing budget", _text(flown), (table,), (Figure("budget.png", caption),)
-    )  # fmt: skip
-    write_exhibit(exhibit, folder)
-    return exhibit
-
-
-def _text(flown: Flown) -> str:
-    return (
-        f"Wall time of the estimators on {os.cpu_count()} cores, over {len(flown.result.online)} frames and "
-        f"{len(flown.result.keyframe_rows)} keyframes of the paper's mission at 320 x 240 pixels. At 30 frames per "
-        f"second, a frame leaves {FRAME_MS:.1f} ms, and {N_FRAMES} frames from one keyframe to the next "
-        f"{KEYFRAME_MS:.0f} ms."
+    text = (
+        f"Wall time of the estimators on {os.cpu_count()} cores, over {n_frames} frames and {n_keyframes} keyframes of "
+        f"the paper's mission at 320 x 240 pixels. At 30 frames per second, a frame leaves {FRAME_MS:.1f} ms, and "
+        f"{N_FRAMES} frames from one keyframe to the next {KEYFRAME_MS:.0f} ms."
     )
+    table = budget_table(flown.stages, n_frames, n_keyframes)
+    caption = "Time of each module per frame or keyframe; red: what the paper's 30 Hz leave for it."
+    figures = (Figure("budget.png", caption),)
+    exhibit = write_exhibit(Exhibit("budget", "Processing budget", text, (table,), figures), folder)
+    draw(flown.stages, n_keyframes, folder / "budget.png")
+    return exhibit
 
 
 def per_unit_ms(stages: Mapping[str, Any], stage: str, count: int) -> float | None:
@@ -151,8 +127,7 @@ def draw(stages: Mapping[str, Any], n_keyframes: int, file: Path) -> None:
     f2f = (stages.get("f2f") or {}).get("mean_ms") or 0.0
     values = [f2f, *(per_unit_ms(stages, name, n_keyframes) or 0.0 for name in KEYFRAME_STAGES)]
     labels = {module.stage: module.label for module in MODULES}
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figure = Canvas(figsize=(9.6, 2.8))
+    with drawn(file, 9.6, 2.8) as figure:
         axes = figure.add_subplot()
         axes.barh([labels[name] for name in names][::-1], values[::-1], 0.6, color=COLOURS["online"])
         for k, name in enumerate(names[::-1]):
@@ -161,4 +136,3 @@ def draw(stages: Mapping[str, Any], n_keyframes: int, file: Path) -> None:
         axes.set(xlabel="mean time per frame (F2F) or keyframe [ms]")
         log_axis(axes.xaxis)
         axes.grid(visible=False, axis="y")
-        FigureCanvasAgg(figure).print_png(str(file))
