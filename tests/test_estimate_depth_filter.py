@@ -133,15 +133,13 @@ def test_the_variance_of_motion_depth_includes_that_of_the_relative_pose():
         shift = flow(old_from_new @ geometry.exp(motion)) - flow(old_from_new)
         expected = np.sum(shift * along, 1) / np.sum(along**2, 1)
         cov = np.outer(motion, motion)
-        variance = depth_filter._pose_variance(
-            disparity, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), cov, CAMERA, FOCAL_BASELINE
-        )
+        variance = depth_filter._pose_variance(disparity, old_from_new, cov, CAMERA, FOCAL_BASELINE)
         np.testing.assert_allclose(np.sqrt(variance.ravel()), np.abs(expected), rtol=2e-3, atol=1e-9)
 
 
 def test_two_images_from_the_same_place_give_no_depth_from_motion():
     image, disparity = np.full((3, 3), 100, np.float32), np.full((3, 3), FOCAL_BASELINE / 2, np.float32)
-    variance = depth_filter._pose_variance(disparity, np.eye(3), np.zeros(3), np.eye(6), CAMERA, FOCAL_BASELINE)
+    variance = depth_filter._pose_variance(disparity, np.eye(4), np.eye(6), CAMERA, FOCAL_BASELINE)
     assert np.isnan(variance).all()
     current = depth_map(image / 50, 1e-4)
     fused = fuse(current, DepthMap(current.depth_m, variance))

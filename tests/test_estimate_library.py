@@ -159,15 +159,9 @@ def test_cropped_depth_maps_with_their_principal_point_give_the_crop_of_the_resu
     inner = np.s_[25:45, 30:50]
     for a, b in zip(ends[0], ends[1], strict=True):
         np.testing.assert_allclose(b[inner], a[rows, cols][inner], rtol=1e-5)
-    rotation, translation = step[:3, :3].copy(), step[:3, 3].copy()
     variances = [
         depth_filter._pose_variance(
-            (15 / one.depth_m).astype(np.float32),
-            rotation,
-            translation,
-            cov,
-            (rig.focal_px, rig.cx_px, rig.cy_px),
-            20.0,
+            (15 / one.depth_m).astype(np.float32), step, cov, (rig.focal_px, rig.cx_px, rig.cy_px), 20.0
         )
         for one, rig in ((whole, full), (part, cropped))
     ]

@@ -1,4 +1,4 @@
-"""Threads: an image in bands of rows, the two images of a stereo pair at the same time, one thread of linear algebra.
+"""Threads: bands of rows of an image, the images of a pair or the next item at the same time; one for linear algebra.
 
 The result does not depend on the number of bands.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import AbstractContextManager
 from functools import cache
@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 Left = TypeVar("Left")
 Right = TypeVar("Right")
+Item = TypeVar("Item")
 
 THREADS = 2  # with more threads, synchronization costs more than it gains: an image takes milliseconds
 LEAST_ROWS = 32  # smallest band; for fewer rows, starting a thread costs more than the work
@@ -89,6 +90,16 @@ def _thread_pool(process: int) -> ThreadPoolExecutor:
 @cache
 def _n_processors() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def prefetched(items: Iterator[Item]) -> Iterator[Item]:
+    """Yields the items of an iterator; a second thread prepares the next one."""
+    end = object()
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, items, end)
+        while (item := coming.result()) is not end:
+            coming = pool.submit(next, items, end)
+            yield item  # type: ignore[misc]
 
 
 def one_blas_thread() -> AbstractContextManager[object]:

@@ -63,9 +63,9 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
     A pixel is updated if its innovation passes the gate (see `GATE`); otherwise it keeps its prior depth. A pixel whose
     depth is known in only one of the maps is taken from that map.
     """
-    depth, variance = prior.depth_m.copy(), prior.variance_m2.copy()
-    _fuse(depth, variance, measured.depth_m, measured.variance_m2, GATE)
-    return DepthMap(depth, variance)
+    fused = DepthMap(prior.depth_m.copy(), prior.variance_m2.copy())
+    _fuse(*fused, *measured, GATE)
+    return fused
 
 
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
@@ -81,16 +81,12 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
         step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
-    args = (camera, rig.focal_px * rig.baseline_m, JUMP_PX)
-    old_from_new = geometry.inverse(new_from_old)
     guess = new.depth_m.copy()
-    _forward_project(old.depth_m, new_from_old[:3, :3].copy(), new_from_old[:3, 3].copy(), guess, camera)
-    prior = DepthMap(
-        *_backward_warp(*old, guess, old_from_new[:3, :3].copy(), old_from_new[:3, 3].copy(), step_cov, *args)
-    )
-    depth, variance = new.depth_m.copy(), new.variance_m2.copy()
-    inherited = _fuse(depth, variance, prior.depth_m, prior.variance_m2, GATE)
-    return PropagatedDepth(DepthMap(depth, variance), inherited)
+    _forward_project(old.depth_m, np.ascontiguousarray(new_from_old), guess, camera)
+    old_from_new, focal_baseline = geometry.inverse(new_from_old), rig.focal_px * rig.baseline_m
+    prior = _backward_warp(*old, guess, old_from_new, step_cov, camera, focal_baseline, JUMP_PX)
+    fused = DepthMap(new.depth_m.copy(), new.variance_m2.copy())
+    return PropagatedDepth(fused, _fuse(*fused, *prior, GATE))
 
 
 def motion_depth(
@@ -110,13 +106,9 @@ def motion_depth(
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
     flow = epipolar.refine(gray, old_gray, np.float32(focal_baseline) / current.depth_m, view, iterations=1)
+    camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     pose_variance = _pose_variance(
-        flow.disparity_px,
-        old_from_new[:3, :3].copy(),
-        old_from_new[:3, 3].copy(),
-        step_cov,
-        (rig.focal_px, rig.cx_px, rig.cy_px),
-        focal_baseline,
+        flow.disparity_px, np.ascontiguousarray(old_from_new), step_cov, camera, focal_baseline
     )
     sigma = np.sqrt(flow.measurement_sigma_px**2 + pose_variance + np.float32(MOTION_MIN_SIGMA_PX**2))
     return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
@@ -136,14 +128,12 @@ def _fuse(depth, variance, measured, measured_variance, gate):
                 depth[v, u], variance[v, u], updated[v, u] = z, r, True
             elif (z - h) ** 2 < gate * (p + r):
                 gain = p / (p + r)
-                depth[v, u] = h + gain * (z - h)
-                variance[v, u] = p * r / (p + r)
-                updated[v, u] = True
+                depth[v, u], variance[v, u], updated[v, u] = h + gain * (z - h), p * r / (p + r), True
     return updated
 
 
 @kernel
-def _forward_project(old, rotation, translation, guess, camera):
+def _forward_project(old, new_from_old, guess, camera):
     """Fills unknown pixels of `guess` (H, W), in place, with the smallest depth of old points that project there."""
     height, width = old.shape
     focal, cx, cy = camera
@@ -152,25 +142,29 @@ def _forward_project(old, rotation, translation, guess, camera):
         for u in range(width):
             if not old[v, u] > 0:
                 continue
-            x, y, z = _transform_pixel(u, v, old[v, u], rotation, translation, focal, cx, cy)
+            x, y, z = _transform_pixel(u, v, old[v, u], new_from_old, camera)
             if z <= 0:
                 continue
             j, i = int(np.floor(focal * x / z + cx + 0.5)), int(np.floor(focal * y / z + cy + 0.5))
-            if not (0 <= i < height and 0 <= j < width):
-                continue
-            if np.isnan(guess[i, j]) or (filled[i, j] and z < guess[i, j]):
-                guess[i, j] = z
-                filled[i, j] = True
+            inside = 0 <= i < height and 0 <= j < width
+            if inside and (np.isnan(guess[i, j]) or (filled[i, j] and z < guess[i, j])):
+                guess[i, j], filled[i, j] = z, True
 
 
 @kernel(inline="always")
-def _transform_pixel(u, v, depth, rotation, translation, focal, cx, cy):
-    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth [m] in the first."""
+def _transform_pixel(u, v, depth, pose, camera):
+    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth [m] in the first.
+
+    Args:
+        pose: (4, 4) pose of the first camera in the other.
+        camera: focal length, column and row of the principal point [px].
+    """
+    focal, cx, cy = camera
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * depth + translation[0],
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * depth + translation[1],
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * depth + translation[2],
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * depth + pose[0, 3],
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * depth + pose[1, 3],
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * depth + pose[2, 3],
     )
 
 
@@ -192,20 +186,18 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
     s, t = x - j, y - i
     wa, wb, wc, we = (1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t
     inverse = wa / a + wb / b + wc / c + we / e
-    return 1 / inverse, wa * variance[i, j] + wb * variance[i, j + 1] + wc * variance[i + 1, j] + we * variance[
-        i + 1, j + 1
-    ]
+    upper, lower = variance[i], variance[i + 1]
+    return 1 / inverse, wa * upper[j] + wb * upper[j + 1] + wc * lower[j] + we * lower[j + 1]
 
 
 @kernel(inline="always")
-def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
+def _normal(depth, u, v, camera, focal_baseline, jump):
     """Returns the surface normal (x, y, z) at a pixel, scaled so that normal . ray = 1 / depth, for a ray with z = 1.
 
     The gradient of inverse depth is set to zero across a depth discontinuity, next to an unknown pixel and at the
     image border.
     """
-    height, width = depth.shape
-    z = depth[v, u]
+    (focal, cx, cy), (height, width) = camera, depth.shape
     slope_u, slope_v = 0.0, 0.0
     if 0 < u < width - 1:
         slope_u = 0.5 / depth[v, u + 1] - 0.5 / depth[v, u - 1]
@@ -216,52 +208,53 @@ def _normal(depth, u, v, focal, cx, cy, focal_baseline, jump):
     if not focal_baseline * abs(slope_v) < 0.5 * jump:
         slope_v = 0.0
     nx, ny = focal * slope_u, focal * slope_v
-    return nx, ny, 1 / z - nx * (u - cx) / focal - ny * (v - cy) / focal
+    return nx, ny, 1 / depth[v, u] - nx * (u - cx) / focal - ny * (v - cy) / focal
 
 
 @kernel
-def _backward_warp(old, old_variance, guess, rotation, translation, step_cov, camera, focal_baseline, jump):
+def _backward_warp(old, old_variance, guess, pose, step_cov, camera, focal_baseline, jump):
     """Returns depth and variance (H, W) of the old map in the new image, linearised at the depths `guess` (H, W).
 
-    They are NaN where the old map gives no depth. `rotation` and `translation` are the pose of the new camera in the
-    old one.
+    They are NaN where the old map gives no depth. `pose` is that of the new camera in the old one.
     """
     height, width = old.shape
     focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))
     is_uncertain = np.trace(step_cov) > 0
-    row = np.empty(6)
     for v in range(height):
         for u in range(width):
             z = guess[v, u]
             if not z > 0:
                 continue
-            x, y, w = _transform_pixel(u, v, z, rotation, translation, focal, cx, cy)
+            x, y, w = _transform_pixel(u, v, z, pose, camera)
             if w <= 0:
                 continue
             ox, oy = x / w, y / w
             h, p = _bilinear(old, old_variance, focal * ox + cx, focal * oy + cy, focal_baseline, jump)
             if np.isnan(h):
                 continue
-            nx, ny, nz = _normal(guess, u, v, focal, cx, cy, focal_baseline, jump)
+            nx, ny, nz = _normal(guess, u, v, camera, focal_baseline, jump)
             # ray of the old camera in axes of the new camera
-            rx = rotation[0, 0] * ox + rotation[1, 0] * oy + rotation[2, 0]
-            ry = rotation[0, 1] * ox + rotation[1, 1] * oy + rotation[2, 1]
-            rz = rotation[0, 2] * ox + rotation[1, 2] * oy + rotation[2, 2]
+            rx = pose[0, 0] * ox + pose[1, 0] * oy + pose[2, 0]
+            ry = pose[0, 1] * ox + pose[1, 1] * oy + pose[2, 1]
+            rz = pose[0, 2] * ox + pose[1, 2] * oy + pose[2, 2]
             ratio = min(max(z * (nx * rx + ny * ry + nz * rz), 0.5), 2.0)
             depth[v, u] = z + (h - w) * ratio
             variance[v, u] = p * ratio**2
             if is_uncertain:
                 px, py = (u - cx) / focal * z, (v - cy) / focal * z
-                row[0], row[1], row[2] = py * nz - z * ny, z * nx - px * nz, px * ny - py * nx
-                row[3], row[4], row[5] = nx, ny, nz
-                variance[v, u] += z * z * _quadratic(row, step_cov)
+                variance[v, u] += z * z * variance_along(px, py, z, nx, ny, nz, step_cov)
     return depth, variance
 
 
 @kernel(inline="always")
-def _quadratic(row, cov):
-    """Returns the quadratic form row cov row' of a row vector (6,) and a covariance (6, 6)."""
+def variance_along(px, py, pz, nx, ny, nz, cov):
+    """Returns the variance of the displacement of a point p [m] along n, due to an error of the pose of its axes.
+
+    Args:
+        cov: (6, 6) covariance of the pose [rotation, translation] (rad, m).
+    """
+    row = (py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx, nx, ny, nz)
     total = 0.0
     for i in range(6):
         for j in range(6):
@@ -270,27 +263,26 @@ def _quadratic(row, cov):
 
 
 @kernel
-def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_baseline):
+def _pose_variance(disparity, pose, step_cov, camera, focal_baseline):
     """Returns the variance (H, W) [px^2] of the disparity from motion that is due to the error of the relative pose.
 
-    J cov J', with J the derivative along the epipolar line. NaN where depth does not displace the image point (epipole,
-    no translation); 0 without disparity, and everywhere if `step_cov` is zero.
+    NaN where depth does not displace the image point (epipole, no translation); 0 without disparity, and everywhere if
+    `step_cov` is zero.
     """
     height, width = disparity.shape
     focal, cx, cy = camera
     result = np.zeros(disparity.shape, np.float32)
     if np.trace(step_cov) <= 0:
         return result
-    row = np.empty(6)
     for v in range(height):
         for u in range(width):
             d = disparity[v, u]
             if not d > 0:
                 continue
             z = focal_baseline / d
-            x, y, w = _transform_pixel(u, v, z, rotation, translation, focal, cx, cy)
-            ex = (translation[0] * w - translation[2] * x) / (w * w) * focal * z / focal_baseline
-            ey = (translation[1] * w - translation[2] * y) / (w * w) * focal * z / focal_baseline
+            x, y, w = _transform_pixel(u, v, z, pose, camera)
+            ex = (pose[0, 3] * w - pose[2, 3] * x) / (w * w) * focal * z / focal_baseline
+            ey = (pose[1, 3] * w - pose[2, 3] * y) / (w * w) * focal * z / focal_baseline
             # flow due to a displacement of the point in the new camera, projected on the epipolar line
             length = ex * ex + ey * ey
             if length == 0:
@@ -298,11 +290,8 @@ def _pose_variance(disparity, rotation, translation, step_cov, camera, focal_bas
                 continue
             gx, gy = ex / length * focal / w, ey / length * focal / w
             gz = -(gx * x + gy * y) / w
-            nx = gx * rotation[0, 0] + gy * rotation[1, 0] + gz * rotation[2, 0]
-            ny = gx * rotation[0, 1] + gy * rotation[1, 1] + gz * rotation[2, 1]
-            nz = gx * rotation[0, 2] + gy * rotation[1, 2] + gz * rotation[2, 2]
-            px, py = (u - cx) / focal * z, (v - cy) / focal * z
-            row[0], row[1], row[2] = py * nz - z * ny, z * nx - px * nz, px * ny - py * nx
-            row[3], row[4], row[5] = nx, ny, nz
-            result[v, u] = _quadratic(row, step_cov)
+            nx = gx * pose[0, 0] + gy * pose[1, 0] + gz * pose[2, 0]
+            ny = gx * pose[0, 1] + gy * pose[1, 1] + gz * pose[2, 1]
+            nz = gx * pose[0, 2] + gy * pose[1, 2] + gz * pose[2, 2]
+            result[v, u] = variance_along((u - cx) / focal * z, (v - cy) / focal * z, z, nx, ny, nz, step_cov)
     return result

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -94,38 +96,31 @@ class ElevationMapper:
     def _choice(self) -> NDArray[np.int64]:
         """Returns the index (1, rows, cols), 0 or 1, of the chosen hypothesis of each cell."""
         low, high = np.argsort(self._height, axis=0)[:, None]
-        height_m, variance_m2 = (
-            [np.take_along_axis(layers, which, 0)[0] for which in (low, high)]
-            for layers in (self._height, self._variance)
-        )
-        two, precise = np.isfinite(height_m[1]), variance_m2[1] * _VARIANCE_RATIO < variance_m2[0]
-        chosen = np.where(two & precise, high, low)
-        first, second = (np.take_along_axis(self._height, which, 0)[0] for which in (chosen, 1 - chosen))
-        return np.where(_isolated(first, second), 1 - chosen, chosen)
+        precise = _taken(self._variance, high) * _VARIANCE_RATIO < _taken(self._variance, low)
+        chosen = np.where(np.isfinite(_taken(self._height, high)) & precise, high, low)
+        isolated = _isolated(_taken(self._height, chosen), _taken(self._height, 1 - chosen))
+        return np.where(isolated, 1 - chosen, chosen)
 
     def _drop_hidden(self) -> None:
         """Drops hypotheses in small groups that their cameras cannot have seen behind large groups of chosen ones."""
         chosen, surface = self._choice(), None
         for which in (chosen, 1 - chosen):
-            height, depth_m2, systematic, camera = (
-                np.take_along_axis(layers, which, 0)[0]
-                for layers in (self._height, self._variance, self._systematic, self._camera)
-            )
-            variance = depth_m2 + systematic + self.grid.cell_m**2
+            height = _taken(self._height, which)
+            variance = _taken(self._variance, which) + _taken(self._systematic, which) + self.grid.cell_m**2
             large = main_surface(height, variance)
             surface = surface or (np.where(large, height, np.float32(np.nan)), variance)
             island = np.where(large, np.float32(np.nan), height)
-            dropped = hidden(island, camera, np.array(self._cameras_m), surface, self.grid)[None]
+            dropped = hidden(island, _taken(self._camera, which), np.array(self._cameras_m), surface, self.grid)
             for layers, unknown in ((self._height, np.nan), (self._variance, np.inf)):
-                kept = np.take_along_axis(layers, which, 0)
-                np.put_along_axis(layers, which, np.where(dropped, np.float32(unknown), kept), 0)
+                kept = np.where(dropped, np.float32(unknown), _taken(layers, which))
+                np.put_along_axis(layers, which, kept[None], 0)
 
     def result(self) -> ElevationMap:
         """Returns the map: the chosen height of each cell, its standard deviation and the orthomosaic."""
         self._drop_hidden()
         chosen, gap = self._choice(), self._height.max(axis=0) - self._height.min(axis=0)
         height, variance, systematic = (
-            np.take_along_axis(layers, chosen, 0)[0] for layers in (self._height, self._variance, self._systematic)
+            _taken(layers, chosen) for layers in (self._height, self._variance, self._systematic)
         )
         height[_small_groups(np.isfinite(height))] = np.nan
         lateral_m = self._lateral_m[0] / max(self._lateral_m[1], 1)
@@ -139,6 +134,11 @@ class ElevationMapper:
         weight = self._colour[..., 3:]
         mosaic = np.divide(self._colour[..., :3], weight, out=np.zeros_like(self._colour[..., :3]), where=weight > 0)
         return ElevationMap(self.grid, height, sigma, np.clip(mosaic + 0.5, 0, 255).astype(np.uint8))
+
+
+def _taken(layers: NDArray[Any], which: NDArray[np.int64]) -> Any:
+    """Returns the layer (rows, cols) of the hypotheses with the indices `which` (1, rows, cols)."""
+    return np.take_along_axis(layers, which, 0)[0]
 
 
 def _isolated(height: Map, other: Map) -> Mask:
@@ -271,9 +271,7 @@ def _fuse_cells(
 
 @kernel
 def _add_colours(row, col, height, pixel, rgb, gain, colour):
-    """Adds the weighted image colour of each cell with a height to `colour` (rows, cols, 4); the last channel is the
-    weight.
-    """
+    """Adds the weighted colour of each cell with a height to `colour` (rows, cols, 4): R, G, B and the weight."""
     rows, cols = rgb.shape[0] - 1, rgb.shape[1] - 1
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
@@ -286,8 +284,7 @@ def _add_colours(row, col, height, pixel, rgb, gain, colour):
             weight = np.exp(-4 * radius2) + 1e-4
             for k in range(3):
                 top = (1 - s) * rgb[v, u, k] * gain[v, u, k] + s * rgb[v, u + 1, k] * gain[v, u + 1, k]
-                bottom = (1 - s) * rgb[v + 1, u, k] * gain[v + 1, u, k] + s * rgb[v + 1, u + 1, k] * gain[
-                    v + 1, u + 1, k
-                ]
+                bottom = (1 - s) * rgb[v + 1, u, k] * gain[v + 1, u, k]
+                bottom += s * rgb[v + 1, u + 1, k] * gain[v + 1, u + 1, k]
                 colour[row + i, col + j, k] += weight * ((1 - t) * top + t * bottom)
             colour[row + i, col + j, 3] += weight

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.ortho_tiles import window
 from twin.core.records import MapGrid, StereoRig, SurveyResult
 
 _MOST_CELLS = 2.5e7  # the cells of a map with more cells are enlarged; at 125 bytes per cell it takes 3.1 GB
@@ -68,7 +68,7 @@ def footprint_tiles(
             for col in range(a[0], b[0] + 1):
                 shown.setdefault((row, col), []).append(number)
     return [
-        MapTile(row, col, _part(whole, row * side, col * side, side), np.array(numbers, np.int64))
+        MapTile(row, col, _tile_grid(whole, row * side, col * side, side), np.array(numbers, np.int64))
         for (row, col), numbers in sorted(shown.items())
     ]
 
@@ -91,14 +91,7 @@ def steps_between(step_cov: Array, keyframes: NDArray[np.int64]) -> Array:
 
 def with_margin(grid: MapGrid, cells: int) -> MapGrid:
     """Returns a grid that is larger by a number of cells on each side."""
-    margin_m = cells * grid.cell_m
-    return replace(
-        grid,
-        west_m=grid.west_m - margin_m,
-        north_m=grid.north_m + margin_m,
-        rows=grid.rows + 2 * cells,
-        cols=grid.cols + 2 * cells,
-    )
+    return window(grid, -cells, -cells, grid.rows + 2 * cells, grid.cols + 2 * cells)
 
 
 def _corners(result: SurveyResult, rig: StereoRig) -> Array:
@@ -111,12 +104,6 @@ def _corners(result: SurveyResult, rig: StereoRig) -> Array:
     )
 
 
-def _part(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
+def _tile_grid(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
     """Returns the grid of at most `side` rows and columns from cell (row, col) on."""
-    return replace(
-        grid,
-        west_m=grid.west_m + col * grid.cell_m,
-        north_m=grid.north_m - row * grid.cell_m,
-        rows=min(side, grid.rows - row),
-        cols=min(side, grid.cols - col),
-    )
+    return window(grid, row, col, min(side, grid.rows - row), min(side, grid.cols - col))

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import cv2
@@ -12,6 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import ElevationMap, Image, MapGrid, StereoRig
+from twin.core.threads import prefetched
 from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap, Mask
 from twin.estimate.mapping.mean_illumination import MeanIllumination
@@ -34,8 +34,8 @@ MAX_RELATIVE_SIGMA = 0.2
 class KeyframeImages(NamedTuple):
     """Stereo pair of a keyframe."""
 
-    left: Image  #: (H, W, 3) uint8 RGB left image
-    right: Image  #: (H, W, 3) uint8 RGB right image
+    left: Image
+    right: Image
 
 
 class KeyframePath(NamedTuple):
@@ -84,7 +84,7 @@ def build_map(
     poses = path.world_from_camera
     step_cov = np.zeros((len(poses), 6, 6)) if path.step_cov is None else path.step_cov
     old = None
-    stereo = _prefetch(_measure_depth(pair, search_range, rig, pattern) for pair in keyframes)
+    stereo = prefetched(_measure_depth(pair, search_range, rig, pattern) for pair in keyframes)
     for k, (pair, gray, stereo_depth) in enumerate(stereo):
         depth, inherited = stereo_depth, None
         if old is not None:
@@ -101,14 +101,6 @@ def build_map(
     if old is not None and old.patch is not None:
         mapper.fuse(old.patch)
     return mapper.result()
-
-
-def _prefetch(items: Iterator[_StereoDepth]) -> Iterator[_StereoDepth]:
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(next, items, None)
-        while (item := coming.result()) is not None:
-            coming = pool.submit(next, items, None)
-            yield item
 
 
 def gray_levels(pair: KeyframeImages) -> tuple[Map, Map]:

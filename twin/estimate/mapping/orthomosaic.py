@@ -7,7 +7,6 @@ memory at a time, whatever the size of the survey.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, Protocol
 
 import cv2
@@ -16,7 +15,13 @@ from numpy.typing import NDArray
 
 from twin.core.ortho_tiles import OrthoTile, finer_grid, tile_side_px, window
 from twin.core.records import Array, ElevationMap, Exposure, Image, MapGrid, StereoRig
-from twin.estimate.mapping import exposure_balance
+from twin.core.threads import prefetched
+from twin.estimate.mapping.exposure_balance import (
+    estimated_factors,
+    patch_colours,
+    patch_points,
+    reported_factors,
+)  # fmt: skip
 from twin.estimate.mapping.orthophoto import Colours, OrthoLayers, add_view, empty_layers, footprint
 
 Map = NDArray[np.float32]
@@ -38,10 +43,9 @@ class Views(NamedTuple):
 
 
 class Restore(Protocol):
-    """Function that removes the effects of lamps and water from an image.
+    """Removes the effects of lamps and water from an image: returns the albedo (H, W, 3) float32, 255 = white.
 
-    Its arguments are the image (H, W, 3) uint8, its exposure, and the pose (4, 4) of the camera in the axes of the map.
-    It returns the albedo (H, W, 3) float32, 255 = white.
+    The pose (4, 4) of the camera is in the axes of the map.
     """
 
     def __call__(self, image: Image, exposure: Exposure | None, world_from_camera: Array, /) -> Map: ...
@@ -74,7 +78,8 @@ def orthomosaic(
     n_done, n_all = 0, max(1, sum(map(len, touching)))
     for (row, col), part, numbers in zip(tiles, parts, touching, strict=True):
         layers = empty_layers(part, heights_of(elevation, part))
-        for k, colours in _prepared(views, numbers, factors, restore):
+        prepared = prefetched(_colours(views, k, factors[k], restore) for k in numbers)
+        for k, colours in zip(numbers, prepared, strict=True):
             add_view(layers, colours, views.world_from_camera[k], rig, heights_m)
             n_done += 1
             if progress is not None:
@@ -115,9 +120,7 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
 
 
 def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
-    """Returns heights with NaN replaced by the nearest known one (0 if none), and a mask of known cells and small
-    holes.
-    """
+    """Returns heights with NaN replaced by the nearest known (0: none), and a mask of known cells and small holes."""
     unknown = np.isnan(height)
     if unknown.all():
         return np.zeros_like(height), ~unknown
@@ -133,14 +136,10 @@ def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
 
 def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> Array:
     """Returns the factors (n, 3) by which to multiply the n images so that their exposures are equal."""
-    reported = exposure_balance.reported_factors(views.exposures)
-    if reported is not None:
+    if (reported := reported_factors(views.exposures)) is not None:
         return reported
-    points = exposure_balance.patch_points(elevation, rig, float(np.median(views.depth_m)))
-    poses = views.world_from_camera
-    return exposure_balance.estimated_factors(
-        exposure_balance.patch_colours(views.load(k), poses[k], rig, points) for k in range(len(poses))
-    )
+    points, poses = patch_points(elevation, rig, float(np.median(views.depth_m))), views.world_from_camera
+    return estimated_factors(patch_colours(views.load(k), poses[k], rig, points) for k in range(len(poses)))
 
 
 def _padded(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
@@ -156,27 +155,14 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
     return np.flatnonzero((west < east_m) & (east > part.west_m) & (south < part.north_m) & (north > south_m))
 
 
-def _prepared(
-    views: Views, numbers: NDArray[np.int64], factors: Array, restore: Restore | None
-) -> Iterator[tuple[int, Colours]]:
-    """Yields numbers and colours of images, the next one prepared by a second thread; `factors` (n, 3): exposure."""
-
-    def colours(k: int) -> Colours:
-        image = views.load(k)
-        saturated = cv2.dilate((image.max(axis=2) == 255).astype(np.uint8), np.ones((3, 3), np.uint8))
-        if restore is not None:
-            rgb = restore(image, views.exposures[k], views.world_from_camera[k])
-        else:
-            rgb = image * factors[k].astype(np.float32)
-        return Colours(rgb, np.asarray(saturated, np.uint8))
-
-    with ThreadPoolExecutor(1) as pool:
-        coming = pool.submit(colours, int(numbers[0])) if len(numbers) else None
-        for k, following in zip(numbers, [*numbers[1:], None], strict=True):
-            assert coming is not None
-            done = coming.result()
-            coming = None if following is None else pool.submit(colours, int(following))
-            yield int(k), done
+def _colours(views: Views, k: int, factor: Array, restore: Restore | None) -> Colours:
+    """Returns the colours of an image: restored, or multiplied by the factor (3,) of its exposure."""
+    image = views.load(int(k))
+    saturated = cv2.dilate((image.max(axis=2) == 255).astype(np.uint8), np.ones((3, 3), np.uint8))
+    if restore is None:
+        return Colours(image * factor.astype(np.float32), np.asarray(saturated, np.uint8))
+    rgb = restore(image, views.exposures[k], views.world_from_camera[k])
+    return Colours(rgb, np.asarray(saturated, np.uint8))
 
 
 def _rgba(layers: OrthoLayers) -> NDArray[np.uint8]:

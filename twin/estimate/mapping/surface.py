@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.records import MapGrid, StereoRig
-from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap
+from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap, variance_along
 from twin.kernels import kernel
 
 Array = NDArray[np.float64]
@@ -57,29 +57,21 @@ def rasterise(
     Returns:
         The patch, or None if the surface does not overlap the grid.
     """
-    points, bounds = _grid_points(
-        depth_map.depth_m,
-        world_from_camera,
-        (rig.focal_px, rig.cx_px, rig.cy_px),
-        grid.west_m,
-        grid.north_m,
-        grid.cell_m,
-    )
+    camera = (rig.focal_px, rig.cx_px, rig.cy_px)
+    points, bounds = _grid_points(depth_map.depth_m, world_from_camera, camera, grid.west_m, grid.north_m, grid.cell_m)
     window = _window(bounds, grid)
     if window is None:
         return None
     row, col, rows, cols = window
     lateral = LATERAL_SIGMA_PX * float(np.nanmean(depth_map.depth_m)) / rig.focal_px
-    patch = HeightPatch(row, col, *_empty_layers(rows, cols), lateral, world_from_camera[:3, 3].copy())
+    height, variance, systematic = np.full((3, rows, cols), np.nan, np.float32)
+    pixel = np.zeros((rows, cols, 2), np.float32)
+    patch = HeightPatch(row, col, height, variance, systematic, pixel, lateral, world_from_camera[:3, 3].copy())
     rotation = np.kron(np.eye(2), world_from_camera[:3, :3])
     view = _ViewGeometry(
-        world_from_camera[:3, 3] - [grid.west_m, grid.north_m, 0],
-        world_from_camera[:3, 2].copy(),
-        rotation @ pose_cov @ rotation.T,
-        grid.cell_m,
-        rig.focal_px,
-        JUMP_PX / (rig.focal_px * rig.baseline_m),
-    )
+        world_from_camera[:3, 3] - [grid.west_m, grid.north_m, 0], world_from_camera[:3, 2].copy(),
+        rotation @ pose_cov @ rotation.T, grid.cell_m, rig.focal_px, JUMP_PX / (rig.focal_px * rig.baseline_m),
+    )  # fmt: skip
     _triangles(points, *depth_map, view, *patch[:6])
     return patch
 
@@ -97,12 +89,6 @@ class _ViewGeometry(NamedTuple):
     max_jump: float
 
 
-def _empty_layers(rows: int, cols: int) -> tuple[Map, Map, Map, Map]:
-    """Returns arrays for height and two variances (rows, cols), all NaN, and for pixels (rows, cols, 2), all zero."""
-    unknown = np.full((rows, cols), np.nan, np.float32)
-    return unknown, unknown.copy(), unknown.copy(), np.zeros((rows, cols, 2), np.float32)
-
-
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
     """Returns first row, first column, numbers of rows and columns of the cells within `bounds`; None if none."""
     if not np.isfinite(bounds).all():
@@ -115,9 +101,7 @@ def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
 
 @kernel
 def _grid_points(depth, pose, camera, west, north, cell):
-    """Returns points (H, W, 3) as row, column (0 at the centre of the first cell) and height [m], and their bounds
-    (4,).
-    """
+    """Returns points (H, W, 3): row, column (0 at the first cell centre) and height [m], and their bounds (4,)."""
     (focal, cx, cy), (height, width) = camera, depth.shape
     points = np.empty((height, width, 3))
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
@@ -136,7 +120,9 @@ def _grid_points(depth, pose, camera, west, north, cell):
 
 
 @kernel(inline="always")
-def _contains_integer(a, b, c, e):
+def _spans_integer(points, v, u, k):
+    """Returns whether coordinate k of four neighbouring points includes an integer."""
+    a, b, c, e = points[v, u, k], points[v, u + 1, k], points[v + 1, u, k], points[v + 1, u + 1, k]
     return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
 
 
@@ -147,16 +133,9 @@ def _triangles(points, depth, variance, view, row, col, height, height_variance,
     for v in range(depth.shape[0] - 1):
         for u in range(depth.shape[1] - 1):
             # most squares of pixels contain no cell centre
-            if not _contains_integer(
-                points[v, u, 0], points[v, u + 1, 0], points[v + 1, u, 0], points[v + 1, u + 1, 0]
-            ):
-                continue
-            if not _contains_integer(
-                points[v, u, 1], points[v, u + 1, 1], points[v + 1, u, 1], points[v + 1, u + 1, 1]
-            ):
-                continue
-            _triangle(v, u, v + 1, u, v, u + 1, *out)
-            _triangle(v + 1, u + 1, v, u + 1, v + 1, u, *out)
+            if _spans_integer(points, v, u, 0) and _spans_integer(points, v, u, 1):
+                _triangle(v, u, v + 1, u, v, u + 1, *out)
+                _triangle(v + 1, u + 1, v, u + 1, v + 1, u, *out)
 
 
 @kernel
@@ -207,12 +186,7 @@ def pose_variance(px, py, pz, sx, sy, cov):
 
     Args:
         px, py, pz: point relative to the camera, in world axes [m].
+        sx, sy: slopes of the surface.
         cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
     """
-    row = (-sx, -sy, 1.0)
-    full = (py * row[2] - pz * row[1], pz * row[0] - px * row[2], px * row[1] - py * row[0], row[0], row[1], row[2])
-    total = 0.0
-    for i in range(6):
-        for j in range(6):
-            total += full[i] * cov[i, j] * full[j]
-    return total
+    return variance_along(px, py, pz, -sx, -sy, 1.0, cov)

@@ -52,16 +52,8 @@ def hidden(
     low, variance = surface
     if not len(cameras_m):
         return np.zeros(height.shape, np.bool_)
-    corner = np.array([grid.west_m, grid.north_m, grid.cell_m])
-    return _blocked(
-        height,
-        camera,
-        cameras_m,
-        _lowest(low),
-        variance,
-        float(np.fmax.reduce(low, axis=None, initial=-np.inf)),
-        corner,
-    )
+    corner, highest = (grid.west_m, grid.north_m, grid.cell_m), float(np.fmax.reduce(low, axis=None, initial=-np.inf))
+    return _blocked(height, camera, cameras_m, _lowest(low), variance, highest, corner)
 
 
 def _lowest(height: Map) -> Map:
