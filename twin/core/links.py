@@ -23,15 +23,14 @@ class Link(NamedTuple):
     overlap: float  #: fraction of the matched points of node j that project into image i (0 to 1)
     n_points: int  #: matched points used; 0 for frame-to-frame motion that replaces a failed measurement
     #: effective number of links that share the errors of this one: those that share the stereo observation of node j,
-    #: times the factor for errors of the floor (`link_selection.inflate_for_shared_noise`). To account for the
-    #: correlation, `cov` is the covariance of the single measurement times this number.
+    #: times the factor for errors of the floor (`link_selection.inflate_for_shared_noise`). `cov` is the covariance of
+    #: the single measurement times this number.
     shared_by: float = 1.0
     #: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as exact; None:
     #: not computed.
     closed_form: Array | None = None
-    #: fraction (0 to 1) of the variance of the measurement that image noise does not explain. This part of the variance
-    #: is due to the relief within the matched patches, and is therefore correlated between links that use the same
-    #: patches. `Links` does not store `floor_share`.
+    #: fraction (0 to 1) of the variance that image noise does not explain: it is due to the relief within the matched
+    #: patches, and correlated between links that use the same patches. `Links` does not store it.
     floor_share: float = 0.0
 
     @property
@@ -43,9 +42,10 @@ class Link(NamedTuple):
 _LINK = np.dtype(
     [
         ("i", int), ("j", int), ("i_from_j", float, (4, 4)), ("information", float, (6, 6)), ("overlap", float),
-        ("n_points", int), ("shared_by", float),
+        ("n_points", int), ("shared_by", float), ("closed_form", float, (4, 4)),
     ]
 )  # fmt: skip
+_NOT_COMPUTED = np.full((4, 4), np.nan)
 
 
 class Links(Sequence[Link]):
@@ -53,7 +53,6 @@ class Links(Sequence[Link]):
 
     def __init__(self, links: Iterable[Link] = ()):
         self._rows = GrowingArray(dtype=_LINK)
-        self._closed_forms: list[Array | None] = []
         self._pending = list(links)  # added, but not yet converted to rows
 
     @classmethod
@@ -71,7 +70,6 @@ class Links(Sequence[Link]):
             return self
         selected = Links()
         selected._rows = GrowingArray.wrap(self._table[mask])
-        selected._closed_forms = [form for form, keep in zip(self._closed_forms, mask.tolist(), strict=True) if keep]
         return selected
 
     def __len__(self) -> int:
@@ -86,10 +84,10 @@ class Links(Sequence[Link]):
     def __getitem__(self, k: int | slice) -> Link | list[Link]:
         if isinstance(k, slice):
             return [self[index] for index in range(*k.indices(len(self)))]
-        i, j, i_from_j, information, overlap, n_points, shared_by = self._table[k]
+        i, j, i_from_j, information, overlap, n_points, shared_by, form = self._table[k]
         numbers = float(overlap), int(n_points), float(shared_by)
         cov = symmetric_inverses(information[None])[0]
-        return Link(int(i), int(j), i_from_j, cov, *numbers, self._closed_forms[k])
+        return Link(int(i), int(j), i_from_j, cov, *numbers, None if np.isnan(form[0, 0]) else form)
 
     @property
     def i(self) -> NDArray[np.int64]:
@@ -113,12 +111,12 @@ class Links(Sequence[Link]):
 
     @property
     def own_cov(self) -> Array:
-        """Returns the covariances (n, 6, 6) of the single measurements, see `Link.own_cov`."""
-        return self.cov / self._table["shared_by"][:, None, None]
+        """Returns `Link.own_cov` (n, 6, 6)."""
+        return self.cov / self.shared_by[:, None, None]
 
     @property
     def shared_by(self) -> Array:
-        """Returns the effective number (n,) of links that share the errors of each link, see `Link.shared_by`."""
+        """Returns `Link.shared_by` (n,)."""
         return self._table["shared_by"]
 
     @property
@@ -128,30 +126,27 @@ class Links(Sequence[Link]):
 
     @property
     def n_points(self) -> NDArray[np.int64]:
-        """Returns the number (n,) of matched points of each link; 0 for frame-to-frame motion."""
+        """Returns `Link.n_points` (n,)."""
         return self._table["n_points"]
 
     @property
     def by_closed_form(self) -> tuple[NDArray[np.bool_], Array]:
         """Returns the mask (n,) of the links that have a closed-form motion, and the closed-form motions (m, 4, 4)."""
-        self._convert_pending()
-        motions = [form for form in self._closed_forms if form is not None]
-        return np.array([form is not None for form in self._closed_forms], bool), np.array(motions).reshape(-1, 4, 4)
+        forms = self._table["closed_form"]
+        known = ~np.isnan(forms[:, 0, 0])
+        return known, forms[known]
 
     @property
     def _table(self) -> NDArray[Any]:
-        self._convert_pending()
-        return self._rows.array
-
-    def _convert_pending(self) -> None:
         if self._pending:
             pending, self._pending = self._pending, []
             *columns, closed_forms, _ = zip(*pending, strict=True)
             table = np.empty(len(pending), _LINK)
-            for name, column in zip(_LINK.names or (), columns, strict=True):
+            for name, column in zip(_LINK.names or (), columns, strict=False):
                 table[name] = symmetric_inverses(np.array(column)) if name == "information" else column
+            table["closed_form"] = [_NOT_COMPUTED if form is None else form for form in closed_forms]
             self._rows.append(table)
-            self._closed_forms += closed_forms
+        return self._rows.array
 
 
 def symmetric_inverses(matrices: Array) -> Array:

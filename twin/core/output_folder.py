@@ -45,7 +45,7 @@ def sole_writer(folder: Path, option: str = "--out", used: bool = False, allowed
         raise TwinError(option, f"{folder} cannot be written: {error.strerror or error}", "a writable folder") from None
     try:
         if not used and os.listdir(folder) != [LOCK_FILE]:
-            raise _not_empty(folder, option, allowed)
+            raise TwinError(option, f"{folder} is not empty", allowed)
         yield
     finally:
         _release(lock, folder / LOCK_FILE)
@@ -63,7 +63,7 @@ def check_folder(folder: Path, option: str = "--out", used: bool = False, allowe
     if folder.exists() and not folder.is_dir():
         raise TwinError(option, f"{folder} is not a folder", allowed)
     if not used and folder.exists() and any(folder.iterdir()) and not (folder / LOCK_FILE).exists():
-        raise _not_empty(folder, option, allowed)
+        raise TwinError(option, f"{folder} is not empty", allowed)
 
 
 def check_path(path: Path, option: str, allowed: str) -> None:
@@ -71,10 +71,6 @@ def check_path(path: Path, option: str, allowed: str) -> None:
     if problem := path_problem(path):
         shown = str(path) if len(str(path)) <= 200 else f"{str(path)[:100]}..."
         raise TwinError(option, f"{ascii(shown)}: {problem}", allowed)
-
-
-def _not_empty(folder: Path, option: str, allowed: str) -> TwinError:
-    return TwinError(option, f"{folder} is not empty", allowed)
 
 
 def _locked(folder: Path, option: str) -> int:

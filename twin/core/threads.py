@@ -29,13 +29,8 @@ _state = threading.local()  # `whole` is set while this thread processes one ima
 def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left, Right]:
     """Returns the results of `left` and `right`, computed at the same time if there are enough processors.
 
-    Meanwhile, `in_row_bands` does not split images.
-
-    Args:
-        right: computes the right image; it must not modify data that `left` uses, and vice versa.
-
-    Raises:
-        Exception: any exception that `left` or `right` raises.
+    Neither may modify data that the other uses. Meanwhile, `in_row_bands` does not split images. Any exception of the
+    two is raised.
     """
     if _n_processors() < THREADS:
         return left(), right()
@@ -59,14 +54,12 @@ def _whole(work: Callable[[], Left]) -> Left:
 def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: int = 1) -> None:
     """Runs `work(first_row, end_row)` over all rows, in parallel bands if the image is large.
 
-    All rows are one band if there are fewer than `THREADS` processors, or within a call of `in_pair`.
+    All rows are one band if there are fewer than `THREADS` processors, or within a call of `in_pair`. Any exception of
+    a band is raised.
 
     Args:
         work: processes rows first_row to end_row - 1; its kernels release the GIL.
         rows_per_row: number of image rows that each processed row represents.
-
-    Raises:
-        Exception: any exception that `work` raises in any band.
     """
     small = n_rows * rows_per_row < THREADS * LEAST_ROWS
     if small or getattr(_state, "whole", False) or _n_processors() < THREADS:

@@ -45,12 +45,8 @@ def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> d
 
     The peak memory is None on Windows.
     """
-    return {
-        "wall_s": wall_s,
-        "simulated_s": simulated_s,
-        "peak_rss_mb": _peak_rss_mb(),
-        "stages": stopwatch.summary(),
-    }
+    memory_mb = _peak_rss_mb()
+    return {"wall_s": wall_s, "simulated_s": simulated_s, "peak_rss_mb": memory_mb, "stages": stopwatch.summary()}
 
 
 def _peak_rss_mb() -> float | None:
@@ -63,13 +59,8 @@ def _peak_rss_mb() -> float | None:
 
 
 def _summary(durations_s: list[float]) -> dict[str, float | int | None]:
-    """Returns count, total [s], mean and 95th percentile [ms] of one stage; the last two are None if the count is 0."""
     if not durations_s:
         return {"count": 0, "mean_ms": None, "p95_ms": None, "total_s": 0.0}
     ms = np.array(durations_s) * 1e3
-    return {
-        "count": len(ms),
-        "mean_ms": float(ms.mean()),
-        "p95_ms": float(np.percentile(ms, 95)),
-        "total_s": float(ms.sum() / 1e3),
-    }
+    mean_ms, p95_ms = float(ms.mean()), float(np.percentile(ms, 95))
+    return {"count": len(ms), "mean_ms": mean_ms, "p95_ms": p95_ms, "total_s": float(ms.sum() / 1e3)}

@@ -78,11 +78,7 @@ class Colours(NamedTuple):
 
 
 def add_view(
-    layers: OrthoLayers,
-    colours: Colours,
-    world_from_camera: Array,
-    rig: StereoRig,
-    heights_m: tuple[float, float],
+    layers: OrthoLayers, colours: Colours, world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]
 ) -> None:
     """Adds an image to the layers, in place.
 
