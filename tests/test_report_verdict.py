@@ -11,7 +11,7 @@ from judge_synthetic import evaluated, survey, write_folder
 from twin.app import console
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.judge.warnings import NEES_BOUNDS, metric_warnings, nees_bounds
-from twin.report import wording
+from twin.report import headline, wording
 from twin.report.run_folder import load_run
 from twin.report.survey_page import write_report
 from twin.report.verdict import badge, first_lines
@@ -156,56 +156,56 @@ def test_metrics_of_older_runs_keep_their_warning():
     older["map"] = {key: value for key, value in good()["map"].items() if not key.endswith(("area", "area_m"))}
     older["warning"] = "surrogate: too murky"
     assert first_lines(older) == ["surrogate: too murky"] and badge(older).level == "warn"
-    assert wording.headline(older, {}) and wording.key_figures(older)
+    assert headline.headline(older, {}) and headline.key_figures(older)
 
 
 def test_the_sentence_on_the_observed_floor_names_the_map_where_no_area_was_asked_for():
     asked, observed = good(), changed(map={"completeness_area": None})
-    assert " of the asked area; " in wording.headline(asked, {}) and " It covers " in wording.headline(asked, {})
-    assert " The map covers " in wording.headline(observed, {}) and " It covers " not in wording.headline(observed, {})
+    assert " of the asked area; " in headline.headline(asked, {}) and " It covers " in wording.headline(asked, {})
+    assert " The map covers " in headline.headline(observed, {}) and " It covers " not in wording.headline(observed, {})
 
 
 def test_a_replay_lists_only_figures_that_it_has():
     metrics = changed(map=dict.fromkeys(good()["map"])) | {"replay": {"dataset": "euroc"}}
-    labels = [figure.label for figure in wording.key_figures(metrics)]
+    labels = [figure.label for figure in headline.key_figures(metrics)]
     assert "Position error, final" in labels and not [label for label in labels if label.startswith("Map")]
 
 
 def test_the_altitude_of_a_plan_is_given_above_what_it_refers_to():
     plane, floor = (
-        wording.conditions({"plan": {"altitude_m": 2.0, "height": height}}) for height in ("plane", "floor")
+        headline.conditions({"plan": {"altitude_m": 2.0, "height": height}}) for height in ("plane", "floor")
     )
     assert plane.startswith("2 m above the reference plane") and floor.startswith("2 m above the smoothed floor")
 
 
 def test_an_unfinished_replay_has_no_conditions():
-    assert wording.headline(None, {"replay": {}}) == "This replay is unfinished: it has no metrics.json."
+    assert headline.headline(None, {"replay": {}}) == "This replay is unfinished: it has no metrics.json."
 
 
 def test_links_without_a_closed_form_are_not_reported_as_missing():
     links = copy.deepcopy(good()["links"])
-    assert "RMS translation error" in wording.closed_form_comparison(links)
+    assert "RMS translation error" in headline.closed_form_comparison(links)
     for row in (links["along"], links["across"]):
         row["closed_form_translation_rmse_m"] = None
-    assert "not computed" in wording.closed_form_comparison(links)
+    assert "not computed" in headline.closed_form_comparison(links)
     for row in (links["along"], links["across"]):
         row["count"] = 0
-    assert "No motion" in wording.closed_form_comparison(links)
+    assert "No motion" in headline.closed_form_comparison(links)
 
 
 def test_every_map_statistic_is_reported_with_completeness():
     metrics = changed(map={"completeness": 0.876, "completeness_area": 0.765})
-    for figure in wording.key_figures(metrics):
+    for figure in headline.key_figures(metrics):
         if figure.label.startswith(("Map", "Sigma")):
             assert "87.6 %" in figure.meaning or "76.5 %" in figure.meaning, figure.label
-    for sentence in wording.headline(metrics, {}).split(". "):
+    for sentence in headline.headline(metrics, {}).split(". "):
         if "LE90" in sentence:
             assert "87.6 %" in sentence or "76.5 %" in sentence
 
 
 def test_a_map_with_too_many_holes_has_an_infinite_le90_in_the_text():
     metrics = changed(map={"completeness_area": 0.5, "le90_area_m": None})
-    assert "LE90 of its heights over this area is infinite" in wording.headline(metrics, {})
+    assert "LE90 of its heights over this area is infinite" in headline.headline(metrics, {})
     assert wording.area_le90({"completeness_area": None, "le90_area_m": None}) == wording.DASH
 
 
@@ -314,5 +314,5 @@ def test_a_kinematic_vehicle_is_ideal():
 
 def test_an_area_without_the_centre_of_a_cell_is_named():
     empty = changed(map={"completeness_area": None, "le90_area_m": None})
-    meaning = {figure.label: figure.meaning for figure in wording.key_figures(empty)}["Map LE90, asked area"]
+    meaning = {figure.label: figure.meaning for figure in headline.key_figures(empty)}["Map LE90, asked area"]
     assert meaning == "the asked area contains no cell centre"

@@ -114,13 +114,13 @@ def print_requirements(require: dict[str, dict[str, Any]], suffix: str, passed: 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Prints the verdict on a survey or replay, its reasons and warnings, the key figures and the requirements."""
+    from twin.report.headline import key_figures, results
     from twin.report.verdict import badge, first_lines
-    from twin.report.wording import key_figures, replay_summary
 
     seed = "" if metrics["seed"] is None else f", seed {metrics['seed']}"
     print(f"{metrics['name']}{seed}: {badge(metrics).text}")
     if metrics.get("replay"):
-        print(replay_summary(metrics))
+        print(results(metrics))
     for sentence in first_lines(metrics):
         print(f"- {sentence}")
     print_table("Key figures", [tuple(figure) for figure in key_figures(metrics)])

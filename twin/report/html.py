@@ -1,9 +1,9 @@
-"""Renders HTML pages from Jinja templates; all pages share a style sheet, number formats and a list of terms."""
+"""Renders pages and texts from Jinja templates; all pages share a style sheet, number formats and a list of terms."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -12,6 +12,12 @@ import jinja2
 from twin.report import wording
 
 _SHARED_TEMPLATES = "twin.report"
+#: Number formats by the names that they have in templates.
+_FILTERS = {
+    "length": wording.length, "percent": wording.percent, "plain": wording.plain, "ms": wording.milliseconds,
+    "angle": wording.angle, "milliradians": wording.milliradians, "ratio": wording.ratio,
+    "area_le90": wording.area_le90,
+}  # fmt: skip
 
 
 def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
@@ -23,24 +29,30 @@ def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
         template: file name of the template.
         context: variables of the template.
     """
+    return _for_narrow_screens(_rendered(package, template, context, autoescape=True))
+
+
+def render_text(template: str, context: Mapping[str, Any]) -> str:
+    """Returns a template of this package rendered as text; missing variables are dashes."""
+    return _rendered(_SHARED_TEMPLATES, template, context, undefined=jinja2.ChainableUndefined)
+
+
+def _rendered(package: str, template: str, context: Mapping[str, Any], **options: Any) -> str:
+    """Returns a template rendered with the number formats of `wording` as filters."""
     environment = jinja2.Environment(
-        autoescape=True,
+        **options,
         trim_blocks=True,
         lstrip_blocks=True,
         loader=jinja2.FunctionLoader(lambda name: _source(package, name) or _source(_SHARED_TEMPLATES, name)),
     )
-    environment.globals["terms"] = wording.TERMS
-    environment.filters.update(
-        length=wording.length,
-        percent=wording.percent,
-        plain=wording.plain,
-        with_unit=wording.with_unit,
-        ms=wording.milliseconds,
-        angle=wording.angle,
-        milliradians=wording.milliradians,
-        ratio=wording.ratio,
-    )
-    return _for_narrow_screens(environment.get_template(template).render(**context))
+    environment.filters |= {name: _of_defined(number) for name, number in _FILTERS.items()}
+    environment.filters["with_unit"] = wording.with_unit
+    return environment.get_template(template).render(**context)
+
+
+def _of_defined(number: Callable[[Any], str]) -> Callable[[Any], str]:
+    """Returns a number format that takes an undefined value as None."""
+    return lambda value: number(None if isinstance(value, jinja2.Undefined) else value)
 
 
 def _for_narrow_screens(page: str) -> str:

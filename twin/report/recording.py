@@ -13,7 +13,8 @@ import rerun.blueprint as rrb
 
 from twin.core import geometry
 from twin.core.records import Array, Estimate, Frame, Image, StereoRig
-from twin.report import recording_surfaces, wording
+from twin.report import recording_surfaces
+from twin.report.headline import headline, key_figures
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.replay_description import replayed_rig
@@ -115,8 +116,8 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
     summary = "\n".join(
         [f"# {run.scenario.get('name', run.folder.name)}: {badge(run.metrics).text}", ""]
         + [f"- {sentence}" for sentence in (first_lines(run.metrics) if run.metrics else ())]
-        + ["", wording.headline(run.metrics, run.scenario), ""]
-        + [f"- **{row.label}**: {row.value} ({row.meaning})" for row in wording.key_figures(run.metrics or {})]
+        + ["", headline(run.metrics, run.scenario), ""]
+        + [f"- **{row.label}**: {row.value} ({row.meaning})" for row in key_figures(run.metrics or {})]
     )
     recording.log("summary", rr.TextDocument(summary, media_type=rr.MediaType.MARKDOWN), static=True)
     if "dem_truth" in run.rasters and np.allclose(run.keyframes.map_from_world, np.eye(4)):

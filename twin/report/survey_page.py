@@ -15,6 +15,7 @@ from twin.core.user_files import read_text
 from twin.judge.processing_budget import stage_times
 from twin.report import wording
 from twin.report.figures import draw_all
+from twin.report.headline import closed_form_comparison, headline, key_figures
 from twin.report.html import render_page
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.mesh_picture import surface_picture
@@ -57,9 +58,9 @@ def context(run: Run) -> dict[str, Any]:
         "name": metrics.get("name") or run.scenario.get("name") or run.folder.name,
         "badge": badge(run.metrics),
         "first_lines": first_lines(metrics) if metrics else [],
-        "headline": wording.headline(run.metrics, run.scenario),
+        "headline": headline(run.metrics, run.scenario),
         "metrics": metrics,
-        "key_figures": wording.key_figures(metrics),
+        "key_figures": key_figures(metrics),
         "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
         "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],
         "closed_form_comparison": _closed_form_comparison(metrics),
@@ -81,7 +82,7 @@ def _closed_form_comparison(metrics: Mapping[str, Any]) -> str:
 
     Returns "" without metrics, and for a replay, which has no link errors.
     """
-    return "" if "links" not in metrics or metrics.get("replay") else wording.closed_form_comparison(metrics["links"])
+    return "" if "links" not in metrics or metrics.get("replay") else closed_form_comparison(metrics["links"])
 
 
 def mosaic_image(run: Run) -> str | None:
