@@ -11,7 +11,6 @@ from twin.core.records import Trajectory
 from twin.judge.recorded import recorded_errors
 from twin.judge.trajectory_errors import path_errors
 from twin.report import comparison_figures, figures, recording, wording
-from twin.report.run_errors import run_errors
 from twin.report.run_folder import load_run
 from twin.report.survey_page import context
 
@@ -42,7 +41,7 @@ def test_the_curves_of_a_replay_have_its_alignment(run, alignment, monkeypatch):
     recording.log_curves(recording.rr.RecordingStream("test"), replayed)
     curves = [
         figures.path_error_curves(replayed).axes[0].lines[-1].get_ydata(),
-        comparison_figures.error_curves([replayed], ["run"]).axes[1].lines[-1].get_ydata(),
+        comparison_figures.error_curves([(replayed, {})]).axes[1].lines[-1].get_ydata(),
         logged["error/position/final"],
     ]
     for curve in curves:
@@ -53,7 +52,7 @@ def test_the_curves_of_a_replay_have_its_alignment(run, alignment, monkeypatch):
 def test_other_curves_are_anchored_at_the_first_true_pose(run, alignment):
     expected = path_errors(run.trajectories["final"], run.trajectories["truth"])
     for one in (run, of_replay(run, alignment)):
-        np.testing.assert_allclose(run_errors(one, "final").distance_m, expected.distance_m, atol=1e-12)
+        np.testing.assert_allclose(one.errors("final").distance_m, expected.distance_m, atol=1e-12)
 
 
 def test_the_page_states_the_alignment_of_the_curves(run):

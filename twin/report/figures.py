@@ -1,10 +1,13 @@
-"""Figures of the survey report. Each figure function returns None if its data are missing from the run."""
+"""Figures of the survey report, and what the figures of all reports share: files, axes, legends, bars.
+
+Each figure function returns None if its data are missing from the run.
+"""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -17,7 +20,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
 from twin.judge.processing_budget import stage_times
-from twin.report.run_errors import run_errors
 from twin.report.run_folder import Raster, Run
 from twin.report.stage_table import stage_rows
 from twin.report.style import COLOURS, ESTIMATES, FIGURE_STYLE, LABELS
@@ -35,20 +37,18 @@ PATH_STYLES: dict[str, dict[str, Any]] = {
 
 def draw_all(run: Run) -> dict[str, str]:
     """Returns the PNG data URI of each figure whose data the run contains, by name of the figure."""
-    functions: dict[str, Callable[[Run], Figure | None]] = {
-        "plan_view": plan_view,
-        "path_errors": path_error_curves,
-        "stages": stage_bars,
-        "tracks": track_bars,
-        "stereo_quality": stereo_quality_curves,
-        "elevation": elevation_maps,
-        "error": error_maps,
-        "histogram": error_histogram,
-        "network": network_plot,
-        "timing": timing_bars,
-    }
+    functions = {
+        "plan_view": plan_view, "path_errors": path_error_curves, "stages": stage_bars, "tracks": track_bars,
+        "stereo_quality": stereo_quality_curves, "elevation": elevation_maps, "error": error_maps,
+        "histogram": error_histogram, "network": network_plot, "timing": timing_bars,
+    }  # fmt: skip
+    return drawn(functions, run)
+
+
+def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> dict[str, str]:
+    """Returns the PNG data URI of each figure that a function of `data` draws, by name of the figure."""
     with matplotlib.rc_context(FIGURE_STYLE):
-        figures = {name: draw(run) for name, draw in functions.items()}
+        figures = {name: draw(*data) for name, draw in functions.items()}
         return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
 
 
@@ -73,9 +73,14 @@ def plan_view(run: Run) -> Figure | None:
             x, y, _ = run.trajectories[name].positions.T
             axes.plot(x, y, color=COLOURS[name], label=LABELS[name], **PATH_STYLES.get(name, {}))
     _add_keyframes(axes, run)
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
+    legend_beside(axes)
     _limit_to_paths(axes, run)
     return figure
+
+
+def legend_beside(axes: Axes) -> None:
+    """Adds the legend to the right of the axes."""
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
 
 
 def _add_keyframes(axes: Axes, run: Run) -> None:
@@ -104,7 +109,7 @@ def path_error_curves(run: Run) -> Figure | None:
     figure = Figure(figsize=(WIDTH_IN, 5.6))
     position, height, heading = figure.subplots(3, 1, sharex=True)
     for name in names:
-        errors = run_errors(run, name)
+        errors = run.errors(name)
         style: dict[str, Any] = {"color": COLOURS[name], "label": LABELS[name]}
         position.plot(errors.travelled_m, errors.distance_m, **style)
         height.plot(errors.travelled_m, errors.position_m[:, 2], **style)
@@ -118,10 +123,7 @@ def path_error_curves(run: Run) -> Figure | None:
 
 
 def log_scale(axes: Axes) -> None:
-    """Sets a logarithmic y axis that starts at 0.7 times the 1st percentile of the positive values of all curves.
-
-    Axes without a positive value stay linear.
-    """
+    """Makes the y axis logarithmic, from 0.7 times the 1st percentile of the positive values; linear if none is."""
     sizes = np.concatenate([np.zeros(0), *(np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines)])
     sizes = sizes[sizes > 0]
     if len(sizes):
@@ -161,17 +163,23 @@ def stage_bars(run: Run) -> Figure | None:
         return None
     figure = Figure(figsize=(WIDTH_IN, 0.7 + 0.4 * len(rows)))
     axes = figure.add_subplot()
-    bars = np.arange(len(rows))[::-1]
-    widths = [row.rmse_m or 0.0 for row in rows]
-    axes.barh(bars, widths, 0.62, color=[COLOURS[row.stage] for row in rows])
-    for y, row in zip(bars, rows, strict=True):
+    bars = {LABELS[row.stage]: (row.rmse_m, COLOURS[row.stage]) for row in rows}
+    for y, row in zip(_rows_of_bars(axes, bars, 0.62), rows, strict=True):
         notes = [length(row.rmse_m), improvement(row.gain), row.disabled]
         axes.text(row.rmse_m or min(errors_m), y, "   ".join(["", *filter(None, notes)]), va="center")
-    axes.set_yticks(bars, [LABELS[row.stage] for row in rows])
     log_axis(axes.xaxis, length)
     axes.set(xlim=(min(errors_m) / 3, max(errors_m) * 3), xlabel="position error of the keyframes (RMSE)")
-    axes.grid(visible=False, axis="y")
     return figure
+
+
+def _rows_of_bars(axes: Axes, bars: Mapping[str, tuple[float, str]], height: float) -> Sequence[int]:
+    """Draws horizontal bars, each with a length and a colour, by label from top to bottom; returns their y."""
+    y = np.arange(len(bars))[::-1]
+    lengths, colours = zip(*bars.values(), strict=True)
+    axes.barh(y, lengths, height, color=colours)
+    axes.set_yticks(y, list(bars))
+    axes.grid(visible=False, axis="y")
+    return y.tolist()
 
 
 def track_bars(run: Run) -> Figure | None:
@@ -193,10 +201,7 @@ def track_bars(run: Run) -> Figure | None:
 
 
 def stereo_quality_curves(run: Run) -> Figure | None:
-    """Returns curves of matched points and contrast over time.
-
-    Stereo observations with too few points for a keyframe are red.
-    """
+    """Returns curves of matched points and contrast over time; red: too few points for a keyframe."""
     observations, path = run.keyframes.stereo_observations, run.trajectories.get("online")
     if path is None or not len(observations) or observations[:, 0].max() >= len(path):
         return None
@@ -205,9 +210,8 @@ def stereo_quality_curves(run: Run) -> Figure | None:
     shown = [(observations[:, 1], "matched points"), (observations[:, 2], "RMS contrast")]
     shown = [(values, label) for values, label in shown if np.isfinite(values).any()]
     figure = Figure(figsize=(WIDTH_IN, 1.9 * len(shown)))
-    for (values, label), axes in zip(
-        shown, figure.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0], strict=True
-    ):
+    panels = figure.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0]
+    for (values, label), axes in zip(shown, panels, strict=True):
         axes.plot(times_s, values, ".-", color=COLOURS["online"], markersize=3, linewidth=0.8)
         axes.plot(times_s[too_few], values[too_few], ".", color=COLOURS["limit"], markersize=6)
         axes.set(ylabel=label, ylim=(0, 1.08 * np.nanmax(values) or None))
@@ -217,11 +221,8 @@ def stereo_quality_curves(run: Run) -> Figure | None:
 
 def elevation_maps(run: Run) -> Figure | None:
     """Returns hill-shaded maps of the true and the estimated elevation with the same colour scale."""
-    rasters = [
-        (run.rasters[key], title)
-        for key, title in (("dem_truth", "True elevation"), ("dem", "Estimated elevation"))
-        if key in run.rasters
-    ]
+    titles = {"dem_truth": "True elevation", "dem": "Estimated elevation"}
+    rasters = [(run.rasters[key], title) for key, title in titles.items() if key in run.rasters]
     if not rasters:
         return None
     scale = _height_scale(np.concatenate([raster.values.ravel() for raster, _ in rasters]))
@@ -287,9 +288,8 @@ def network_plot(run: Run) -> Figure | None:
     figure = Figure(figsize=(WIDTH_IN, 4.4))
     axes = _map_axes(figure.add_subplot())
     axes.set_adjustable("datalim")  # a network along a line fills the figure too
-    axes.add_collection(
-        LineCollection(list(positions[edges][:, :, :2]), colors=COLOURS["link"], linewidths=0.5, alpha=0.6)
-    )
+    links = list(positions[edges][:, :, :2])
+    axes.add_collection(LineCollection(links, colors=COLOURS["link"], linewidths=0.5, alpha=0.6))
     axes.plot(positions[:, 0], positions[:, 1], ".", markersize=3, color=COLOURS["final"])
     axes.set_title(f"{len(positions)} keyframes, {len(edges)} links")
     return figure
@@ -297,30 +297,20 @@ def network_plot(run: Run) -> Figure | None:
 
 def timing_bars(run: Run) -> Figure | None:
     """Returns bars of the mean time per call of each processing stage, with a line at the budget of the stage."""
-    rows = [
-        row
-        for row in stage_times(run.metrics or {}, run.scenario, run.keyframes.n_frames_per_keyframe)
-        if row.mean_ms is not None
-    ]
+    stages = stage_times(run.metrics or {}, run.scenario, run.keyframes.n_frames_per_keyframe)
+    rows = [row for row in stages if row.mean_ms is not None]
     if not rows:
         return None
     figure = Figure(figsize=(WIDTH_IN, 0.6 + 0.34 * len(rows)))
     axes = figure.add_subplot()
-    bars = np.arange(len(rows))[::-1]
-    axes.barh(
-        bars,
-        [row.mean_ms or 0.0 for row in rows],
-        0.6,
-        color=[COLOURS["online" if r.budget_ms else "link"] for r in rows],
-    )
-    for y, row in zip(bars, rows, strict=True):
+    colours = [COLOURS["online" if row.budget_ms else "link"] for row in rows]
+    bars = {PROCESSING_STAGES[r.stage]: (r.mean_ms or 0.0, colour) for r, colour in zip(rows, colours, strict=True)}
+    for y, row in zip(_rows_of_bars(axes, bars, 0.6), rows, strict=True):
         if row.budget_ms:
             axes.plot([row.budget_ms] * 2, [y - 0.4, y + 0.4], color=COLOURS["limit"], linewidth=2)
-    axes.set_yticks(bars, [PROCESSING_STAGES[row.stage] for row in rows])
-    shortest = min(row.mean_ms or 1.0 for row in rows)
     log_axis(axes.xaxis)
-    axes.set(xlim=(shortest / 3, None), xlabel="mean time per call [ms] (red: budget)")
-    axes.grid(visible=False, axis="y")
+    shortest_ms = min(row.mean_ms or 1.0 for row in rows)
+    axes.set(xlim=(shortest_ms / 3, None), xlabel="mean time per call [ms] (red: budget)")
     return figure
 
 
@@ -340,12 +330,8 @@ def _height_scale(heights: np.ndarray) -> tuple[float, float]:
 def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None = None) -> np.ndarray:
     """Returns hill-shaded RGBA colours (rows, cols, 4), lit from the north-west; cells without data are transparent.
 
-    Heights are clipped to the colour scale, because a single outlier would remove the shading from all other cells.
-
-    Args:
-        heights: (rows, cols) [m], NaN for no data.
-        cmap: name of a matplotlib colour map.
-        scale: lowest and highest height of the colour scale [m]; None: the percentiles of `_height_scale`.
+    Heights (rows, cols) [m] are clipped to `scale`, the lowest and highest height of the colour map `cmap` (by default
+    `_height_scale`), because a single outlier would remove the shading from all other cells.
     """
     empty = ~np.isfinite(heights)
     low, high = scale or _height_scale(heights)

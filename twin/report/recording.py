@@ -18,7 +18,6 @@ from twin.report.headline import headline, key_figures
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.replay_description import replayed_rig
-from twin.report.run_errors import run_errors
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
 from twin.report.verdict import badge, first_lines
@@ -227,7 +226,7 @@ def log_curves(recording: rr.RecordingStream, run: Run) -> None:
 
 def _log_errors(recording: rr.RecordingStream, run: Run, name: str) -> None:
     """Logs position, height and heading error of one estimate."""
-    errors, truth = run_errors(run, name), run.trajectories["truth"]
+    errors, truth = run.errors(name), run.trajectories["truth"]
     rows = subsampled_rows(len(errors.travelled_m))
     times = FrameTimes(rows, truth.times_s[rows])
     log_curve(recording, f"error/position/{name}", times, errors.distance_m[rows], name)

@@ -14,7 +14,7 @@ _ANY = "*"
 #: Template of a number that may be NaN, which Python's json reads and writes, or None.
 _NAN = math.nan
 _LARGEST = 1e15  # largest absolute value of a number
-_OBSERVATION = ("row", "n_points", "contrast")
+OBSERVATION_KEYS = ("row", "n_points", "contrast")
 _TRACK = {"track": 0} | dict.fromkeys(
     ("before_ga_rmse_m", "after_ga_rmse_m", "farthest_error_m", "ga_ms", "nodes", "edges")
 )
@@ -23,7 +23,7 @@ _INDEX = {
     "tracks": [0],
     "n_frames_per_keyframe": None,
     "timing_ms": {_ANY: [0.0]},
-    "stereo_observations": [{name: _NAN for name in _OBSERVATION}],
+    "stereo_observations": [{name: _NAN for name in OBSERVATION_KEYS}],
     "map_from_world": [[0.0]],
 }
 

@@ -14,46 +14,40 @@ from twin.core.records import Array, Trajectory
 from twin.core.user_files import is_file, path_problem, read_json, read_text, reading
 from twin.errors import TwinError
 from twin.exchange.geotiff import Raster, read_mosaic, read_raster
-from twin.report.run_files import checked_environment, checked_index, checked_metrics, checked_scenario
+from twin.judge.recorded import ALIGNMENTS, AlignmentName, recorded_errors
+from twin.judge.trajectory_errors import PathErrors, path_errors
+from twin.report.run_files import (
+    OBSERVATION_KEYS,
+    checked_environment,
+    checked_index,
+    checked_metrics,
+    checked_scenario,
+)
 from twin.scenario.toml_text import parse_toml
 
 TRAJECTORIES = ("truth", "f2f", "online", "final", "reference")
 SCENARIO_FILE = "scenario.resolved.toml"
-_OBSERVATION_KEYS = ("row", "n_points", "contrast")  # columns of `Keyframes.stereo_observations`
 RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error")
 
 
 class Network(NamedTuple):
-    """The keyframe network.
+    """The keyframe network."""
 
-    Args:
-        positions: (n, 3) positions of the nodes in the world [m].
-        edges: (m, 2) indices into `positions` of the two nodes of each link.
-    """
-
-    positions: Array
-    edges: NDArray[np.int64]
+    positions: Array  # (n, 3) of the nodes in the world [m]
+    edges: NDArray[np.int64]  # (m, 2) indices into `positions` of the two nodes of each link
 
 
 class Keyframes(NamedTuple):
-    """Contents of keyframes/index.json.
+    """Contents of keyframes/index.json."""
 
-    Args:
-        frames: (n,) frame number of each keyframe.
-        tracks: (n,) track of each keyframe, from 1.
-        n_frames_per_keyframe: planned frames from one keyframe to the next; None if unknown.
-        timing_ms: for some processing stages, the duration of each call in chronological order [ms].
-        stereo_observations: (m, 3) frame number, number of matched points and contrast (NaN without images) of each
-            stereo observation, including those that gave no keyframe.
-        map_from_world: (4, 4) pose of the world in the frame of the maps (`ElevationMap.map_from_world`).
-    """
-
-    frames: NDArray[np.int64]
-    tracks: NDArray[np.int64]
-    n_frames_per_keyframe: int | None
-    timing_ms: dict[str, Array]
+    frames: NDArray[np.int64]  # (n,) frame number of each keyframe
+    tracks: NDArray[np.int64]  # (n,) track of each keyframe, from 1
+    n_frames_per_keyframe: int | None  # planned
+    timing_ms: dict[str, Array]  # durations of all calls of some processing stages [ms]
+    #: (m, 3) frame number, number of matched points and contrast (NaN without images) of each stereo observation,
+    #: including those that gave no keyframe.
     stereo_observations: Array
-    map_from_world: Array
+    map_from_world: Array  # (4, 4) pose of the world in the frame of the maps (`ElevationMap.map_from_world`)
 
 
 @dataclass(frozen=True)
@@ -73,6 +67,21 @@ class Run:
     def finished(self) -> bool:
         """Returns whether the survey has finished, i.e. has metrics."""
         return self.metrics is not None
+
+    @property
+    def alignment(self) -> AlignmentName | None:
+        """Returns the alignment of a replay with the recorded truth; None for a survey or without evaluation."""
+        name = ((self.metrics or {}).get("replay") or {}).get("alignment")
+        return next((allowed for allowed in ALIGNMENTS if allowed == name), None)
+
+    def errors(self, name: str) -> PathErrors:
+        """Returns the errors of the estimate "f2f", "online" or "final" at the frames that have a true pose.
+
+        The estimate of a replay is aligned with the truth by the method that its metrics state; any other estimate is
+        anchored at the first true pose.
+        """
+        estimate, truth, alignment = self.trajectories[name], self.trajectories["truth"], self.alignment
+        return path_errors(estimate, truth) if alignment is None else recorded_errors(estimate, truth, alignment)
 
     def image_file(self, frame: int, side: str) -> Path:
         """Returns the path of an image of a keyframe; `side` is "left" or "right"."""
@@ -106,19 +115,14 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         _read_existing({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
         _read_existing({k: folder / f"{k}.tif" for k in RASTERS}, read_raster)
         | _read_existing({"mosaic": folder / "mosaic.tif"}, read_mosaic),
-        _read_existing({"network": folder / "posegraph.g2o"}, read_network).get("network", _empty_network()),
+        _read_existing({"": folder / "posegraph.g2o"}, lambda f: _network(read_text(f))).get("", _network("")),
         _read_keyframes(folder / "keyframes" / "index.json"),
     )
 
 
-def read_network(file: Path) -> Network:
-    """Reads the node positions and the edges of a g2o pose graph (SE3:QUAT).
-
-    Raises:
-        KeyError: an edge names a node that the file does not contain.
-        ValueError: a number or an edge is damaged.
-    """
-    lines = [line.split() for line in read_text(file).splitlines()]
+def _network(text: str) -> Network:
+    """Returns the network in the text of a g2o pose graph; raises KeyError or ValueError if it is damaged."""
+    lines = [line.split() for line in text.splitlines()]
     nodes = [line for line in lines if line and line[0] == "VERTEX_SE3:QUAT"]
     pairs = [line[1:3] for line in lines if line and line[0] == "EDGE_SE3:QUAT"]
     row = {node[1]: k for k, node in enumerate(nodes)}
@@ -126,23 +130,13 @@ def read_network(file: Path) -> Network:
     return Network(positions, np.array([[row[i], row[j]] for i, j in pairs], dtype=np.int64).reshape(-1, 2))
 
 
-def _empty_network() -> Network:
-    """Returns a network without nodes."""
-    return Network(np.zeros((0, 3)), np.zeros((0, 2), dtype=np.int64))
-
-
 def _read_keyframes(file: Path) -> Keyframes:
-    """Reads keyframes/index.json.
-
-    If the file is missing, the arrays are empty, except `map_from_world`, which is the identity.
-    """
+    """Reads keyframes/index.json; if it is missing, there are no keyframes, and `map_from_world` is the identity."""
     index = _read_json(file, checked_index) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}
-    observations = [
-        [observation[key] for key in _OBSERVATION_KEYS] for observation in index.get("stereo_observations", [])
-    ]
-    stereo_observations = np.array(observations, float).reshape(-1, 3)
+    rows = [[observation[key] for key in OBSERVATION_KEYS] for observation in index.get("stereo_observations", [])]
+    stereo_observations = np.array(rows, float).reshape(-1, 3)
     map_from_world = np.array(index.get("map_from_world", np.eye(4)), float)
     return Keyframes(frames, tracks, index.get("n_frames_per_keyframe"), timing_ms, stereo_observations, map_from_world)
 

@@ -19,7 +19,6 @@ from twin.report.headline import closed_form_comparison, headline, key_figures
 from twin.report.html import render_page
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.mesh_picture import surface_picture
-from twin.report.run_errors import run_alignment
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_table import stage_rows
 from twin.report.style import COLOURS, ESTIMATES, LABELS
@@ -70,7 +69,7 @@ def context(run: Run) -> dict[str, Any]:
         "mosaic": mosaic_image(run),
         "surface": surface_image(run),
         "samples": sample_images(run),
-        "alignment": wording.REPLAY_ALIGNMENTS[run_alignment(run) or "first"],
+        "alignment": wording.REPLAY_ALIGNMENTS[run.alignment or "first"],
         "scenario": read_text(run.folder / SCENARIO_FILE),
         "environment": {key: _text(value) for key, value in run.environment.items()},
         "colours": COLOURS,
