@@ -12,17 +12,11 @@ from twin.kernels import kernel
 
 
 class ThrustAllocation(NamedTuple):
-    """Thrust allocation: distributes a wrench [moment, force] among n thrusters.
+    """Thrust allocation: distributes a wrench [moment, force] among n thrusters."""
 
-    Args:
-        thrusts_from_wrench: (n, 6) weighted pseudo-inverse of the thrust configuration matrix.
-        command_table: (k,) increasing commands, over the range in which thrust increases with the command.
-        thrust_table_n: (k,) steady thrust at the commands of `command_table` [N].
-    """
-
-    thrusts_from_wrench: Array
-    command_table: Array
-    thrust_table_n: Array
+    thrusts_from_wrench: Array  # (n, 6) weighted pseudo-inverse of the thrust configuration matrix
+    command_table: Array  # (k,) increasing commands, over the range in which thrust increases with the command
+    thrust_table_n: Array  # (k,) steady thrust at the commands of `command_table` [N]
 
     def commands(self, wrench: Array) -> tuple[Array, float]:
         """Computes thruster commands for a wrench.

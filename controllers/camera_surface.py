@@ -16,13 +16,9 @@ from twin.kernels import kernel
 
 @dataclass(frozen=True)
 class CameraSurface:
-    """Planned height z of the camera as a function of x and y: a bicubic spline with continuous second derivatives.
+    """Planned height z of the camera as a function of x and y: a bicubic spline with continuous second derivatives."""
 
-    Args:
-        spline: z [m] as a function of x and y [m]; constant beyond the outermost knots.
-    """
-
-    spline: RectBivariateSpline
+    spline: RectBivariateSpline  # z [m] as a function of x and y [m]; constant beyond the outermost knots
 
     def height_at(self, x_m: Array, y_m: Array) -> Array:
         """Returns the planned height z of the camera (n,) at points (x, y) [m]."""

@@ -16,39 +16,26 @@ MAX_CLEARANCE_SAMPLES = 20_000_000
 
 
 class Forecast(NamedTuple):
-    """Predicted properties of a survey, for a floor at the reference plane z = 0.
+    """Predicted properties of a survey, for a floor at the reference plane z = 0."""
 
-    Args:
-        n_frames_per_keyframe: N, frames from one keyframe to the next.
-        keyframes_per_swath: M, number of keyframes on a leg of mean length or on a loop.
-        n_tracks: L, number of planned tracks.
-        n_keyframes, n_frames: number of keyframes and of frames of the survey, without station keeping.
-        duration_s, path_m: duration of the survey and horizontal length of its path, without station keeping.
-        speed_mps: cruise speed along the swaths.
-        footprint_m: width (across the heading) and height (along the heading) of the image on the floor.
-        keyframe_spacing_m: distance between consecutive keyframes.
-        swath_spacing_m: greatest distance between neighbouring swaths.
-        overlap_along: overlap of consecutive keyframes, as a fraction of `SurveyPlan.side_along_m`.
-        overlap_across: sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`.
-        disparity_px: expected disparity of the reference plane.
-        depth_sigma_m: expected standard deviation of the depth from one stereo pair.
-    """
-
-    n_frames_per_keyframe: int
-    keyframes_per_swath: int
-    n_tracks: int
+    n_frames_per_keyframe: int  # N, frames from one keyframe to the next
+    keyframes_per_swath: int  # M, number of keyframes on a leg of mean length or on a loop
+    n_tracks: int  # L, number of planned tracks
+    #: n_keyframes, n_frames: number of keyframes and of frames of the survey, without station keeping.
     n_keyframes: int
     n_frames: int
+    #: duration_s, path_m: duration of the survey and horizontal length of its path, without station keeping.
     duration_s: float
     path_m: float
-    speed_mps: float
+    speed_mps: float  # cruise speed along the swaths
+    #: width (across the heading) and height (along the heading) of the image on the floor.
     footprint_m: tuple[float, float]
-    keyframe_spacing_m: float
-    swath_spacing_m: float
-    overlap_along: float
-    overlap_across: float
-    disparity_px: float
-    depth_sigma_m: float
+    keyframe_spacing_m: float  # distance between consecutive keyframes
+    swath_spacing_m: float  # greatest distance between neighbouring swaths
+    overlap_along: float  # overlap of consecutive keyframes, as a fraction of `SurveyPlan.side_along_m`
+    overlap_across: float  # sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`
+    disparity_px: float  # expected disparity of the reference plane
+    depth_sigma_m: float  # expected standard deviation of the depth from one stereo pair
 
 
 def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> Forecast:
@@ -83,19 +70,14 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
 
 
 class Clearance(NamedTuple):
-    """Clearance of a planned path above the floor.
+    """Clearance of a planned path above the floor."""
 
-    Args:
-        least_m: least height of the camera above the highest floor near it; infinite if no floor was found.
-        x_m, y_m: where the clearance is least: the floor point for a level path, the camera for a path that follows the
-            floor.
-        inside: whether every point (x, y) of the path lies within the extent of the terrain.
-    """
-
-    least_m: float
+    least_m: float  # least height of the camera above the highest floor near it; infinite if no floor was found
+    #: x_m, y_m: where the clearance is least: the floor point for a level path, the camera for a path that follows the
+    #: floor.
     x_m: float
     y_m: float
-    inside: bool
+    inside: bool  # whether every point (x, y) of the path lies within the extent of the terrain
 
 
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:

@@ -9,17 +9,11 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Trapezoidal speed profile: constant acceleration, cruise, constant deceleration; triangular on a short segment.
+    """Trapezoidal speed profile: constant acceleration, cruise, deceleration; triangular on a short segment."""
 
-    Args:
-        length_m: length of the segment.
-        cruise_mps: speed limit.
-        acceleration_mps2: acceleration, and deceleration at the end.
-    """
-
-    length_m: float
-    cruise_mps: float
-    acceleration_mps2: float
+    length_m: float  # length of the segment
+    cruise_mps: float  # speed limit
+    acceleration_mps2: float  # acceleration, and deceleration at the end
 
     @cached_property
     def peak_mps(self) -> float:

@@ -98,19 +98,12 @@ class Circle(NamedTuple):
 
 
 class Turn(NamedTuple):
-    """Turn on the spot: the vehicle rotates about the vertical axis through the camera, whose position does not change.
+    """Turn on the spot, about the vertical axis through the camera, whose position does not change."""
 
-    Args:
-        position: position of the camera [m].
-        yaw: yaw at the start [rad].
-        sense: +1 counter-clockwise, -1 clockwise.
-        profile: profile of the rotation angle, in rad, rad/s and rad/s2 instead of m, m/s and m/s2.
-    """
-
-    position: Point
-    yaw: float
-    sense: float
-    profile: SpeedProfile
+    position: Point  # position of the camera [m]
+    yaw: float  # yaw at the start [rad]
+    sense: float  # +1 counter-clockwise, -1 clockwise
+    profile: SpeedProfile  # profile of the rotation angle, in rad, rad/s and rad/s2 instead of m, m/s and m/s2
 
     @property
     def length_m(self) -> float:

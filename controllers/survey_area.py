@@ -25,21 +25,13 @@ _EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of roun
 
 @dataclass(frozen=True)
 class SurveyArea:
-    """Area that a survey has to cover, in the scene.
+    """Area that a survey has to cover, in the scene."""
 
-    Args:
-        shape: rectangle, disc or polygon.
-        size_m: extent along and across the legs; for a disc, the first value is its diameter.
-        centre_m: x, y of the centre of the extent.
-        heading: direction of the legs [rad, counter-clockwise from east].
-        corners: corners (u, v) of a polygon in the axes of the legs [m]; empty for other shapes.
-    """
-
-    shape: Literal["rectangle", "disc", "polygon"]
-    size_m: tuple[float, float]
-    centre_m: Corner = (0.0, 0.0)
-    heading: float = 0.0
-    corners: tuple[Corner, ...] = ()
+    shape: Literal["rectangle", "disc", "polygon"]  # rectangle, disc or polygon
+    size_m: tuple[float, float]  # extent along and across the legs; for a disc, the first value is its diameter
+    centre_m: Corner = (0.0, 0.0)  # x, y of the centre of the extent
+    heading: float = 0.0  # direction of the legs [rad, counter-clockwise from east]
+    corners: tuple[Corner, ...] = ()  # corners (u, v) of a polygon in the axes of the legs [m]; empty for other shapes
 
     def to_scene(self, u_m: ArrayLike, v_m: ArrayLike) -> tuple[Array, Array]:
         """Converts points from the axes of the legs to x, y in the scene [m]."""

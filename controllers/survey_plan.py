@@ -25,42 +25,32 @@ MAX_TRACKS, MAX_FILLING, LEAST_M = 10_000, 1_000_000, 1e-3
 
 
 class SurveyRequest(NamedTuple):
-    """Requirements of a survey.
+    """Requirements of a survey."""
 
-    Args:
-        area_m: extent along and across the legs.
-        altitude_m: height of the left camera above the reference plane z = 0 or, with `surface`, above the smoothed
-            floor.
-        speed_mps: cruise speed.
-        overlap_along: required overlap of consecutive keyframes, as a fraction of the image width (see
-            `frames_per_keyframe`).
-        overlap_across: required sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`.
-        tracks: number of tracks to fly, starting with the first; 0: all tracks that fill the area.
-        image_width_px, image_height_px, focal_px, frame_rate_hz: parameters of the left camera.
-        acceleration_mps2: greatest acceleration of the camera.
-        area: area to cover, of extent `area_m`; None: a rectangle or disc at the origin, with legs along x.
-        turns: "reverse": every second leg is flown backwards; "bow_first": the vehicle turns by 180 degrees at
-            the end of each leg except the last.
-        along_scale, across_scale: factors on the spacing of keyframes and of swaths that follows from the footprint on
-            the reference plane; below 1 if the floor is nearer to the cameras than the plane.
-        surface: planned height z of the camera as a function of x and y; None: `altitude_m` everywhere.
-    """
-
-    area_m: tuple[float, float]
+    area_m: tuple[float, float]  # extent along and across the legs
+    #: height of the left camera above the reference plane z = 0 or, with `surface`, above the smoothed floor.
     altitude_m: float
-    speed_mps: float
+    speed_mps: float  # cruise speed
+    #: required overlap of consecutive keyframes, as a fraction of the image width (see `frames_per_keyframe`).
     overlap_along: float
-    overlap_across: float
-    tracks: int
+    overlap_across: float  # required sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`
+    tracks: int  # number of tracks to fly, starting with the first; 0: all tracks that fill the area
+    #: image_width_px, image_height_px, focal_px, frame_rate_hz: parameters of the left camera.
     image_width_px: int
     image_height_px: int
     focal_px: float
     frame_rate_hz: float
-    acceleration_mps2: float = 0.2
+    acceleration_mps2: float = 0.2  # greatest acceleration of the camera
+    #: area to cover, of extent `area_m`; None: a rectangle or disc at the origin, with legs along x.
     area: SurveyArea | None = None
+    #: "reverse": every second leg is flown backwards; "bow_first": the vehicle turns by 180 degrees at the end of each
+    #: leg except the last.
     turns: Literal["reverse", "bow_first"] = "reverse"
+    #: along_scale, across_scale: factors on the spacing of keyframes and of swaths that follows from the footprint on
+    #: the reference plane; below 1 if the floor is nearer to the cameras than the plane.
     along_scale: float = 1.0
     across_scale: float = 1.0
+    #: planned height z of the camera as a function of x and y; None: `altitude_m` everywhere.
     surface: CameraSurface | None = None
 
     @property
@@ -72,40 +62,28 @@ class SurveyRequest(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """Planned path and heading of the left camera. The vehicle keeps station after each track.
+    """Planned path and heading of the left camera. The vehicle keeps station after each track."""
 
-    Args:
-        paths: segments of each track; tracks are numbered from 1, and every segment starts and ends at rest.
-        area: area to cover; the legs, and the bow on the first leg, point along its heading.
-        altitude_m: height of the camera above the reference plane z = 0 or, with `surface`, above the smoothed floor.
-        speed_mps: cruise speed along the swaths.
-        frame_rate_hz: frames per second.
-        n_frames_per_keyframe: N, frames from one keyframe to the next.
-        swath_length_m: length of a swath: the mean over all legs that fill the area, or that of a loop.
-        swath_spacing_m: greatest distance between neighbouring swaths.
-        n_tracks_to_fill: number of tracks that fill the area, of which the first `n_tracks` are planned.
-        footprint_m: width (across the heading) and height (along the heading) of the image on the reference plane.
-        side_along_m: side of the footprint along which consecutive keyframes are displaced; the shorter one for loops.
-        side_across_m: side of the footprint along which neighbouring swaths are displaced; the shorter one for loops.
-        focal_px: focal length of the cameras.
-        acceleration_mps2: greatest acceleration of the camera.
-        surface: planned height z of the camera, which replaces z of the paths; None: `altitude_m` everywhere.
-    """
-
+    #: segments of each track; tracks are numbered from 1, and every segment starts and ends at rest.
     paths: tuple[tuple[Segment, ...], ...]
-    area: SurveyArea
+    area: SurveyArea  # area to cover; the legs, and the bow on the first leg, point along its heading
+    #: height of the camera above the reference plane z = 0 or, with `surface`, above the smoothed floor.
     altitude_m: float
-    speed_mps: float
-    frame_rate_hz: float
-    n_frames_per_keyframe: int
-    swath_length_m: float
-    swath_spacing_m: float
-    n_tracks_to_fill: int
+    speed_mps: float  # cruise speed along the swaths
+    frame_rate_hz: float  # frames per second
+    n_frames_per_keyframe: int  # N, frames from one keyframe to the next
+    swath_length_m: float  # length of a swath: the mean over all legs that fill the area, or that of a loop
+    swath_spacing_m: float  # greatest distance between neighbouring swaths
+    n_tracks_to_fill: int  # number of tracks that fill the area, of which the first `n_tracks` are planned
+    #: width (across the heading) and height (along the heading) of the image on the reference plane.
     footprint_m: tuple[float, float]
+    #: side of the footprint along which consecutive keyframes are displaced; the shorter one for loops.
     side_along_m: float
+    #: side of the footprint along which neighbouring swaths are displaced; the shorter one for loops.
     side_across_m: float
-    focal_px: float
-    acceleration_mps2: float
+    focal_px: float  # focal length of the cameras
+    acceleration_mps2: float  # greatest acceleration of the camera
+    #: planned height z of the camera, which replaces z of the paths; None: `altitude_m` everywhere.
     surface: CameraSurface | None = None
 
     @property

@@ -17,19 +17,12 @@ INTEGRAL_LIMIT = np.array([2.0, 2.0, 2.0, 1.5, 1.5, 1.5])  # [rad/s2, m/s2]: mor
 
 
 class HullModel(NamedTuple):
-    """Hull model of the controller; (6,) arrays are [rotation about, translation along] the x, y, z axes of the body.
+    """Hull model of the controller; (6,) arrays are [rotation about, translation along] the axes of the body."""
 
-    Args:
-        inertia: (6,) moments of inertia [kg m2] and masses [kg], including added mass.
-        added_mass: (3,) added masses along the axes [kg].
-        linear_drag: (6,) coefficients of linear drag [N m s/rad, then N s/m], positive.
-        quadratic_drag: (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive.
-    """
-
-    inertia: Array
-    added_mass: Array
-    linear_drag: Array
-    quadratic_drag: Array
+    inertia: Array  # (6,) moments of inertia [kg m2] and masses [kg], including added mass
+    added_mass: Array  # (3,) added masses along the axes [kg]
+    linear_drag: Array  # (6,) coefficients of linear drag [N m s/rad, then N s/m], positive
+    quadratic_drag: Array  # (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive
 
 
 @kernel
@@ -83,21 +76,14 @@ def commanded_velocity(position: Array, reference: Reference, natural_frequency_
 
 
 class ControllerState(NamedTuple):
-    """Parameters and integral action of the pose controller; `integral` is modified in place.
+    """Parameters and integral action of the pose controller; `integral` is modified in place."""
 
-    Args:
-        hull: hull model.
-        allocation: thrust allocation.
-        gains: PID gains.
-        period_s: time between commands.
-        integral: (6,) integral action [rad/s2 in the body, m/s2 in the world]. The linear part is in the world because
-            current and buoyancy do not rotate with the vehicle.
-    """
-
-    hull: HullModel
-    allocation: ThrustAllocation
-    gains: Gains
-    period_s: float
+    hull: HullModel  # hull model
+    allocation: ThrustAllocation  # thrust allocation
+    gains: Gains  # PID gains
+    period_s: float  # time between commands
+    #: (6,) integral action [rad/s2 in the body, m/s2 in the world]. The linear part is in the world because current and
+    #: buoyancy do not rotate with the vehicle.
     integral: Array
 
 

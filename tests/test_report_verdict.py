@@ -161,8 +161,10 @@ def test_metrics_of_older_runs_keep_their_warning():
 
 def test_the_sentence_on_the_observed_floor_names_the_map_where_no_area_was_asked_for():
     asked, observed = good(), changed(map={"completeness_area": None})
-    assert " of the asked area; " in headline.headline(asked, {}) and " It covers " in wording.headline(asked, {})
-    assert " The map covers " in headline.headline(observed, {}) and " It covers " not in wording.headline(observed, {})
+    assert " of the asked area; " in headline.headline(asked, {}) and " It covers " in headline.headline(asked, {})
+    assert " The map covers " in headline.headline(observed, {}) and " It covers " not in headline.headline(
+        observed, {}
+    )
 
 
 def test_a_replay_lists_only_figures_that_it_has():

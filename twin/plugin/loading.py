@@ -17,17 +17,11 @@ T = TypeVar("T")
 
 
 class Registered(NamedTuple):
-    """A plug-in that another package registers.
+    """A plug-in that another package registers."""
 
-    Args:
-        name: name of the entry point.
-        target: module and class as the entry point gives them, for example "mypackage.control:LQR".
-        create: the class; calling it returns the plug-in.
-    """
-
-    name: str
-    target: str
-    create: Callable[..., Any]
+    name: str  # name of the entry point
+    target: str  # module and class as the entry point gives them, for example "mypackage.control:LQR"
+    create: Callable[..., Any]  # the class; calling it returns the plug-in
 
 
 def registered(group: str) -> list[Registered]:

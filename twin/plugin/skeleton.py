@@ -15,17 +15,11 @@ Kind = Literal["controller", "estimator", "terrain", "reader"]
 
 
 class _Flown(NamedTuple):
-    """Settings of the survey that the test of a skeleton flies with the plug-in.
+    """Settings of the survey that the test of a skeleton flies with the plug-in."""
 
-    Args:
-        section: section of the scenario with the key `plugin`.
-        fidelity: value of imaging.fidelity.
-        error_m: largest RMSE of the trajectory and of the cross-track error that the test accepts [m].
-    """
-
-    section: str
-    fidelity: str
-    error_m: float
+    section: str  # section of the scenario with the key `plugin`
+    fidelity: str  # value of imaging.fidelity
+    error_m: float  # largest RMSE of the trajectory and of the cross-track error that the test accepts [m]
 
 
 _FLOWN: dict[str, _Flown] = {

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from twin.core.user_files import resolved
 from twin.errors import TwinError
 from twin.report import wording
-from twin.report.comparison_figures import draw_comparison, run_colours
+from twin.report.comparison_figures import RUN_COLOURS, draw_comparison
 from twin.report.html import render_page
 from twin.report.run_folder import Run, load_run
 from twin.report.verdict import badge, first_lines
@@ -20,60 +20,52 @@ MOST_RUNS = 8
 
 
 class ComparedQuantity(NamedTuple):
-    """Metric that the comparison of runs shows in one row of its table.
+    """Metric that the comparison of runs shows in one row of its table."""
 
-    Args:
-        name: dotted name in metrics.json.
-        label: name on the page.
-        text: function that returns a value as text, with its unit unless the label has it.
-        better: "less" or "more": whether smaller or larger values are better; "" if neither.
-    """
-
-    name: str
+    name: str  # dotted, in metrics.json
     label: str
-    text: Callable[[Any], str]
-    better: str = "less"
+    text: Callable[[Any], str]  # returns a value as text, with its unit unless the label has it
+    better: str = "less"  # or "more", or "" if neither smaller nor larger values are better
 
 
-QUANTITIES = (
-    ComparedQuantity("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", wording.length),
-    ComparedQuantity("trajectory.online.ate_rmse_m", "position error, online (RMSE)", wording.length),
-    ComparedQuantity("trajectory.final.ate_rmse_m", "position error, final (RMSE)", wording.length),
-    ComparedQuantity("trajectory.final.ate_max_m", "position error, final (maximum)", wording.length),
-    ComparedQuantity("trajectory.final.z_rmse_m", "height error, final (RMSE)", wording.length),
-    ComparedQuantity("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", wording.milliradians),
-    ComparedQuantity("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", wording.plain, ""),
-    ComparedQuantity("map.le90_m", "LE90 of the map", wording.length),
-    ComparedQuantity("map.nmad_m", "NMAD of the map", wording.length),
-    ComparedQuantity("map.le90_area_m", "LE90 over the asked area", wording.length),
-    ComparedQuantity("map.completeness", "completeness, observed floor", wording.percent, "more"),
-    ComparedQuantity("map.completeness_area", "completeness, asked area", wording.percent, "more"),
-    ComparedQuantity("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", wording.plain),
-    ComparedQuantity("control.cross_track_rmse_m", "cross-track error (RMSE)", wording.length),
-    ComparedQuantity("self_check.frames_lost", "frames without measured motion", wording.percent),
-    ComparedQuantity("timing.frames", "frames", wording.plain, ""),
-    ComparedQuantity("timing.keyframes", "keyframes", wording.plain, ""),
-    ComparedQuantity("timing.wall_s", "computing time [s]", wording.plain),
-    ComparedQuantity("timing.peak_rss_mb", "peak memory [MiB]", wording.plain),
+QUANTITIES = tuple(
+    ComparedQuantity(*row)
+    for row in (
+        ("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", wording.length),
+        ("trajectory.online.ate_rmse_m", "position error, online (RMSE)", wording.length),
+        ("trajectory.final.ate_rmse_m", "position error, final (RMSE)", wording.length),
+        ("trajectory.final.ate_max_m", "position error, final (maximum)", wording.length),
+        ("trajectory.final.z_rmse_m", "height error, final (RMSE)", wording.length),
+        ("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", wording.milliradians),
+        ("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", wording.plain, ""),
+        ("map.le90_m", "LE90 of the map", wording.length),
+        ("map.nmad_m", "NMAD of the map", wording.length),
+        ("map.le90_area_m", "LE90 over the asked area", wording.length),
+        ("map.completeness", "completeness, observed floor", wording.percent, "more"),
+        ("map.completeness_area", "completeness, asked area", wording.percent, "more"),
+        ("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", wording.plain),
+        ("control.cross_track_rmse_m", "cross-track error (RMSE)", wording.length),
+        ("self_check.frames_lost", "frames without measured motion", wording.percent),
+        ("timing.frames", "frames", wording.plain, ""),
+        ("timing.keyframes", "keyframes", wording.plain, ""),
+        ("timing.wall_s", "computing time [s]", wording.plain),
+        ("timing.peak_rss_mb", "peak memory [MiB]", wording.plain),
+    )
 )
 
 
 class Cell(NamedTuple):
-    """Value of one run in the table.
+    """Value of one run in the table, and its difference from that of the first run; None if it is missing.
 
-    Args:
-        value: the value; None if the run has none.
-        difference: value minus that of the first run; None for the first run and where a value is missing.
-        text: the value as text.
-        change: the difference as text, for example "+1.2 mm (+10 %)"; "same" if it is 0; "" if it is None.
-        level: "good" or "bad" if the value is better or worse than that of the first run; otherwise "".
+    `change` is the difference as text, for example "+1.2 mm (+10 %)"; "same" if it is 0; "" if it is None.
+    `level` is "good" or "bad" if the value is better or worse than that of the first run; otherwise "".
     """
 
     value: float | None
-    difference: float | None
     text: str
-    change: str
-    level: str
+    difference: float | None = None
+    change: str = ""
+    level: str = ""
 
 
 class Row(NamedTuple):
@@ -102,10 +94,7 @@ def load_runs(folders: Sequence[Path]) -> list[Run]:
 
 
 def names_of(runs: Sequence[Run]) -> list[str]:
-    """Returns distinct names of runs: the last parts of the paths of their folders, joined by "/".
-
-    All names have the same number of parts, the smallest that makes them distinct.
-    """
+    """Returns distinct names of runs: the last parts of the paths of their folders, as few as make them distinct."""
     paths = [resolved(run.folder) for run in runs]
     for n in range(1, max(len(path.parts) for path in paths) + 1):
         names = ["/".join(path.parts[-n:]) for path in paths]
@@ -118,17 +107,15 @@ def table(runs: Sequence[Run]) -> list[Row]:
     """Returns the rows of all quantities that at least one run has."""
     rows: list[Row] = []
     for quantity in QUANTITIES:
-        values = [_value(run.metrics or {}, quantity.name) for run in runs]
-        if any(value is not None for value in values):
-            rows.append(Row(quantity, [_cell(quantity, value, values[0], k == 0) for k, value in enumerate(values)]))
+        first, *others = [_value(run.metrics or {}, quantity.name) for run in runs]
+        if any(value is not None for value in (first, *others)):
+            start = Cell(first, quantity.text(first))
+            rows.append(Row(quantity, [start, *(_compared(quantity, value, first) for value in others)]))
     return rows
 
 
 def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
-    """Returns the keys of the scenario in which the runs differ, each with its value in every run as JSON (`_json`).
-
-    The value in a run whose scenario lacks the key is a dash.
-    """
+    """Returns the keys of the scenario in which the runs differ, with the value in every run as JSON, or a dash."""
     flat = [dict(_flattened(run.scenario)) for run in runs]
     keys = sorted(set().union(*flat))
     texts = {key: [_json(one[key]) if key in one else wording.DASH for one in flat] for key in keys}
@@ -136,11 +123,7 @@ def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
 
 
 def notes(differences: Mapping[str, Sequence[str]]) -> list[str]:
-    """Returns sentences on the limits of the comparison: different floors or plans, and the effect of chance.
-
-    Args:
-        differences: keys in which the scenarios differ (`scenario_differences`).
-    """
+    """Returns sentences on the limits of a comparison with these `scenario_differences`."""
     survey = [key for key in differences if key.split(".")[0] in ("seed", "terrain", "objects", "plan")]
     sentences = ["A difference between two surveys is partly due to chance; twin study compares many seeds."]
     if survey:
@@ -179,20 +162,17 @@ def text_rows(runs: Sequence[Run]) -> list[tuple[str, ...]]:
 def render(runs: Sequence[Run]) -> str:
     """Returns the page of a comparison as HTML."""
     names, differences = names_of(runs), scenario_differences(runs)
-    return render_page(
-        "twin.report",
-        "comparison.html.j2",
-        {
-            "names": names,
-            "colours": run_colours(len(runs)),
-            "badges": [badge(run.metrics) for run in runs],
-            "first_lines": [first_lines(run.metrics or {}) for run in runs],
-            "rows": table(runs),
-            "notes": notes(differences),
-            "differences": differences,
-            "figures": draw_comparison(runs, names),
-        },
-    )
+    variables = {
+        "names": names,
+        "colours": RUN_COLOURS[: len(runs)],
+        "badges": [badge(run.metrics) for run in runs],
+        "first_lines": [first_lines(run.metrics or {}) for run in runs],
+        "rows": table(runs),
+        "notes": notes(differences),
+        "differences": differences,
+        "figures": draw_comparison(runs, names),
+    }
+    return render_page("twin.report", "comparison.html.j2", variables)
 
 
 def _value(metrics: Mapping[str, Any], name: str) -> float | None:
@@ -203,27 +183,20 @@ def _value(metrics: Mapping[str, Any], name: str) -> float | None:
     return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
-def _cell(quantity: ComparedQuantity, value: float | None, first: float | None, is_first: bool) -> Cell:
-    """Returns the table cell of one run, with its value compared to that of the first run.
-
-    Args:
-        quantity: the quantity of the row.
-        value: value of the run; None if it has none.
-        first: value of the first run; None if it has none.
-        is_first: whether the run is the first one.
-    """
-    if is_first or value is None or first is None:
-        return Cell(value, None, quantity.text(value), "", "")
+def _compared(quantity: ComparedQuantity, value: float | None, first: float | None) -> Cell:
+    """Returns the cell of a value that is compared with that of the first run."""
+    text = quantity.text(value)
+    if value is None or first is None:
+        return Cell(value, text)
     difference = value - first
     if difference == 0:
-        return Cell(value, difference, quantity.text(value), "same", "")
-    sign = "+" if difference > 0 else "-"
+        return Cell(value, text, difference, "same")
     better = {"less": difference < 0, "more": difference > 0}.get(quantity.better)
     level = "" if better is None else "good" if better else "bad"
-    change = f"{sign}{quantity.text(abs(difference))}"
+    change = f"{'+' if difference > 0 else '-'}{quantity.text(abs(difference))}"
     if quantity.text is not wording.percent and first > 0:
         change += f" ({_relative(value / first)})"
-    return Cell(value, difference, quantity.text(value), change, level)
+    return Cell(value, text, difference, change, level)
 
 
 def _relative(factor: float) -> str:
@@ -231,15 +204,13 @@ def _relative(factor: float) -> str:
     return f"{100 * (factor - 1):+.0f} %" if factor < 3 else wording.ratio(factor)
 
 
-def _flattened(tree: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
-    """Returns the dotted keys and the values of nested tables; a list is one value."""
-    return [
-        pair
-        for key, value in tree.items()
-        for pair in (
-            _flattened(value, f"{prefix}{key}.") if isinstance(value, Mapping) else [(f"{prefix}{key}", value)]
-        )
-    ]
+def _flattened(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yields the dotted keys and the values of nested tables; a list is one value."""
+    for key, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _flattened(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
 
 
 def _json(value: Any) -> str:

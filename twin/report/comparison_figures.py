@@ -16,23 +16,18 @@ from twin.report.run_folder import Run
 from twin.report.style import COLOURS
 
 #: Colours of the runs in their order (Okabe & Ito palette, with grey in place of yellow).
-_RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6d76", "#000000")
+RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6d76", "#000000")
 #: Line styles of the runs: coinciding curves stay visible.
 _RUN_STYLES = ("-", "--", "-.", ":") * 2
 #: Runs, each with the style of its curves.
 Styled = Sequence[tuple[Run, dict[str, Any]]]
 
 
-def run_colours(n: int) -> list[str]:
-    """Returns the colours of the first n runs."""
-    return list(_RUN_COLOURS[:n])
-
-
 def draw_comparison(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
     """Returns the PNG data URI of each figure whose data at least one run contains, by name of the figure."""
     styles = [
         {"color": colour, "linestyle": style, "label": name}
-        for name, colour, style in zip(names, _RUN_COLOURS, _RUN_STYLES, strict=False)
+        for name, colour, style in zip(names, RUN_COLOURS, _RUN_STYLES, strict=False)
     ]
     functions = {"errors": error_curves, "paths": path_curves, "heights": height_error_curves}
     return drawn(functions, list(zip(runs, styles, strict=True)))

@@ -21,19 +21,12 @@ NOT_OBSERVED = np.iinfo(np.int64).max
 
 
 class Surface(NamedTuple):
-    """A coloured triangle mesh, in the axes of the map or of the world.
+    """A coloured triangle mesh, in the axes of the map or of the world."""
 
-    Args:
-        points: (n, 3) vertices [m]; not finite where the map has no height.
-        normals: (n, 3) unit normals.
-        colours: (n, 3) uint8 RGB.
-        triangles: (m, 3) vertex numbers.
-    """
-
-    points: Array
-    normals: Array
-    colours: NDArray[np.uint8]
-    triangles: NDArray[np.int64]
+    points: Array  # (n, 3) vertices [m]; not finite where the map has no height
+    normals: Array  # (n, 3) unit normals
+    colours: NDArray[np.uint8]  # (n, 3) uint8 RGB
+    triangles: NDArray[np.int64]  # (m, 3) vertex numbers
 
 
 def floor_surface(raster: Raster) -> Surface:

@@ -17,17 +17,11 @@ _RIG_KEYS = ("image_width_px", "image_height_px", "focal_px", "baseline_m", "fra
 
 
 class RunDescription(NamedTuple):
-    """Description of a run without a scenario, such as a replay.
+    """Description of a run without a scenario, such as a replay."""
 
-    Args:
-        name: name of the run.
-        seed: seed of its random numbers; None if it has none.
-        text: contents of scenario.resolved.toml.
-    """
-
-    name: str
-    seed: int | None
-    text: str
+    name: str  # name of the run
+    seed: int | None  # seed of its random numbers; None if it has none
+    text: str  # contents of scenario.resolved.toml
 
 
 def describe_replay(

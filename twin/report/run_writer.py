@@ -40,17 +40,12 @@ _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are writ
 
 
 class PlannedTruth(NamedTuple):
-    """Truth, map grid and plan of a simulated survey.
+    """Truth, map grid and plan of a simulated survey."""
 
-    Args:
-        truth: true trajectory and floor, and the reference path.
-        grid: cells of the maps.
-        start: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path unless
-            the truth has a planned heading per frame.
-    """
-
-    truth: Truth
-    grid: MapGrid
+    truth: Truth  # true trajectory and floor, and the reference path
+    grid: MapGrid  # cells of the maps
+    #: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path unless the truth
+    #: has a planned heading per frame.
     start: Array
 
     def reference(self) -> Trajectory:
@@ -65,33 +60,22 @@ class PlannedTruth(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyRecord:
-    """Results of a survey, complete or aborted, as `RunFolder.finish` writes them.
+    """Results of a survey, complete or aborted, as `RunFolder.finish` writes them."""
 
-    Args:
-        result: output of the estimators.
-        elevation: elevation map; None if none was built.
-        simulated: truth and plan of a simulated survey; None for recorded data.
-        n_frames_per_keyframe: planned frames from one keyframe to the next; None without a plan.
-        stopwatch: durations of the processing stages.
-        metrics: contents of metrics.json.
-        georeference: position of the scene in the CRS of the DEM; None: rasters are in scene coordinates.
-        has_orthomosaic: whether mosaic.tif has been written as an orthomosaic (`RunFolder.orthomosaic_file`); otherwise
-            it is written with the cells of the map.
-        recorded_truth: recorded true poses of all frames, in the world of the estimates; None unless every frame has
-            one.
-        recorded_heights_m: (rows, cols) true heights at the cells of the map, along its axis of height; None if they
-            are not known.
-    """
-
-    result: SurveyResult
-    elevation: ElevationMap | None
-    simulated: PlannedTruth | None
-    n_frames_per_keyframe: int | None
-    stopwatch: Stopwatch
-    metrics: dict[str, Any]
+    result: SurveyResult  # output of the estimators
+    elevation: ElevationMap | None  # elevation map; None if none was built
+    simulated: PlannedTruth | None  # truth and plan of a simulated survey; None for recorded data
+    n_frames_per_keyframe: int | None  # planned frames from one keyframe to the next; None without a plan
+    stopwatch: Stopwatch  # durations of the processing stages
+    metrics: dict[str, Any]  # contents of metrics.json
+    #: position of the scene in the CRS of the DEM; None: rasters are in scene coordinates.
     georeference: Georeference | None = None
+    #: whether mosaic.tif has been written as an orthomosaic (`RunFolder.orthomosaic_file`); otherwise it is written
+    #: with the cells of the map.
     has_orthomosaic: bool = False
+    #: recorded true poses of all frames, in the world of the estimates; None unless every frame has one.
     recorded_truth: Trajectory | None = None
+    #: (rows, cols) true heights at the cells of the map, along its axis of height; None if they are not known.
     recorded_heights_m: NDArray[np.float32] | None = None
 
 

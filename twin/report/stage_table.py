@@ -9,21 +9,13 @@ from twin.judge.network_errors import stage_errors
 
 
 class StageRow(NamedTuple):
-    """One positioning stage in the report.
+    """One positioning stage in the report."""
 
-    Args:
-        stage: key of the stage.
-        inputs: measurements that the stage uses.
-        rmse_m: RMS position error of the keyframes [m].
-        gain: error of the preceding stage / error of this stage; None if one of them is missing or zero.
-        disabled: note on the corrections that the scenario disables in this stage; "" if there are none.
-    """
-
-    stage: str
-    inputs: str
-    rmse_m: float
-    gain: float | None
-    disabled: str
+    stage: str  # key of the stage
+    inputs: str  # measurements that the stage uses
+    rmse_m: float  # RMS position error of the keyframes [m]
+    gain: float | None  # error of the preceding stage / error of this stage; None if one of them is missing or zero
+    disabled: str  # note on the corrections that the scenario disables in this stage; "" if there are none
 
 
 def stage_rows(metrics: Mapping[str, Any], scenario: Mapping[str, Any]) -> list[StageRow]:

@@ -8,15 +8,10 @@ WaterSourceName = Literal["solonenko2015", "williamson2022"]
 
 
 class WaterSource(NamedTuple):
-    """A published table of water types.
+    """A published table of water types."""
 
-    Args:
-        citation: authors and year.
-        types: the Jerlov types of the table.
-    """
-
-    citation: str
-    types: tuple[str, ...]
+    citation: str  # authors and year
+    types: tuple[str, ...]  # the Jerlov types of the table
 
 
 WATER_SOURCES: dict[WaterSourceName, WaterSource] = {
