@@ -28,29 +28,26 @@ class ComparedQuantity(NamedTuple):
     better: str = "less"  # or "more", or "" if neither smaller nor larger values are better
 
 
-QUANTITIES = tuple(
-    ComparedQuantity(*row)
-    for row in (
-        ("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", wording.length),
-        ("trajectory.online.ate_rmse_m", "position error, online (RMSE)", wording.length),
-        ("trajectory.final.ate_rmse_m", "position error, final (RMSE)", wording.length),
-        ("trajectory.final.ate_max_m", "position error, final (maximum)", wording.length),
-        ("trajectory.final.z_rmse_m", "height error, final (RMSE)", wording.length),
-        ("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", wording.milliradians),
-        ("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", wording.plain, ""),
-        ("map.le90_m", "LE90 of the map", wording.length),
-        ("map.nmad_m", "NMAD of the map", wording.length),
-        ("map.le90_area_m", "LE90 over the asked area", wording.length),
-        ("map.completeness", "completeness, observed floor", wording.percent, "more"),
-        ("map.completeness_area", "completeness, asked area", wording.percent, "more"),
-        ("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", wording.plain),
-        ("control.cross_track_rmse_m", "cross-track error (RMSE)", wording.length),
-        ("self_check.frames_lost", "frames without measured motion", wording.percent),
-        ("timing.frames", "frames", wording.plain, ""),
-        ("timing.keyframes", "keyframes", wording.plain, ""),
-        ("timing.wall_s", "computing time [s]", wording.plain),
-        ("timing.peak_rss_mb", "peak memory [MiB]", wording.plain),
-    )
+QUANTITIES = (
+    ComparedQuantity("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", wording.length),
+    ComparedQuantity("trajectory.online.ate_rmse_m", "position error, online (RMSE)", wording.length),
+    ComparedQuantity("trajectory.final.ate_rmse_m", "position error, final (RMSE)", wording.length),
+    ComparedQuantity("trajectory.final.ate_max_m", "position error, final (maximum)", wording.length),
+    ComparedQuantity("trajectory.final.z_rmse_m", "height error, final (RMSE)", wording.length),
+    ComparedQuantity("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", wording.milliradians),
+    ComparedQuantity("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", wording.plain, ""),
+    ComparedQuantity("map.le90_m", "LE90 of the map", wording.length),
+    ComparedQuantity("map.nmad_m", "NMAD of the map", wording.length),
+    ComparedQuantity("map.le90_area_m", "LE90 over the asked area", wording.length),
+    ComparedQuantity("map.completeness", "completeness, observed floor", wording.percent, "more"),
+    ComparedQuantity("map.completeness_area", "completeness, asked area", wording.percent, "more"),
+    ComparedQuantity("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", wording.plain),
+    ComparedQuantity("control.cross_track_rmse_m", "cross-track error (RMSE)", wording.length),
+    ComparedQuantity("self_check.frames_lost", "frames without measured motion", wording.percent),
+    ComparedQuantity("timing.frames", "frames", wording.plain, ""),
+    ComparedQuantity("timing.keyframes", "keyframes", wording.plain, ""),
+    ComparedQuantity("timing.wall_s", "computing time [s]", wording.plain),
+    ComparedQuantity("timing.peak_rss_mb", "peak memory [MiB]", wording.plain),
 )
 
 
