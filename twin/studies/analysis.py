@@ -91,8 +91,8 @@ class StudyAnalysis:
         self.complete = self.evaluated & (self.status == "complete")
         self.keys = [key for key in study.varied_keys if f"vary.{key}" in rows.column_names]
         self.limits = self._limits()
-        names = with_completeness([*self.limits, *study.show])
-        self.metrics = [name for name in names if self._has_values(name)]
+        names = [n for n in with_completeness([*self.limits, *study.show]) if n in rows.column_names]
+        self.metrics = [n for n in names if n in self.limits or np.isfinite(self.numbers(n)).any()]
         met = [self.numbers(f"require.{name}.passed") == 1 for name in self.limits]
         self.passed: Mask = np.logical_and.reduce([self.complete, *met])  # completed and met every requirement
 
@@ -122,11 +122,6 @@ class StudyAnalysis:
         columns = [re.fullmatch(r"require\.(.+)\.limit", column) for column in self.rows.column_names]
         limits = {match[1]: self.numbers(match[0]) for match in columns if match}
         return {name: float(np.nanmax(v)) if np.isfinite(v).any() else np.nan for name, v in limits.items()}
-
-    def _has_values(self, metric: str) -> bool:
-        """Returns whether the metric is in the table, and is required or has a finite value in some survey."""
-        required = metric in self.limits and metric in self.rows.column_names
-        return required or bool(np.isfinite(self.numbers(metric)).any())
 
     def included(self, metric: str) -> Mask:
         """Returns the mask (n,) of the surveys that are included in the statistics of a metric.

@@ -45,21 +45,12 @@ class PassRecord(NamedTuple):
     pass_level: float = LEVEL  #: confidence level of the lower bound for the verdict "passes"
     fail_level: float = LEVEL  #: confidence level of the upper bound for the verdict "fails"
     #: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at the lower
-    #: bound of the pass probability, and as one that passed at the upper bound. None: all are known.
-    unknown: NDArray[np.bool_] | None = None
-
-    @property
-    def outcomes(self) -> NDArray[np.int64]:
-        """Returns the outcome of each survey (n,): 0 did not pass, 1 passed, 2 unknown."""
-        return np.where(self._unknown, 2, self.passed)
-
-    @property
-    def _unknown(self) -> NDArray[np.bool_]:
-        return np.zeros(len(self.passed), np.bool_) if self.unknown is None else self.unknown
+    #: bound of the pass probability, and as one that passed at the upper bound
+    unknown: NDArray[np.bool_] | np.bool_ = np.False_
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
         """Returns the answer for the surveys that the mask `chosen` (n,) selects, of which there is at least one."""
-        clusters, unknown = self.clusters[chosen], self._unknown[chosen]
+        clusters, unknown = self.clusters[chosen], (self.unknown & chosen)[chosen]
         passed = self.passed[chosen] & ~unknown
         verdict: Verdict = "undecided"
         if clustered_proportion(passed, clusters, unknown, self.pass_level).low >= self.required:
@@ -114,7 +105,7 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     """
     if len(x) == 0:
         return []
-    bins = pass_bins(x, record.outcomes)
+    bins = pass_bins(x, np.where(record.unknown, 2, record.passed))
     n_bins = int(bins.max()) + 1
     searched = record.for_ranges(n_bins)
 
@@ -144,7 +135,8 @@ def value_bins(x: Array) -> NDArray[np.int64]:
 def pass_bins(x: Array, outcomes: ArrayLike) -> NDArray[np.int64]:
     """Returns the bin of each survey (n,), numbered in ascending order of its value x (n,): `value_bins`, divided.
 
-    Bins are divided where the fractions of the outcomes (n,) change, so that no bin mixes two pass probabilities.
+    Bins are divided where the fractions of the outcomes (n,) change, so that no bin mixes two pass probabilities; an
+    outcome is 0: did not pass, 1: passed, or 2: unknown.
     """
     order, bins = np.argsort(x, kind="stable"), value_bins(x)
     changes = _changes(x[order], np.asarray(outcomes)[order, None] == np.arange(3))

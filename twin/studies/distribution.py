@@ -20,14 +20,18 @@ Values = Annotated[tuple[Any, ...], Field(min_length=1)]
 class Distribution(Section):
     """Distribution of one varied key; exactly one field is given, and its name is the kind of distribution."""
 
-    uniform: Pair | None = Field(default=None, description="[low, high]")
-    log_uniform: Pair | None = Field(default=None, description="[low, high]; the logarithm is uniformly distributed")
-    normal: Pair | None = Field(default=None, description="[mean, standard deviation]")
-    truncated_normal: tuple[Number, Number, Number, Number] | None = Field(
-        default=None, description="[mean, standard deviation, low, high]"
-    )
-    choice: Values | None = Field(default=None, description="one of these values, with equal probability")
-    grid: Values | None = Field(default=None, description="every one of these values, for every sample of other keys")
+    uniform: Pair | None = None
+    """[low, high]"""
+    log_uniform: Pair | None = None
+    """[low, high]; the logarithm is uniformly distributed"""
+    normal: Pair | None = None
+    """[mean, standard deviation]"""
+    truncated_normal: tuple[Number, Number, Number, Number] | None = None
+    """[mean, standard deviation, low, high]"""
+    choice: Values | None = None
+    """one of these values, with equal probability"""
+    grid: Values | None = None
+    """every one of these values, for every sample of other keys"""
 
     @model_validator(mode="before")
     @classmethod

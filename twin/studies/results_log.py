@@ -9,7 +9,7 @@ from collections.abc import Container, Iterator
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -43,7 +43,9 @@ class ResultsLog:
             return
         with self.file.open("a+b", buffering=0) as file:
             begin = file.seek(0, 2)
-            lines = _line_end(file, begin) + "".join(self._unwritten).encode()
+            file.seek(max(begin - 1, 0))
+            is_cut = file.read(1) not in (b"", b"\n")  # the last line, e.g. by a power failure
+            lines = b"\n" * is_cut + "".join(self._unwritten).encode()
             if (file.write(lines) or 0) < len(lines):
                 file.truncate(begin)  # remove the partly written row
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.file))
@@ -94,14 +96,6 @@ class ResultsLog:
 def key_of(row: Row) -> tuple[int, int]:
     """Returns (sample, seed) of the survey of a row."""
     return row["sample"], row["seed"]
-
-
-def _line_end(file: IO[bytes], end: int) -> bytes:
-    """Returns a line break if the file does not end with one, e.g. after a power failure; else an empty string."""
-    if end == 0:
-        return b""
-    file.seek(end - 1)
-    return b"" if file.read(1) == b"\n" else b"\n"
 
 
 def write_parquet(rows: pa.Table, file: Path) -> None:

@@ -31,10 +31,10 @@ DEFAULT_METRICS = (
 class JointValues(Section):
     """Table of keys that vary jointly: each row has one value for every key."""
 
-    keys: Annotated[tuple[str, ...], Field(min_length=1)] = Field(description="dotted keys of the scenario")
-    rows: Annotated[tuple[tuple[Any, ...], ...], Field(min_length=1)] = Field(
-        description="one value per key in each row; all rows have equal probability"
-    )
+    keys: Annotated[tuple[str, ...], Field(min_length=1)]
+    """dotted keys of the scenario"""
+    rows: Annotated[tuple[tuple[Any, ...], ...], Field(min_length=1)]
+    """one value per key in each row; all rows have equal probability"""
 
     @property
     def values(self) -> tuple[tuple[Any, ...], ...]:
@@ -54,101 +54,82 @@ class JointValues(Section):
 class SamplingConfig(Section):
     """Sampling of a study: method, number of samples, and number of seeds per sample."""
 
-    method: SamplingMethod = Field(
-        default="random",
-        description="independent random samples; Latin hypercube; scrambled Sobol points; Saltelli's design, for Sobol "
-        "indices; or a full grid of the listed values",
-    )
-    samples: int | None = Field(
-        default=None,
-        ge=1,
-        le=10_000_000,
-        description="number of samples; each is combined with every cell of the grids; Saltelli's design has "
-        "(axes + 2) times as many",
-    )
-    seeds: int = Field(default=1, ge=1, le=100_000, description="surveys of each sample, each with a different seed")
-    paired: bool = Field(
-        default=True,
-        description="use the same seeds for all samples, so they have the same floor and noise; "
-        "else different seeds for each design point",
-    )
-    seed: int = Field(
-        default=1, ge=0, lt=2**31, description="seed of the sampling; the seeds of the surveys count up from it"
-    )
+    method: SamplingMethod = "random"
+    """independent random samples; Latin hypercube; scrambled Sobol points; Saltelli's design, for Sobol indices; or a
+    full grid of the listed values"""
+    samples: int | None = Field(default=None, ge=1, le=10_000_000)
+    """number of samples; each is combined with every cell of the grids; Saltelli's design has (axes + 2) times as
+    many"""
+    seeds: int = Field(default=1, ge=1, le=100_000)
+    """surveys of each sample, each with a different seed"""
+    paired: bool = True
+    """use the same seeds for all samples, so they have the same floor and noise; else different seeds for each design
+    point"""
+    seed: int = Field(default=1, ge=0, lt=2**31)
+    """seed of the sampling; the seeds of the surveys count up from it"""
 
 
 class TuningConfig(Section):
     """Settings of the search by `twin tune`; each candidate plan is flown with every sample and seed of the study."""
 
-    search: Annotated[dict[str, Distribution], Field(min_length=1)] = Field(
-        description="keys of the scenario to optimise, each with a range (uniform, log_uniform) or values (choice)"
-    )
-    objectives: Annotated[tuple[str, ...], Field(min_length=1, max_length=4)] = Field(
-        description="metrics whose median is optimised, and `risk`, the fraction of surveys that do not pass; the "
-        "first duration among them, else the first one, is the cost: the cheapest Pareto-optimal plan is recommended"
-    )
-    trials: int = Field(default=64, ge=1, le=100_000, description="number of candidates")
-    batch: int = Field(
-        default=8, ge=1, le=1000, description="candidates proposed at a time, from the results of the earlier batches"
-    )
-    confirm: int = Field(
-        default=4, ge=1, le=1000, description="factor on the number of surveys when a finalist is flown with new seeds"
-    )
-    verify: int = Field(
-        default=3,
-        ge=0,
-        le=1000,
-        description="rendered surveys of a plan in each cell of the grids, all of which must pass before the plan is "
-        "recommended, if the search uses the surrogate; 0: the recommended plan is not verified",
-    )
-    plans: int = Field(
-        default=3, ge=1, le=100, description="most plans verified in a round, and cheaper plans at the end"
-    )
-    rounds: int = Field(
-        default=2,
-        ge=0,
-        le=10,
-        description="largest number of further rounds of search while no plan passes in rendered surveys; in these "
-        "rounds the surrogate's results are corrected by those of the rendered surveys",
-    )
-    keep: KeepLevel | None = Field(
-        default=None, description="files to keep of rendered surveys; default: `keep` of the study"
-    )
-    timeout_s: float = Field(
-        default=7200.0, gt=0, le=1e7, description="run time after which a rendered survey counts as failed [s]"
-    )
+    search: Annotated[dict[str, Distribution], Field(min_length=1)]
+    """keys of the scenario to optimise, each with a range (uniform, log_uniform) or values (choice)"""
+    objectives: Annotated[tuple[str, ...], Field(min_length=1, max_length=4)]
+    """metrics whose median is optimised, and `risk`, the fraction of surveys that do not pass; the first duration among
+    them, else the first one, is the cost: the cheapest Pareto-optimal plan is recommended"""
+    trials: int = Field(default=64, ge=1, le=100_000)
+    """number of candidates"""
+    batch: int = Field(default=8, ge=1, le=1000)
+    """candidates proposed at a time, from the results of the earlier batches"""
+    confirm: int = Field(default=4, ge=1, le=1000)
+    """factor on the number of surveys when a finalist is flown with new seeds"""
+    verify: int = Field(default=3, ge=0, le=1000)
+    """rendered surveys of a plan in each cell of the grids, all of which must pass before the plan is recommended, if
+    the search uses the surrogate; 0: the recommended plan is not verified"""
+    plans: int = Field(default=3, ge=1, le=100)
+    """most plans verified in a round, and cheaper plans at the end"""
+    rounds: int = Field(default=2, ge=0, le=10)
+    """largest number of further rounds of search while no plan passes in rendered surveys; in these rounds the
+    surrogate's results are corrected by those of the rendered surveys"""
+    keep: KeepLevel | None = None
+    """files to keep of rendered surveys; default: `keep` of the study"""
+    timeout_s: float = Field(default=7200.0, gt=0, le=1e7)
+    """run time after which a rendered survey counts as failed [s]"""
 
 
 class Study(Section):
     """Monte Carlo study: surveys of one scenario, some of whose keys vary."""
 
-    name: str | None = Field(default=None, min_length=1, max_length=80, description="default: the name of the file")
-    scenario: str = Field(description="the scenario to vary: a path relative to this file, or a name in scenes/")
-    question: str = Field(default="", max_length=200, description="question to answer; a heading of the report")
-    seek: str | None = Field(
-        default=None, description="a varied numeric key: report first where it reaches require.probability"
-    )
-    keep: KeepLevel = Field(default="metrics", description="files to keep of each run")
-    timeout_s: float = Field(
-        default=3600.0, gt=0, le=1e7, description="run time after which a survey counts as failed [s]"
-    )
-    retries: int = Field(default=2, ge=0, le=100, description="retries if the process of a survey was killed")
-    show: tuple[str, ...] = Field(
-        default=DEFAULT_METRICS, description="metrics shown in the report, in addition to those with a limit"
-    )
-    compare: tuple[str, ...] = Field(
-        default=(),
-        description="metrics, never negative, whose values in rendered and surrogate surveys are compared; needs "
-        'vary.imaging.fidelity = { grid = ["rendered", "surrogate"] }',
-    )
-    set: dict[str, Any] = Field(default={}, description="keys of the scenario that have a fixed value in this study")
-    vary: dict[str, Distribution] = Field(default={}, description="distribution of each varied key of the scenario")
-    together: tuple[JointValues, ...] = Field(default=(), description="tables of keys that vary jointly")
+    name: str | None = Field(default=None, min_length=1, max_length=80)
+    """default: the name of the file"""
+    scenario: str
+    """the scenario to vary: a path relative to this file, or a name in scenes/"""
+    question: str = Field(default="", max_length=200)
+    """question to answer; a heading of the report"""
+    seek: str | None = None
+    """a varied numeric key: report first where it reaches require.probability"""
+    keep: KeepLevel = "metrics"
+    """files to keep of each run"""
+    timeout_s: float = Field(default=3600.0, gt=0, le=1e7)
+    """run time after which a survey counts as failed [s]"""
+    retries: int = Field(default=2, ge=0, le=100)
+    """retries if the process of a survey was killed"""
+    show: tuple[str, ...] = DEFAULT_METRICS
+    """metrics shown in the report, in addition to those with a limit"""
+    compare: tuple[str, ...] = ()
+    """metrics, never negative, whose values in rendered and surrogate surveys are compared; needs
+    vary.imaging.fidelity = { grid = ["rendered", "surrogate"] }"""
+    set: dict[str, Any] = {}
+    """keys of the scenario that have a fixed value in this study"""
+    vary: dict[str, Distribution] = {}
+    """distribution of each varied key of the scenario"""
+    together: tuple[JointValues, ...] = ()
+    """tables of keys that vary jointly"""
     sampling: SamplingConfig = SamplingConfig()
-    tune: TuningConfig | None = Field(default=None, description="search of `twin tune`")
-    require: dict[str, float] = Field(
-        default={}, description="limits on metrics of each survey; `probability`: smallest pass probability"
-    )
+    tune: TuningConfig | None = None
+    """search of `twin tune`"""
+    require: dict[str, float] = {}
+    """limits on metrics of each survey; `probability`: smallest pass probability"""
 
     _source: Source = PrivateAttr(default_factory=lambda: Source(path=Path("study")))
 

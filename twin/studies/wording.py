@@ -91,7 +91,10 @@ def headline(analysis: StudyAnalysis) -> str:
     if n == 0:
         return " ".join(["No survey could be evaluated.", *left_out])
     sought = {} if study.seek is None else {study.seek: analysis.answers.get(study.seek)}
-    limits = [f"{metric_name(m)} {limit_relation(m)} {metric_value(m, v)}" for m, v in analysis.limits.items()]
+    limits = [
+        f"{metric_name(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
+        for metric, limit in analysis.limits.items()
+    ]
     completed = "were completed" + (" with " + " and ".join(limits) if limits else "")
     result = (
         f"The pass probability is {confidence(analysis.pass_probability)}: "
@@ -160,11 +163,6 @@ def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
         f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} per minute; "
         f"mean run time {worker_s / surveys:.2f} s"
     )
-
-
-def limit_relation(metric: str) -> str:
-    """Returns "at least" for a metric with a lower limit, "at most" for one with an upper limit."""
-    return "at least" if more_is_better(metric) else "at most"
 
 
 def requirement_verdict(analysis: StudyAnalysis) -> str:

@@ -44,7 +44,8 @@ class Search:
     def __init__(self, study: Study, config: TuningConfig, folder: Path, fingerprint: str, search_round: int = 0):
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self.config, self.seed, self.first_number = config, study.sampling.seed, search_round * ROUND_NUMBERS
-        self.n_trials = further_trials(config) if search_round else config.trials
+        further = max(min(config.batch, config.trials), config.trials // 4)  # candidates of a further round
+        self.n_trials = further if search_round else config.trials
         self.space = {key: _optuna_distribution(distribution) for key, distribution in config.search.items()}
         self.optuna_study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL_FILE))),
@@ -111,11 +112,6 @@ class Search:
 
     def _trials(self) -> list[FrozenTrial]:
         return self.optuna_study.get_trials(deepcopy=False)
-
-
-def further_trials(config: TuningConfig) -> int:
-    """Returns the number of candidates of a further round: a quarter of `trials`, but at least one batch."""
-    return max(min(config.batch, config.trials), config.trials // 4)
 
 
 def _optuna_distribution(distribution: Distribution) -> BaseDistribution:
