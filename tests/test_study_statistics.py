@@ -91,6 +91,16 @@ def test_sobol_indices_of_the_ishigami_function_equal_its_closed_form():
         assert abs(index.total.value - t) < 0.03
 
 
+def test_sobol_indices_are_those_of_scipy_and_their_bounds_the_same_each_time():
+    """The bounds once depended on the state of numpy's global generator."""
+    y = np.random.default_rng(0).standard_normal((4, 1, 16)).cumsum(axis=0)
+    once, again = (statistics.sobol_indices(y.ravel(), 2) for _ in range(2))
+    assert once == again
+    reference = stats.sobol_indices(func={"f_A": y[0], "f_B": y[1], "f_AB": y[2:]}, n=16)
+    for order, values in (("first", reference.first_order), ("total", reference.total_order)):
+        np.testing.assert_allclose([getattr(index, order).value for index in once], np.ravel(values))
+
+
 def test_explained_variance_of_a_sum_is_the_fraction_of_each_term():
     rng = np.random.default_rng(2)
     x, z = rng.random(4000), rng.random(4000)

@@ -206,26 +206,34 @@ class SobolIndex(NamedTuple):
 
 
 def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
-    """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals.
+    """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals of the design points.
 
-    Uses the estimator of `scipy.stats.sobol_indices`. If an interval is not defined, its bounds equal the index.
+    The estimators are those of `scipy.stats.sobol_indices` (Saltelli et al. 2010, Jansen 1999). If an interval is not
+    defined, its bounds equal the index.
 
     Args:
         values: (n (n_axes + 2),) metric at the n design points of each block A, B, AB_1, AB_2, ..., where AB_k is A
             with column k of B (`surveys.design_points`).
     """
-    blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, 1, -1)
-    given: Any = {"f_A": blocks[0], "f_B": blocks[1], "f_AB": blocks[2:]}
-    result: Any = stats.sobol_indices(func=given, n=blocks.shape[-1], rng=np.random.default_rng(0))
+    blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, -1)
+    blocks = blocks - blocks[:2].mean()
+
+    def indices(points: NDArray[np.int64]) -> Array:
+        a, b, mixed = blocks[0, points], blocks[1, points], blocks[2:, points]
+        variance = np.var([a, b])
+        first, total = np.mean(b * (mixed - a), axis=-1), np.mean((a - mixed) ** 2, axis=-1) / 2
+        return np.array([first, total]) / variance
+
+    points = np.arange(blocks.shape[-1])
     with warnings.catch_warnings(action="ignore"):  # an axis without any effect has a variance of 0
-        resampled: Any = result.bootstrap(confidence_level=LEVEL, n_resamples=RESAMPLES)
-
-    def interval(name: str, k: int) -> Interval:
-        value, bounds = float(np.ravel(getattr(result, name))[k]), getattr(resampled, name).confidence_interval
-        low, high = (float(np.ravel(bound)[k]) for bound in bounds)
-        return Interval(value, low, high) if np.isfinite(low) else Interval(value, value, value)
-
-    return [SobolIndex(interval("first_order", k), interval("total_order", k)) for k in range(n_axes)]
+        bounds: Any = stats.bootstrap(
+            (points,), indices, n_resamples=RESAMPLES, vectorized=False, confidence_level=LEVEL,
+            rng=np.random.default_rng(0),
+        ).confidence_interval  # fmt: skip
+    value = indices(points)
+    low, high = (np.where(np.isfinite(bounds.low), bound, value) for bound in bounds)
+    intervals = np.stack([value, low, high], axis=-1).tolist()  # order, axis, field
+    return [SobolIndex(Interval(*first), Interval(*total)) for first, total in zip(*intervals, strict=True)]
 
 
 def group_indices(x: ArrayLike) -> NDArray[np.int64]:
