@@ -96,16 +96,12 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
         self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else 8,), np.float32)
         shape = (self._world.rig.height_px, self._world.rig.width_px, 3)
-        self.observation_space = spaces.Dict(
-            {
-                "left": spaces.Box(0, 255, shape, np.uint8),
-                "right": spaces.Box(0, 255, shape, np.uint8),
-                "readings": spaces.Box(-np.inf, np.inf, (7,), np.float64),
-                "available": spaces.MultiBinary(3),
-                "pose": spaces.Box(-np.inf, np.inf, (7,), np.float64),
-                "reference": spaces.Box(-np.inf, np.inf, (4,), np.float64),
-            }
-        )
+        images = {name: spaces.Box(0, 255, shape, np.uint8) for name in ("left", "right")}
+        numbers = {
+            name: spaces.Box(-np.inf, np.inf, (n,), np.float64)
+            for name, n in (("readings", 7), ("pose", 7), ("reference", 4))
+        }
+        self.observation_space = spaces.Dict({**images, **numbers, "available": spaces.MultiBinary(3)})
 
     @property
     def frames_per_step(self) -> int:
@@ -236,10 +232,5 @@ def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:
     return np.concatenate(filled).astype(np.float64), np.array([part is not None for part in parts], np.int8)
 
 
-def register() -> None:
-    """Registers the environment under its id, if it is not registered yet."""
-    if ENVIRONMENT not in gymnasium.registry:
-        gymnasium.register(ENVIRONMENT, entry_point="twin.gym:SeabedTwinEnv")
-
-
-register()
+if ENVIRONMENT not in gymnasium.registry:
+    gymnasium.register(ENVIRONMENT, entry_point="twin.gym:SeabedTwinEnv")

@@ -10,17 +10,14 @@ from scipy.ndimage import map_coordinates
 
 from twin.core import geometry
 from twin.core.records import Array, ElevationMap, MapGrid, Trajectory, Truth
-from twin.judge.map_error import map_metrics
+from twin.judge.map_error import KEYS, map_metrics
 
 _MOST_STEPS = 20
 _CONVERGED_M = 1e-5
 _LEAST_COSINE = 0.7  # of the angle between the axes of height; a map of a wall is not compared with a height grid
 _ROWS_PER_CALL = 256
 #: Metrics of the map that need to know which cells the cameras saw, which area was asked for or where objects are.
-_UNKNOWN = (
-    "completeness", "completeness_area", "le90_area_m", "floor_median_m", "floor_le90_m", "floor_gross_share",
-    "objects_median_m", "objects_le90_m", "objects_gross_share",
-)  # fmt: skip
+_UNKNOWN = [key for key in KEYS if key.startswith(("completeness", "le90_area", "floor_", "objects_"))]
 
 
 class TrueMap(NamedTuple):

@@ -20,21 +20,34 @@ def metric_warnings(metrics: Mapping[str, Any]) -> list[str]:
 
     One more reports rejected readings of navigation sensors.
     """
-    found = (
-        _out_of_bounds(
-            metrics["consistency"]["nees_position_mean"], nees_bounds(metrics["consistency"]),
-            "The position covariances are {}: the mean NEES is {:.3g}, where 3 is expected and {:.3g} to {:.3g} "
-            "accepted.",
-        ),
-        _out_of_bounds(
-            metrics["map"]["sigma_ratio"], SIGMA_RATIO_BOUNDS,
-            "The sigmas of the map are {}: the RMS of error / sigma is {:.3g}, where 1 is expected and "
-            "{:g} to {:g} accepted.",
-        ),
-        _saturation(metrics["vision"]["saturated_median"]),
-        _rejected(metrics["self_check"]["readings_rejected"]),
-    )  # fmt: skip
-    return [sentence for sentence in found if sentence]
+    nees, sigma_ratio = metrics["consistency"]["nees_position_mean"], metrics["map"]["sigma_ratio"]
+    low, high = nees_bounds(metrics["consistency"])
+    least, most = SIGMA_RATIO_BOUNDS
+    found = []
+    if nees is not None and not low <= nees <= high:
+        found.append(
+            f"The position covariances are {_size(nees, high)}: the mean NEES is {nees:.3g}, where 3 is expected and "
+            f"{low:.3g} to {high:.3g} accepted."
+        )
+    if sigma_ratio is not None and not least <= sigma_ratio <= most:
+        found.append(
+            f"The sigmas of the map are {_size(sigma_ratio, most)}: the RMS of error / sigma is {sigma_ratio:.3g}, "
+            f"where 1 is expected and {least:g} to {most:g} accepted."
+        )
+    if (metrics["vision"]["saturated_median"] or 0.0) > MOST_SATURATED:
+        share, limit = 100 * metrics["vision"]["saturated_median"], 100 * MOST_SATURATED
+        found.append(
+            f"The images are saturated: the median share of saturated values is {share:.3g} % (more than {limit:g} %)."
+        )
+    rejected = metrics["self_check"]["readings_rejected"].items()
+    if texts := [f"{sensor} {count}" for sensor, count in rejected if count]:
+        found.append(f"Readings that contradicted the estimates were not used: {', '.join(texts)}.")
+    return found
+
+
+def _size(value: float, most: float) -> str:
+    """Returns the fault of covariances whose normalised errors are out of bounds."""
+    return "too small" if value > most else "too large"
 
 
 def nees_bounds(consistency: Mapping[str, Any]) -> tuple[float, float]:
@@ -43,24 +56,3 @@ def nees_bounds(consistency: Mapping[str, Any]) -> tuple[float, float]:
     if low is None or high is None:
         return NEES_BOUNDS
     return min(low, NEES_BOUNDS[0]), max(high, NEES_BOUNDS[1])
-
-
-def _out_of_bounds(value: float | None, bounds: tuple[float, float], sentence: str) -> str:
-    """Returns the sentence with "too small" or "too large", the value and the bounds; "" for a value within bounds."""
-    if value is None or bounds[0] <= value <= bounds[1]:
-        return ""
-    return sentence.format("too small" if value > bounds[1] else "too large", value, *bounds)
-
-
-def _saturation(fraction: float | None) -> str:
-    """Returns a warning if the median saturated fraction exceeds `MOST_SATURATED`, else ""."""
-    if fraction is None or fraction <= MOST_SATURATED:
-        return ""
-    share, limit = 100 * fraction, 100 * MOST_SATURATED
-    return f"The images are saturated: the median share of saturated values is {share:.3g} % (more than {limit:g} %)."
-
-
-def _rejected(counts: Mapping[str, int]) -> str:
-    """Returns a warning with the number of rejected readings of each sensor that had any, else ""."""
-    found = ", ".join(f"{sensor} {count}" for sensor, count in counts.items() if count)
-    return f"Readings that contradicted the estimates were not used: {found}." if found else ""

@@ -44,9 +44,8 @@ class RecordedFrames:
     def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):
         self.dataset = dataset
         self.size_px = _usual_size(dataset)
-        self.rectification: Rectification = rectification(
-            calibration.for_images(*self.size_px), _frame_rate_hz(dataset)
-        )
+        sized = calibration.for_images(*self.size_px)
+        self.rectification: Rectification = rectification(sized, _frame_rate_hz(dataset))
         sources = [*(frame.left for frame in dataset.images), *(f.right for f in dataset.images if f.right is not None)]
         self._format = image_format(sources, self.size_px, bayer)
         self._in_order = increasing(np.array([frame.time_s for frame in dataset.images]))
@@ -78,12 +77,8 @@ class RecordedFrames:
         if left is None:
             return None
         right = self._read(images.right, "right")
-        return Frame(
-            index,
-            images.time_s - self.start_s,
-            self.rectification.left(left),
-            None if right is None else self.rectification.right(right),
-        )
+        right = None if right is None else self.rectification.right(right)
+        return Frame(index, images.time_s - self.start_s, self.rectification.left(left), right)
 
     def spread(self, n: int) -> Iterator[Frame]:
         """Yields at most n frames with both images, in the order of time and spread evenly over the data set.
@@ -100,9 +95,7 @@ class RecordedFrames:
     @property
     def unused(self) -> int:
         """Returns the number of frames skipped so far; a frame without a usable right image is not skipped."""
-        return sum(
-            count for reason, count in self.skipped.items() if reason == _OUT_OF_ORDER or reason.startswith("left")
-        )
+        return sum(n for reason, n in self.skipped.items() if reason == _OUT_OF_ORDER or reason.startswith("left"))
 
     def _read(self, image: ImageSource | None, side: str) -> Image | None:
         """Returns an image as RGB; if it cannot be used, adds the reason to `skipped` and returns None."""
@@ -128,12 +121,9 @@ class RecordedFrames:
 
 
 def increasing(times_s: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of a largest set of frames whose times increase in the order of the data set.
+    """Returns a mask (n,) of a largest set of frames whose times (n,) increase in the order of the data set.
 
     The set is a longest increasing subsequence (Schensted 1961), so a single wrong time excludes a single frame.
-
-    Args:
-        times_s: (n,) times of the frames [s].
     """
     ends: list[float] = []  # for each length, the smallest last time of a sequence
     rows: list[int] = []  # and its row

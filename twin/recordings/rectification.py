@@ -22,17 +22,12 @@ _Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
 
 
 class Rectification(NamedTuple):
-    """Conversion of recorded images to a rectified pair.
+    """Conversion of recorded images to a rectified pair."""
 
-    Args:
-        rig: calibration of the rectified pair.
-        left_from_rectified: (4, 4) pose of the rectified left camera in the axes of the recorded one (a rotation).
-        maps: for each camera (left, right), the columns (H, W) and the rows (H, W) at which the recorded image is
-            sampled for the pixels of the rectified image; None if its recorded images are used unchanged.
-    """
-
-    rig: StereoRig
-    left_from_rectified: Array
+    rig: StereoRig  #: calibration of the rectified pair
+    left_from_rectified: Array  #: (4, 4) pose of the rectified left camera in the axes of the recorded one (a rotation)
+    #: for each camera (left, right), the columns (H, W) and the rows (H, W) at which the recorded image is sampled for
+    #: the pixels of the rectified image; None if its recorded images are used unchanged.
     maps: tuple[_Maps | None, _Maps | None]
 
     @property
@@ -125,10 +120,7 @@ def _four(camera: RecordedCamera) -> Array:
 def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
     """Returns the columns (H, W) and the rows (H, W) [px] in the recorded image of the pixels of the rectified image.
 
-    Args:
-        camera: the recorded camera.
-        turn: (3, 3) rotation rectified_from_recorded between the axes of the camera.
-        rig: calibration of the rectified pair.
+    The turn is the rotation rectified_from_recorded (3, 3) between the axes of the camera.
     """
     size = rig.width_px, rig.height_px
     if camera.kind == "fisheye":
@@ -139,10 +131,7 @@ def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
 
 
 def _resampled(image: Image, maps: _Maps | None) -> Image:
-    """Returns the image resampled by cubic interpolation at the columns and rows in `maps`; black outside the image.
-
-    If `maps` is None, the image is returned unchanged.
-    """
+    """Returns the image resampled by cubic interpolation at the columns and rows in `maps`, black outside the image."""
     if maps is None:
         return image
     return np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_CUBIC), np.uint8)

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.reproduce import light_sheet
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+
+from twin.imaging.reference.pixel_light import BatchMean
+from twin.report.figures import log_axis
 from twin.reproduce.daylight_comparison import ALL_DAYLIGHT, QUICK_DAYLIGHT, daylight_cells, daylight_table
-from twin.reproduce.exhibit import Exhibit, Figure, Table, make_table, write_json
+from twin.reproduce.exhibit import Exhibit, Figure, Table, drawn, make_table, write_json
 from twin.reproduce.lamp_comparison import ALL_LAMPS, QUICK_LAMPS, lamp_cells, lamp_table
 from twin.reproduce.light_cell import ALBEDO, MOST_WALKS, LightCell, write_csv
+
+MARKERS = {"leds": "o", "spots": "^"}
+OFFSET_M = 0.08  # horizontal distance between the markers of two pixels at the same height
 
 
 class LightComparison(NamedTuple):
@@ -29,7 +38,7 @@ class LightComparison(NamedTuple):
         rows = write_csv(self.lamps, folder / "light.csv")
         summary = {"schema": "twin.light/1", "band": "green", "albedo": ALBEDO / 255, "cells": rows}
         write_json(folder / "light.json", summary)
-        light_sheet.draw(self.lamps, folder / "light.png")
+        draw(self.lamps, folder / "light.png")
         return summary | {"daylight": write_csv(self.daylight, folder / "daylight.csv")}
 
 
@@ -46,3 +55,75 @@ def run(folder: Path, quick: bool = False) -> Exhibit:
     text = "The light model of the images compared with a Monte Carlo of any order of scattering, green band."
     figure = Figure("light.png", "Light model and Monte Carlo reference; bars: two standard errors.")
     return Exhibit("light", "Light of lamps and sun", text, found.tables, (figure,))
+
+
+def draw(cells: Sequence[LightCell], file: Path) -> None:
+    """Draws the figure to a PNG file."""
+    with drawn(file, 12.0, 7.5) as figure:
+        grid = figure.subplots(2, 2)
+        figure.suptitle(
+            "Light model and Monte Carlo reference, green band; bars: two standard errors of the reference", fontsize=12
+        )
+        _ratios(grid[0, 0], cells, "total light, model / reference", lambda cell: cell.light["total"].ratio)
+        _ratios(grid[0, 1], cells, "veil, reference / model", lambda cell: cell.light["veil"].inverse_ratio)
+        _shares(grid[1, 0], cells)
+        _blur(grid[1, 1], cells)
+
+
+def _series(cells: Sequence[LightCell]) -> list[tuple[str, tuple[float, float, float, float], list[LightCell]]]:
+    """Returns name, colour and cells of each water type."""
+    waters = list(dict.fromkeys(cell.conditions["water"] for cell in cells))
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(waters)))
+    return [
+        (water, tuple(shade), [cell for cell in cells if cell.conditions["water"] == water])
+        for water, shade in zip(waters, shades, strict=True)
+    ]
+
+
+def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[[LightCell], BatchMean]) -> None:
+    for water, colour, own in _series(cells):
+        for lamps, marker in MARKERS.items():
+            chosen = [cell for cell in own if cell.conditions["lamps"] == lamps]
+            found = [value(cell) for cell in chosen]
+            axes.errorbar(
+                [_place_m(cell, chosen) for cell in chosen], [one.value for one in found],
+                yerr=[2 * one.standard_error for one in found], fmt=marker, color=colour, markersize=4,
+                label=water if lamps == "leds" else None,
+            )  # fmt: skip
+    axes.axhline(1.0, color="#9aa8b0", linewidth=1)
+    log_axis(axes.yaxis)
+    axes.set(xlabel="height [m] (one column of markers per pixel)", ylabel=label, title=label)
+    axes.legend(fontsize=7, title="circles: LED lamps\ntriangles: spots", title_fontsize=7, loc="center left",
+                bbox_to_anchor=(1.0, 0.5))  # fmt: skip
+
+
+def _place_m(cell: LightCell, cells: Sequence[LightCell]) -> float:
+    """Returns the abscissa of a cell [m]: the camera height, shifted for each pixel so that markers do not overlap."""
+    pixels = [(one.conditions["column_px"], one.conditions["row_px"]) for one in (*cells, cell)]
+    return cell.conditions["height_m"] + OFFSET_M * list(dict.fromkeys(pixels)).index(pixels[-1])
+
+
+def _shares(axes: Axes, cells: Sequence[LightCell]) -> None:
+    for _, colour, own in _series(cells):
+        for cell in own:
+            model, truth = cell.light["sharp_share"][:2]
+            marker = MARKERS[cell.conditions["lamps"]]
+            axes.errorbar(truth.value, model, xerr=2 * truth.standard_error, fmt=marker, color=colour, markersize=4)
+    axes.plot([0, 1], [0, 1], color="#9aa8b0", linewidth=1)
+    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="reference", ylabel="model", title="share of unscattered light")
+
+
+def _blur(axes: Axes, cells: Sequence[LightCell]) -> None:
+    for _, colour, own in _series(cells):
+        for cell in own:
+            for name, fill in (("blur_near", "full"), ("blur_far", "none")):
+                model, truth = cell.light[name][:2]
+                marker = MARKERS[cell.conditions["lamps"]]
+                axes.plot(truth.value, model, marker, color=colour, markersize=4, fillstyle=fill)
+    axes.plot([1e-3, 1], [1e-3, 1], color="#9aa8b0", linewidth=1)
+    axes.set(
+        xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="reference", ylabel="model",
+        title="blur: share within 2 px (full), beyond 40 px (open)",
+    )  # fmt: skip
+    log_axis(axes.xaxis)
+    log_axis(axes.yaxis)

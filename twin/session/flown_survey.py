@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
+import numpy as np
+
+from twin.core.ortho_tiles import mean_colours, window
 from twin.core.quality import ActionTimes, Finding
 from twin.core.records import ElevationMap, SurveyResult, Truth
 from twin.judge.metrics import EvaluationInput
+from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.plugin.navigator import NOTE
 from twin.report.run_writer import PlannedTruth, SurveyRecord
 from twin.scenario.idealisations import idealisations
 from twin.scenario.model import Scenario
 from twin.session.conclusion import Estimation, Maps
 from twin.session.survey_check import calibration_notes, survey_findings
-from twin.session.survey_orthomosaic import is_wanted, make_orthomosaic
 from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Mission
 
@@ -29,10 +33,12 @@ class FlownSurvey:
     actions: ActionTimes  #: durations for which the mission slowed and stopped the vehicle
 
     def maps(self, estimation: Estimation, result: SurveyResult) -> Maps:
-        """Builds the elevation map and, if it is wanted, the orthomosaic."""
+        """Builds the elevation map and, if maps are written or it is judged, the orthomosaic of the scenario."""
         with estimation.stopwatch("map"):
             elevation = estimation.build_map(result, self.mission.grid)
-        if elevation is None or not is_wanted(self.mission, estimation.folder):
+        scenario = self.mission.scenario
+        required = any(name.startswith("orthomosaic.") for name in scenario.require)
+        if elevation is None or not (scenario.map.orthomosaic and (estimation.folder.writes_maps or required)):
             return Maps(elevation)
         guard = estimation.guard
 
@@ -92,3 +98,48 @@ def plugin_notes(scenario: Scenario) -> list[str]:
         (scenario.estimate.plugin, NOTE),
     )
     return [note.format(name) for name, note in notes if name is not None]
+
+
+def make_orthomosaic(
+    mission: Mission, truth: Truth, estimation: Estimation, result: SurveyResult, elevation: ElevationMap
+) -> Maps | None:
+    """Makes the orthomosaic of a survey, writes it if the run folder keeps maps, and compares it with the truth.
+
+    The orthomosaic is made from the images, the estimated poses and map, and, for the restoration of colours, from the
+    lamps and the water of the scenario. The true albedo is used for the comparison only.
+
+    Returns:
+        The elevation map with the orthomosaic averaged to its cells, and the errors of the orthomosaic; None without
+        images or mapped cells.
+
+    Raises:
+        OSError: the file could not be written, or an image could not be read.
+    """
+    stopwatch, folder, restored = estimation.stopwatch, estimation.folder, mission.scenario.map.restore
+    if not np.isfinite(elevation.height_m).any():
+        return None
+    with stopwatch("orthomosaic"):
+        restore = None
+        if restored:
+            from twin.imaging.restoration import Restoration  # imported here: others do not need its tables
+
+            restore = Restoration(mission.scenario, mission.illumination, mission.rig, elevation)
+        report = partial(estimation.progress, "orthomosaic")
+        tiles = estimation.navigator.orthomosaic(result, elevation, restore, report) or iter(())
+        first = tile = next(tiles, None)
+    if first is None:
+        return None
+    judge, mosaic = OrthomosaicJudge(restored), np.zeros_like(elevation.mosaic)
+    n = round(elevation.grid.cell_m / first.grid.cell_m)
+    with folder.orthomosaic_file(first.grid, mission.terrain.georeference) as file:
+        while tile is not None:
+            colours, row, col = mean_colours(tile, n), tile.row // n, tile.col // n
+            mosaic[row : row + len(colours), col : col + colours.shape[1]] = colours
+            if truth.albedo is not None and truth.in_area is not None:
+                part = window(tile.grid, tile.row, tile.col, *tile.rgba.shape[:2])
+                judge.add(tile, truth.albedo(part), truth.in_area(*np.meshgrid(*part.centres())))
+            with stopwatch("orthomosaic"):
+                if file is not None:
+                    file.write(tile)
+                tile = next(tiles, None)
+    return Maps(replace(elevation, mosaic=mosaic), judge.metrics())

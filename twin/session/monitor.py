@@ -23,21 +23,13 @@ _MAX_SIGMA = 0.5  # largest ratio of position sigma to shorter side of the footp
 
 
 class SurveyProgress(NamedTuple):
-    """Progress of a survey.
-
-    Args:
-        simulated_s, wall_s: simulated time (0 after the flight) and wall time [s].
-        share: completed fraction of `stage`, 0 to 1.
-        sigma_m: standard deviation of the online position, root of the sum of the three variances [m]; 0 after the
-            flight.
-        stage: current stage, "survey", "map", "orthomosaic" or "report".
-    """
+    """Progress of a survey; simulated time and sigma are 0 after the flight."""
 
     simulated_s: float
     wall_s: float
-    share: float
-    sigma_m: float
-    stage: str
+    share: float  #: completed fraction of `stage`, 0 to 1
+    sigma_m: float  #: standard deviation of the online position, root of the sum of the three variances
+    stage: str  #: current stage, "survey", "map", "orthomosaic" or "report"
 
 
 class SurveyMonitor:

@@ -51,7 +51,6 @@ class SteppedWorld:
     def __init__(self, scenario: Scenario):
         self._mission = prepare(scenario)
         self._open = ExitStack()
-        self._world: World | None = None
         self._flight: Flight | None = None
         self._stopwatch = Stopwatch()
 
@@ -63,7 +62,7 @@ class SteppedWorld:
 
     def close(self) -> None:
         """Ends the flight: closes its estimators and releases the OpenGL context; `reset` can start another flight."""
-        self._world = self._flight = None
+        self._flight = None
         self._open.close()
 
     def reset(self, seed: int | None = None) -> Frame:
@@ -83,8 +82,8 @@ class SteppedWorld:
         if seed is not None and seed != scenario.seed:
             self._mission = prepare(scenario.model_copy(update={"seed": seed}))
         self._stopwatch = Stopwatch()
-        self._world = self._open.enter_context(open_world(self._mission, self._stopwatch))
-        self._flight = Flight(self._mission, self._world)
+        world = self._open.enter_context(open_world(self._mission, self._stopwatch))
+        self._flight = Flight(self._mission, world)
         return self._flight.start()
 
     def step(self, command: Array, pace: Pace = FULL, keyframe: bool | None = None) -> Frame | None:
@@ -143,11 +142,9 @@ class SteppedWorld:
             TwinError: the plug-in that the scenario names cannot be loaded.
         """
         steer, flight = make_pilot(self._mission), self.flight
-
-        def command(estimate: Estimate, frame: Frame) -> Array:
-            return steer(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
-
-        return command
+        return lambda estimate, frame: steer(
+            without_feedback(estimate, flight.reference, frame.readings), flight.reference
+        )
 
     def actions(self) -> MissionActions:
         """Returns the actions in poor visibility: a function from an estimate to the pace towards the next frame."""
@@ -166,9 +163,7 @@ class SteppedWorld:
     @property
     def world(self) -> World:
         """Returns the simulated world of the flight. Raises RuntimeError before `reset`."""
-        if self._world is None:
-            raise RuntimeError("call reset first")
-        return self._world
+        return self.flight.world
 
     @property
     def flight(self) -> Flight:

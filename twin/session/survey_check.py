@@ -22,11 +22,7 @@ def survey_findings(
 ) -> list[Finding]:
     """Returns the findings of all checks, each a reason not to trust the survey; empty if the survey passes.
 
-    Args:
-        mission: the survey as planned.
-        result: output of the estimators.
-        elevation: elevation map; None if none was built.
-        reference_m: (n, 3) planned positions of the left camera at the frames [m].
+    The planned positions (n, 3) are those of the left camera at the frames [m].
     """
     found = check_survey(result, mission.rig, elevation)
     return [*found, *_off_course(mission, result, reference_m), *_area(mission, elevation)]
