@@ -10,7 +10,6 @@ from twin.core.ortho_tiles import OrthoTile, finer_grid
 from twin.core.records import ElevationMap, MapGrid, Readings, Trajectory
 from twin.datasets.run_contents import RecordedFrame, RunContents
 from twin.exchange.geotiff import OrthomosaicFile
-from twin.exports.camera_models import believed_calibration
 
 GRID = MapGrid(-1.0, 2.0, 0.05, 30, 44)
 RED_CORNER = (0.25, 0.25)  # size [m] of the red patch in the north-west corner of the orthomosaic
@@ -52,10 +51,9 @@ def write_orthomosaic(path: Path, georeference=None) -> Path:
 def contents(folder: Path, **changed) -> RunContents:
     """Returns a run with a map; `changed` replaces fields."""
     rig = recorded.RIG
-    calibration = believed_calibration(rig)
     given = {
-        "folder": folder, "name": "small", "scenario": {}, "rig": rig, "believed": calibration, "true": None,
-        "trajectories": {"final": Trajectory(np.zeros(1), np.eye(4)[None])}, "keyframe_rows": np.zeros(1, np.int64),
+        "folder": folder, "name": "small", "scenario": {}, "rig": rig, "true": None,
+        "trajectories": {"final": Trajectory(np.zeros(1), np.eye(4)[None])},
         "elevation": elevation(),
     }  # fmt: skip
     return RunContents(**(given | changed))

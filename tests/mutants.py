@@ -128,7 +128,7 @@ MUTANTS = [
         ("twin/report/verdict.py", "'at least' if more_is_better(name) else 'at most'", "'at most' if more_is_better(name) else 'at least'", "report_verdict"),
         # data sets, surrogate's fit, studies, app, reproduction
         ("twin/recordings/recorded_aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),
-        ("twin/datasets/sensor_folders.py", "times_s, values = table.values[:, 0] * 1e-9,", "times_s, values = table.values[:, 0] * 1e-6,", "datasets_readings"),
+        ("twin/datasets/sensor_folders.py", "times_s, values = table[:, 0] * 1e-9,", "times_s, values = table[:, 0] * 1e-6,", "datasets_readings"),
         ("twin/studies/statistics.py", "centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)", "centre = (p + z**2 / n) / (1 + z**2 / n)", "study_statistics"),
         ("twin/studies/surveys.py", "0 if plan.paired else sample.point * plan.seeds", "sample.point * plan.seeds if plan.paired else 0", "study_sampling study_runner"),
         ("twin/studies/agreement.py", "within = 1 / (1 + MEDIAN_LIMIT) <= self.ratio.value", "within = 1 - MEDIAN_LIMIT <= self.ratio.value", "study_agreement"),

@@ -9,6 +9,8 @@ import yaml
 
 from twin.core import geometry
 from twin.core.records import Frame, StereoRig, Trajectory
+from twin.datasets import euroc
+from twin.datasets.run_contents import RecordedFrame, RunContents
 
 _BODY_FROM_CAMERA = geometry.pose(np.eye(3), np.array([0.1, 0, 0]))
 RIG = StereoRig(240, 180, float(120 / np.tan(np.deg2rad(30))), 0.15, 5.0, _BODY_FROM_CAMERA)
@@ -43,6 +45,21 @@ def frames(path: np.ndarray, rig: StereoRig = RIG, noise: float = 1.5) -> list[F
 def trajectory(path: np.ndarray, rig: StereoRig = RIG) -> Trajectory:
     """Returns the true trajectory of `frames`."""
     return Trajectory(np.arange(len(path)) / rig.frame_rate_hz, path)
+
+
+def write_euroc(folder: Path, given: list[Frame], path: np.ndarray) -> Path:
+    """Writes frames and the true poses (n, 4, 4) of the left camera as an EuRoC folder."""
+    images, listed = folder.with_name(f"{folder.name}-images"), []
+    images.mkdir(parents=True)
+    for frame in given:
+        files = {"left": images / f"{frame.index}_left.png", "right": images / f"{frame.index}_right.png"}
+        for side, file in files.items():
+            if getattr(frame, side) is not None:
+                cv2.imwrite(str(file), getattr(frame, side)[..., ::-1])
+        right = None if frame.right is None else files["right"]
+        listed.append(RecordedFrame(frame.index, frame.time_s, files["left"], right, False))
+    euroc.export(RunContents(folder, folder.name, {}, RIG, None, {"truth": trajectory(path)}, tuple(listed)), folder)
+    return folder
 
 
 def write_folder(folder: Path, given: list[Frame], swapped: bool = False) -> Path:

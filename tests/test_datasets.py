@@ -22,7 +22,6 @@ from twin.datasets import image_files
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.dataset import Dataset, ImageTime, StereoImages, pair_by_time
-from twin.datasets.euroc import EurocWriter
 from twin.datasets.image_files import ImageFormat, UnreadableImage, image_format, image_size, read_rgb
 from twin.datasets.readers import read_dataset
 from twin.datasets.truth_files import read_truth
@@ -48,11 +47,7 @@ def frames_of(n):
 
 @pytest.fixture
 def euroc(tmp_path):
-    writer = EurocWriter(tmp_path / "set", RIG)
-    for frame in frames_of(4):
-        writer.add(frame)
-    writer.add_truth(recorded.trajectory(recorded.poses(4)))
-    return tmp_path / "set"
+    return recorded.write_euroc(tmp_path / "set", frames_of(4), recorded.poses(4))
 
 
 def test_images_of_unequal_times_are_paired_with_the_nearest_one():

@@ -19,9 +19,8 @@ from twin.core import geometry
 from twin.datasets.image_files import UnreadableImage
 from twin.datasets.ros2 import bag as bag_module
 from twin.datasets.ros2.bag import Bag
-from twin.datasets.ros2.bag_images import raw_pixels
+from twin.datasets.ros2.bag_images import image_topics, raw_pixels, stereo_topics
 from twin.datasets.ros2.bag_reader import BagReader, BagTopics
-from twin.datasets.ros2.bag_topics import image_topics, stereo_topics
 from twin.datasets.ros2.camera_info import stereo_calibration
 from twin.errors import TwinError
 from twin.recordings.frames import RecordedFrames

@@ -19,7 +19,6 @@ import twin
 from twin.core import geometry
 from twin.core.records import MapGrid, Trajectory
 from twin.datasets import readers
-from twin.datasets.euroc import EurocWriter
 from twin.errors import TwinError
 from twin.estimate.first_pair import floor_plane, inspect_pair
 from twin.exchange.geotiff import write_elevations
@@ -43,12 +42,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def euroc(frames, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("euroc")
-    writer = EurocWriter(folder, RIG)
-    for frame in frames:
-        writer.add(frame)
-    writer.add_truth(recorded.trajectory(PATH))
-    return folder
+    return recorded.write_euroc(tmp_path_factory.mktemp("euroc"), frames, PATH)
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from twin.core import geometry
 from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, ImuReadings, MapGrid, Readings, StereoRig, Trajectory
 from twin.datasets import calibration_files, colmap, euroc, kitti, tum
+from twin.datasets.calibration import rectified_calibration
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.readers import read_dataset
 from twin.datasets.run_contents import ImuNoise, RecordedFrame, RecordedImu, RunContents
@@ -24,7 +25,7 @@ from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exports import ifdo, metashape, nerfstudio
 from twin.exports.attitude import yaw_pitch_roll_deg
-from twin.exports.camera_models import believed_calibration, true_calibration
+from twin.exports.camera_models import true_calibration
 from twin.exports.formats import FORMATS, check_needs, chosen_formats
 from twin.scenario.model import Scenario
 
@@ -65,13 +66,12 @@ def contents(tmp_path):
     )
     path = Trajectory(np.arange(N) / 5.0, poses())
     shifted = Trajectory(path.times_s, geometry.pose(np.eye(3), np.array([0.01, 0, 0])) @ poses())
-    believed = believed_calibration(RIG)
+    believed = rectified_calibration(RIG)
     pose = geometry.pose(geometry.so3_exp(np.array([0.01, 0.02, -0.01])), np.array([0.121, 0, 0]))
     left = replace(believed.left, distortion=np.array([0.05, -0.02, 0.001, -0.002, 0.003]))
     true = replace(believed, left=left, right_from_left=geometry.inverse(pose))
     return RunContents(
-        tmp_path, "run", {"name": "run"}, RIG, believed, true, {"truth": path, "final": shifted},
-        np.array([0, 2, 4]), tuple(frames), elevation,
+        tmp_path, "run", {"name": "run"}, RIG, true, {"truth": path, "final": shifted}, tuple(frames), elevation,
     )  # fmt: skip
 
 
@@ -332,7 +332,7 @@ def test_the_model_of_the_fit_is_that_of_opencv():
     points = rng.uniform([-1, -1, 1], [1, 1, 3], (20, 3))
     distortion, matrix = np.array([0.1, -0.05, 0.01, -0.02, 0.03]), RIG.matrix
     expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)[0][:, 0]
-    camera = replace(believed_calibration(RIG).left, distortion=distortion)
+    camera = replace(rectified_calibration(RIG).left, distortion=distortion)
     np.testing.assert_allclose(camera.project(points), expected, atol=1e-9)
 
 

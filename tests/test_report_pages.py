@@ -19,7 +19,6 @@ from matplotlib.backends.backend_agg import RendererAgg
 from study_surveys import STUDY, fly, study_of
 
 import twin
-from twin.datasets.euroc import EurocWriter
 from twin.recordings.replay import ReplayOptions
 from twin.report import comparison, survey_page
 from twin.reproduce.exhibit import PAGE_FILE, read_all, write_all
@@ -82,10 +81,7 @@ def survey(folder):
 
 def replay(folder):
     path = recorded.poses(10)
-    writer = EurocWriter(folder, recorded.RIG)
-    for frame in recorded.frames(path):
-        writer.add(frame)
-    writer.add_truth(recorded.trajectory(path))
+    recorded.write_euroc(folder, recorded.frames(path), path)
     return survey_page.write_report(twin.replay(folder, folder / "run", ReplayOptions(outputs=())).folder)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.records import StereoRig
 from twin.errors import TwinError
 
 _MOST_PX = 16384  # largest side of an image
@@ -82,6 +83,12 @@ class StereoCalibration:
             if fault := _misfit(name, camera, size):
                 raise TwinError(str(self.file), *fault)
         return replace(self, left=replace(self.left, size_px=size), right=replace(self.right, size_px=size))
+
+
+def rectified_calibration(rig: StereoRig) -> StereoCalibration:
+    """Returns the calibration of rectified images: two equal pinhole cameras without distortion."""
+    camera = RecordedCamera((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
+    return StereoCalibration(camera, camera, geometry.inverse(rig.left_from_right))
 
 
 def _misfit(name: str, camera: RecordedCamera, size: tuple[int, int]) -> tuple[str, str] | None:

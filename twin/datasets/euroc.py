@@ -10,17 +10,16 @@ import re
 import shutil
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Frame, StereoRig, Trajectory
+from twin.core.records import StereoRig, Trajectory
 from twin.datasets.calibration import StereoCalibration, checked, is_rigid
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, trajectory_of, value_or_error
 from twin.datasets.image_copy import copy_image
 from twin.datasets.kalibr import camera_of, pose_of
-from twin.datasets.run_contents import RecordedFrame, RunContents
+from twin.datasets.run_contents import RunContents
 from twin.datasets.sensor_folders import pose_table, read_folder, timestamp_ns, write_csv, write_readings, write_sensor
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
@@ -122,65 +121,6 @@ def _body_from_left(root: Path) -> Array | None:
     return geometry.nearest_rigid(pose)
 
 
-class EurocWriter:
-    """Writes mav0 in a folder: the calibration of rectified images at once, then frames one by one, and the truth.
-
-    All methods raise OSError if a file cannot be written; images are PNG or, with a quality (1 to 100), JPEG.
-    """
-
-    def __init__(self, folder: Path, rig: StereoRig, jpeg_quality: int | None = None):
-        self.root, self._rig, self._quality = folder / "mav0", rig, jpeg_quality
-        for camera, pose in zip(_CAMERAS, (np.eye(4), rig.left_from_right), strict=True):
-            (self.root / camera / "data").mkdir(parents=True, exist_ok=True)
-            write_csv(self.root / camera, "filename", [])
-            tree = {
-                "sensor_type": "camera",
-                "T_BS": pose_table(rig.body_from_camera @ pose),
-                "rate_hz": float(rig.frame_rate_hz),
-                "resolution": [rig.width_px, rig.height_px],
-                "camera_model": "pinhole",
-                "intrinsics": [float(value) for value in (rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px)],
-                "distortion_model": "radial-tangential",
-                "distortion_coefficients": [0.0] * 4,
-            }
-            write_sensor(self.root / camera, tree)
-
-    def add(self, frame: Frame) -> None:
-        """Writes the images of a frame and adds them to the lists of images; the right image may be missing."""
-        suffix = ".png" if self._quality is None else ".jpg"
-        options = [] if self._quality is None else [cv2.IMWRITE_JPEG_QUALITY, self._quality]
-        for camera, image in zip(_CAMERAS, (frame.left, frame.right), strict=True):
-            if image is not None:
-                name = f"{timestamp_ns(frame.time_s)}{suffix}"
-                if not cv2.imwrite(str(self.root / camera / "data" / name), image[..., ::-1], options):
-                    raise OSError(f"{name} cannot be written")
-                self._list(camera, frame.time_s, name)
-
-    def add_recorded(self, frame: RecordedFrame) -> None:
-        """Copies the image files of a recorded frame; raises TwinError if one is truncated or not a PNG image."""
-        for camera, file in zip(_CAMERAS, (frame.left, frame.right), strict=True):
-            if file is not None:
-                stem = self.root / camera / "data" / str(timestamp_ns(frame.time_s))
-                self._list(camera, frame.time_s, copy_image(file, stem, self._quality).name)
-
-    def _list(self, camera: str, time_s: float, name: str) -> None:
-        with (self.root / camera / "data.csv").open("a", encoding="utf-8") as file:
-            file.write(f"{timestamp_ns(time_s)},{name}\n")
-
-    def add_truth(self, truth: Trajectory, true_map: Path | None = None) -> None:
-        """Writes the poses of the body, given the true trajectory of the left camera, and copies the true heights."""
-        folder = self.root / _TRUTH[0]
-        folder.mkdir(exist_ok=True)
-        world_from_body = truth.world_from_camera @ geometry.inverse(self._rig.body_from_camera)
-        lines = []
-        for time_s, pose in zip(truth.times_s, world_from_body, strict=True):
-            values = [*pose[:3, 3], *geometry.quaternion_wxyz(pose[:3, :3])]
-            lines.append(",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in values)]))
-        write_csv(folder, "x [m],y [m],z [m],qw [],qx [],qy [],qz []", lines)
-        if true_map is not None:
-            shutil.copyfile(true_map, folder / _TRUE_MAP)
-
-
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes images, calibration, readings and the truth, if known, to `folder`/mav0, and returns [`folder`/mav0].
 
@@ -188,11 +128,49 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     as far as they were recorded. The truth consists of the poses of the body at all frames of the survey, including
     those without a recorded image, and of the true heights (dem_truth.tif), if the run has them.
     """
-    writer = EurocWriter(folder, contents.rig, contents.jpeg_quality)
+    root, rig = folder / "mav0", contents.rig
+    _write_camera(root / "cam0", rig, rig.body_from_camera)
+    _write_camera(root / "cam1", rig, rig.body_from_camera @ rig.left_from_right)
+    lists: dict[str, list[str]] = {camera: [] for camera in _CAMERAS}
     for k, frame in enumerate(contents.frames):
-        writer.add_recorded(frame)
+        stamp = str(timestamp_ns(frame.time_s))
+        for camera, file in zip(_CAMERAS, (frame.left, frame.right), strict=True):
+            if file is not None:
+                copied = copy_image(file, root / camera / "data" / stamp, contents.jpeg_quality)
+                lists[camera].append(f"{stamp},{copied.name}")
         contents.progress((k + 1) / len(contents.frames))
+    for camera, lines in lists.items():
+        write_csv(root / camera, "filename", lines)
     if "truth" in contents.trajectories:
-        writer.add_truth(contents.trajectories["truth"], contents.true_map)
-    write_readings(writer.root, contents)
-    return [writer.root]
+        _write_truth(root / _TRUTH[0], contents)
+    write_readings(root, contents)
+    return [root]
+
+
+def _write_camera(folder: Path, rig: StereoRig, body_from_camera: Array) -> None:
+    """Creates the folder of a camera of rectified images with its calibration."""
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    tree = {
+        "sensor_type": "camera",
+        "T_BS": pose_table(body_from_camera),
+        "rate_hz": float(rig.frame_rate_hz),
+        "resolution": [rig.width_px, rig.height_px],
+        "camera_model": "pinhole",
+        "intrinsics": [float(value) for value in (rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px)],
+        "distortion_model": "radial-tangential",
+        "distortion_coefficients": [0.0] * 4,
+    }
+    write_sensor(folder, tree)
+
+
+def _write_truth(folder: Path, contents: RunContents) -> None:
+    """Writes the true poses of the body, and the true heights, if the run has them."""
+    folder.mkdir(exist_ok=True)
+    truth, lines = contents.trajectories["truth"], []
+    world_from_body = truth.world_from_camera @ geometry.inverse(contents.rig.body_from_camera)
+    for time_s, pose in zip(truth.times_s, world_from_body, strict=True):
+        values = [*pose[:3, 3], *geometry.quaternion_wxyz(pose[:3, :3])]
+        lines.append(",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in values)]))
+    write_csv(folder, "x [m],y [m],z [m],qw [],qx [],qy [],qz []", lines)
+    if contents.true_map is not None:
+        shutil.copyfile(contents.true_map, folder / _TRUE_MAP)

@@ -1,4 +1,4 @@
-"""Recorded readings of navigation sensors: pressure, attitude, Doppler velocity log (DVL), IMU; and their checks."""
+"""Recorded readings of navigation sensors (pressure, attitude, DVL, IMU): their checks, and the vertical by an IMU."""
 
 from __future__ import annotations
 
@@ -8,10 +8,16 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
+from twin.core.records import ImuReadings
 from twin.errors import TwinError
+from twin.estimate.navigation.vertical import GRAVITY_MPS2, InertialNoise, verticals
 
 #: Smallest and largest allowed standard deviation of a reading, as fractions of the largest allowed value.
 _SIGMA_SHARES = 1e-12, 1e6
+
+#: Standard deviation of the bias of an accelerometer that states none [m/s2]: 20 mg, as of small MEMS sensors.
+USUAL_BIAS_MPS2 = 0.2
+_MOST_OFF = 0.15  # largest relative difference of the mean specific force from gravity
 
 
 class SensorQuantity(NamedTuple):
@@ -45,7 +51,7 @@ class RecordedReadings(NamedTuple):
     height: SensorSeries | None = None  #: heights of the left camera above a plane whose level may be unknown [m]
     attitude: SensorSeries | None = None  #: roll, pitch and yaw of the body in a world whose z axis points up [rad]
     velocity: SensorSeries | None = None  #: velocities of the origin of the body over ground, in body axes [m/s]
-    #: unit vectors that point upwards, in body axes, with one standard deviation [rad] (`inertial.vertical_series`);
+    #: unit vectors that point upwards, in body axes, with one standard deviation [rad] (`vertical_series`);
     #: None if there is an attitude.
     vertical: SensorSeries | None = None
     notes: tuple[str, ...] = ()  #: sentences on readings that are not used, and on assumptions about their times
@@ -105,3 +111,36 @@ def _fault(quantity: SensorQuantity, series: SensorSeries) -> tuple[int | None, 
         problem = f"the standard deviations of the {quantity.name} are {shown}"
         return None, problem, f"positive numbers, {low:g} to {high:g} {quantity.unit}"
     return None
+
+
+def vertical_series(
+    source: str,
+    inertial: SensorSeries,
+    body_from_sensor: Array,
+    noise: InertialNoise,
+    bias_mps2: float,
+    notes: list[str],
+) -> SensorSeries | None:
+    """Returns the direction of the vertical in body axes (unit vectors that point upwards) and its standard deviation.
+
+    The standard deviation [rad] is that about each perpendicular axis: the RMS of that of `verticals` and, on top of
+    it, the error due to the bias of the accelerometer. If the mean specific force differs from gravity by more than
+    15 %, the result is None, and a note says so.
+
+    Args:
+        source: topic or folder of the IMU, for notes.
+        inertial: (n, 6) angular rates [rad/s] and specific forces [m/s2] in the axes of the IMU.
+        turn: (3, 3) rotation of these axes in the body.
+        bias_mps2: standard deviation of the bias of each specific force.
+    """
+    rates, forces = inertial.values[:, :3], inertial.values[:, 3:]
+    mean_mps2 = float(np.linalg.norm(forces, axis=1).mean())
+    if abs(mean_mps2 / GRAVITY_MPS2 - 1) > _MOST_OFF:
+        notes.append(
+            f"The readings of {source} are not used: their mean specific force is {mean_mps2:.3g} m/s2, that of "
+            f"gravity is {GRAVITY_MPS2} m/s2."
+        )
+        return None
+    up, sigma_rad = verticals(ImuReadings(inertial.times_s, rates, forces), noise)
+    sigma = float(np.hypot(np.sqrt(np.mean(sigma_rad**2)), bias_mps2 / GRAVITY_MPS2))
+    return SensorSeries(inertial.times_s, up @ body_from_sensor.T, np.array([sigma]))

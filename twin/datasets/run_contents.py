@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from twin.core.georeference import Georeference
 from twin.core.records import ElevationMap, Exposure, Image, ImuReadings, Readings, StereoRig, Trajectory
-from twin.datasets.calibration import StereoCalibration
+from twin.datasets.calibration import StereoCalibration, rectified_calibration
 
 #: Names of the trajectories that give the poses of exported images; the first one that a run has is used.
 POSES = ("truth", "final")
@@ -103,10 +103,8 @@ class RunContents:
     name: str  #: name of the run
     scenario: Mapping[str, Any]  #: contents of scenario.resolved.toml
     rig: StereoRig  #: believed calibration, with which the images were rectified
-    believed: StereoCalibration  #: the same calibration as camera models
     true: StereoCalibration | None  #: true calibration of the delivered images; None if not known (recorded data)
     trajectories: Mapping[str, Trajectory]  #: those of "truth", "f2f", "online", "final" and "reference" that exist
-    keyframe_rows: NDArray[np.int64]  #: (n_keyframes,) row of each keyframe in the trajectories
     frames: tuple[RecordedFrame, ...] = ()  #: recorded frames in the order of time; empty if no images were kept
     elevation: ElevationMap | None = None  #: map with sigma and the colours of the orthomosaic at its cells
     #: (rows, cols) estimated minus true elevation at the cells of the map, NaN where unknown; None without a true map.
@@ -127,6 +125,11 @@ class RunContents:
     def pairs(self) -> tuple[RecordedFrame, ...]:
         """Returns the recorded frames that have a right image."""
         return tuple(frame for frame in self.frames if frame.right is not None)
+
+    @property
+    def believed(self) -> StereoCalibration:
+        """Returns the believed calibration as camera models."""
+        return rectified_calibration(self.rig)
 
     @property
     def best_calibration(self) -> StereoCalibration:

@@ -14,19 +14,9 @@ import numpy as np
 import yaml
 
 from twin.core.geometry import Array
-from twin.datasets.inertial import USUAL_BIAS_MPS2, InertialErrorModel, vertical_series
+from twin.datasets import readings
 from twin.datasets.kalibr import pose_of
-from twin.datasets.readings import (
-    ATTITUDE,
-    HEIGHT,
-    INERTIAL,
-    VELOCITY,
-    RecordedReadings,
-    SensorQuantity,
-    SensorSeries,
-    UncheckedReadings,
-    checked_series,
-)
+from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries, UncheckedReadings
 from twin.datasets.run_contents import RecordedImu, RunContents
 from twin.datasets.text_files import read_numbered_table, read_yaml
 from twin.errors import TwinError
@@ -71,8 +61,9 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
         TwinError: a file is damaged, or a value is impossible.
     """
     notes: list[str] = []
-    height, attitude, velocity = (_read_sensor(root / one.folder, one, notes) for one in (HEIGHT, ATTITUDE, VELOCITY))
-    vertical = None if attitude is not None else _read_vertical(root / INERTIAL.folder, notes)
+    quantities = (readings.HEIGHT, readings.ATTITUDE, readings.VELOCITY)
+    height, attitude, velocity = (_read_sensor(root / one.folder, one, notes) for one in quantities)
+    vertical = None if attitude is not None else _read_vertical(root / readings.INERTIAL.folder, notes)
     if not notes and height is attitude is velocity is vertical is None:
         return None
     return RecordedReadings(body_from_left, height, attitude, velocity, vertical, tuple(notes))
@@ -89,10 +80,10 @@ def _read_sensor(folder: Path, quantity: SensorQuantity, notes: list[str]) -> Se
 
 
 def _read_csv(file: Path, quantity: SensorQuantity, sigmas: Array, notes: list[str]) -> SensorSeries | None:
-    table = read_numbered_table(file, 1 + quantity.n, 1)
-    times_s, values = table.values[:, 0] * 1e-9, table.values[:, 1:]
-    recorded = UncheckedReadings(quantity.folder, times_s, values, lambda k: f"{file}:{table.lines[k]}")
-    return checked_series(quantity, recorded, sigmas, notes)
+    lines, table = read_numbered_table(file, 1 + quantity.n, 1)
+    times_s, values = table[:, 0] * 1e-9, table[:, 1:]
+    recorded = UncheckedReadings(quantity.folder, times_s, values, lambda k: f"{file}:{lines[k]}")
+    return readings.checked_series(quantity, recorded, sigmas, notes)
 
 
 def _read_sigmas(file: Path, n: int) -> Array | None:
@@ -112,23 +103,26 @@ def _read_sigmas(file: Path, n: int) -> Array | None:
 def _read_vertical(folder: Path, notes: list[str]) -> SensorSeries | None:
     """Returns the direction of the vertical by an IMU; None without one, or with a note on why it is not used.
 
-    By default the axes of the IMU are those of the body, and its bias is `USUAL_BIAS_MPS2`.
+    By default the axes of the IMU are those of the body, and its bias is `readings.USUAL_BIAS_MPS2`.
     """
     file, description = folder / "data.csv", folder / "sensor.yaml"
     if not file.exists():
         return None
     tree = read_yaml(description) if description.is_file() else {}
     if missing := [name for name in _DENSITIES if tree.get(name) is None]:
-        notes.append(f"The readings in {INERTIAL.folder} are not used: sensor.yaml states no `{missing[0]}`.")
+        notes.append(f"The readings in {readings.INERTIAL.folder} are not used: sensor.yaml states no `{missing[0]}`.")
         return None
     rate, walk, force = (_deviation(tree, name, description) for name in _DENSITIES)
-    bias = USUAL_BIAS_MPS2 if tree.get(_BIAS) is None else _deviation(tree, _BIAS, description)
+    bias = readings.USUAL_BIAS_MPS2 if tree.get(_BIAS) is None else _deviation(tree, _BIAS, description)
     axes = pose_of(tree, "T_BS", description)[:3, :3] if "T_BS" in tree else np.eye(3)
     if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3):
         raise TwinError(f"{description}: T_BS", "is not a rigid motion", "a rotation matrix and a translation [m]")
-    readings = _read_csv(file, INERTIAL, np.ones(INERTIAL.n), notes)
-    sensor = InertialErrorModel(INERTIAL.folder, InertialNoise(rate, walk, force), bias, axes)
-    return None if readings is None else vertical_series(readings, sensor, notes)
+    inertial = _read_csv(file, readings.INERTIAL, np.ones(readings.INERTIAL.n), notes)
+    if inertial is None:
+        return None
+    return readings.vertical_series(
+        readings.INERTIAL.folder, inertial, axes, InertialNoise(rate, walk, force), bias, notes
+    )
 
 
 def _deviation(tree: Mapping[str, Any], name: str, file: Path) -> float:
@@ -147,10 +141,10 @@ def write_readings(root: Path, contents: RunContents) -> None:
     states none or if one of them is 0.
     """
     for name, sensor in _WRITTEN.items():
-        readings = [(frame.time_s, getattr(frame.readings, sensor.reading)) for frame in contents.frames]
+        rows = [(frame.time_s, getattr(frame.readings, sensor.reading)) for frame in contents.frames]
         lines = [
             ",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in np.atleast_1d(values))])
-            for time_s, values in readings
+            for time_s, values in rows
             if values is not None
         ]
         sigmas = contents.sigmas(*sensor.sigmas)
@@ -167,8 +161,10 @@ def _write_imu(folder: Path, imu: RecordedImu) -> None:
     """Writes the readings of the IMU, whose axes are those of the body, with full precision."""
     folder.mkdir()
     values = np.hstack([imu.readings.rates_radps, imu.readings.specific_forces_mps2]).tolist()
-    readings = zip(imu.readings.times_s, values, strict=True)
-    lines = [",".join([str(timestamp_ns(time_s)), *map(repr, row)]) for time_s, row in readings]
+    lines = [
+        ",".join([str(timestamp_ns(time_s)), *map(repr, row)])
+        for time_s, row in zip(imu.readings.times_s, values, strict=True)
+    ]
     write_csv(folder, _IMU_COLUMNS, lines)
     tree = {"sensor_type": "imu", "T_BS": pose_table(np.eye(4)), "rate_hz": float(imu.rate_hz), **imu.noise._asdict()}
     if imu.accelerometer_bias_mps2 is not None:

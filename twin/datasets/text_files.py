@@ -6,11 +6,10 @@ import csv
 import math
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from twin.core import user_files
 from twin.core.geometry import Array
@@ -96,22 +95,15 @@ def read_yaml(file: Path) -> dict[str, Any]:
     return tree
 
 
-class NumberedTable(NamedTuple):
-    """Numbers (n, columns) of a text file, with the line (n,), from 1, of each row."""
-
-    lines: NDArray[np.int64]
-    values: Array
-
-
 def read_table(file: Path, columns: int) -> Array:
     """Returns the finite numbers (n, columns) of a text file (`read_numbered_table`)."""
-    return read_numbered_table(file, columns, columns).values
+    return read_numbered_table(file, columns, columns)[1]
 
 
-def read_numbered_table(file: Path, columns: int, n_finite: int) -> NumberedTable:
-    """Returns the first columns of a text file as numbers; a text that is empty is NaN.
+def read_numbered_table(file: Path, columns: int, n_finite: int) -> tuple[list[int], Array]:
+    """Returns the numbers of the lines of a text file, from 1, and their first columns as numbers (n, columns).
 
-    Lines that are empty or begin with # are ignored.
+    A text that is empty is NaN. Lines that are empty or begin with # are ignored.
 
     Raises:
         TwinError: the file cannot be read, a line has too few columns, or a value is not a number or, in the first
@@ -127,7 +119,7 @@ def read_numbered_table(file: Path, columns: int, n_finite: int) -> NumberedTabl
             raise TwinError(f"{file}:{number}", "is not a line of numbers", f"{columns} finite numbers")
         lines.append(number)
         rows.append(values)
-    return NumberedTable(np.array(lines, np.int64), np.array(rows, dtype=np.float64).reshape(-1, columns))
+    return lines, np.array(rows, dtype=np.float64).reshape(-1, columns)
 
 
 def text_rows(file: Path) -> list[tuple[int, list[str]]]:

@@ -7,6 +7,7 @@ positive upwards. Tags then hold the scene origin, from which `scene_placement` 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -71,44 +72,44 @@ def write_elevations(
     if georeference is None:
         return write_layer(path, height_m, grid, description)
     elevations = height_m.astype(np.float64) + georeference.elevation_m
-    _write_band(path, elevations, grid, description, georeference, **_ELEVATION_TAG)
+    _write(path, elevations[None], grid, georeference, (description,), _ELEVATION_TAG, nodata=np.nan, predictor=3)
 
 
 def write_layer(
     path: Path, values: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
     """Writes one layer (rows, cols) as float32; the nodata value is NaN."""
-    _write_band(path, values.astype(np.float32), grid, description, georeference)
-
-
-def _write_band(
-    path: Path, values: NDArray[Any], grid: MapGrid, description: str, georeference: Georeference | None, **tags: str
-) -> None:
-    layout = profile(grid, 1, str(values.dtype), georeference)
-    with rasterio.open(path, "w", **layout, nodata=np.nan, predictor=3) as file:
-        file.write(values, 1)
-        file.set_band_description(1, description)
-        file.update_tags(**placement_tags(georeference))
-        if tags:
-            file.update_tags(1, **tags)
+    _write(path, values[None].astype(np.float32), grid, georeference, (description,), nodata=np.nan, predictor=3)
 
 
 def write_masks(
     path: Path, masks: dict[str, NDArray[Any]], grid: MapGrid, georeference: Georeference | None = None
 ) -> None:
     """Writes layers (rows, cols) of integers or Booleans as uint16, one band each; the keys describe the bands."""
-    with rasterio.open(path, "w", **profile(grid, len(masks), "uint16", georeference)) as file:
-        for band, (description, values) in enumerate(masks.items(), start=1):
-            file.write(values.astype(np.uint16), band)
-            file.set_band_description(band, description)
-        file.update_tags(**placement_tags(georeference))
+    _write(path, np.array(list(masks.values())).astype(np.uint16), grid, georeference, tuple(masks))
 
 
 def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georeference | None = None) -> None:
     """Writes the orthomosaic (rows, cols, 3) as RGB; the nodata value is 0 (black)."""
-    layout = profile(grid, 3, "uint8", georeference)
-    with rasterio.open(path, "w", **layout, nodata=0, photometric="RGB") as file:
-        file.write(np.moveaxis(mosaic, 2, 0))
+    _write(path, np.moveaxis(mosaic, 2, 0), grid, georeference, nodata=0, photometric="RGB")
+
+
+def _write(
+    path: Path,
+    bands: NDArray[Any],
+    grid: MapGrid,
+    georeference: Georeference | None,
+    descriptions: tuple[str, ...] = (),
+    tags: Mapping[str, str] | None = None,
+    **options: Any,
+) -> None:
+    """Writes bands (n, rows, cols) with their descriptions and tags; `options` are those of rasterio."""
+    layout = profile(grid, len(bands), str(bands.dtype), georeference)
+    with rasterio.open(path, "w", **layout, **options) as file:
+        file.write(bands)
+        for band, description in enumerate(descriptions, start=1):
+            file.set_band_description(band, description)
+            file.update_tags(band, **(tags or {}))
         file.update_tags(**placement_tags(georeference))
 
 

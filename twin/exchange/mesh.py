@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -20,16 +19,15 @@ GLB_FROM_WORLD = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 MAX_VERTICES = 400_000
 
 
-class MapSurface(NamedTuple):
-    """Triangles that connect the centres of mapped cells; those of no triangle are left out."""
+def surface(
+    elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES
+) -> tuple[Array, NDArray[np.int64], NDArray[np.uint8]]:
+    """Returns the surface of a map: triangles that connect the centres of its cells, about `max_vertices` at most.
 
-    points: Array  #: (n, 3) vertices in the frame of the map [m]
-    faces: NDArray[np.int64]  #: (m, 3) vertices of the triangles, which face up in the frame of the map
-    colours: NDArray[np.uint8]  #: (n, 3) RGB of the cells
-
-
-def surface(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> MapSurface:
-    """Returns the surface of a map, subsampled to about `max_vertices` cells."""
+    Returns:
+        Vertices (n, 3) in the frame of the map [m], without those of no triangle; triangles (m, 3), which face up in
+        this frame; colours (n, 3) of the vertices.
+    """
     stride = max(1, int(np.ceil(np.sqrt(elevation_map.height_m.size / max_vertices))))
     x, y = elevation_map.grid.centres()
     height = elevation_map.height_m[::stride, ::stride]
@@ -37,7 +35,7 @@ def surface(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> Ma
     points = np.stack([east, north, height], axis=-1).reshape(-1, 3).astype(np.float64)
     colours = elevation_map.mosaic[::stride, ::stride].reshape(-1, 3)
     used, faces = np.unique(raster_triangles(np.isfinite(height)), return_inverse=True)
-    return MapSurface(points[used], faces.reshape(-1, 3), colours[used])
+    return points[used], faces.reshape(-1, 3), colours[used]
 
 
 def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> trimesh.Trimesh:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -16,13 +15,6 @@ LAYERS = {"dem": ("Float32",), "dem_sigma": ("Float32",), "mosaic": ("Byte", "By
 _COLOURS = ("Red", "Green", "Blue")
 
 
-class _Written(NamedTuple):
-    """A written tile: the middle of its file names, and its cells."""
-
-    name: str
-    grid: MapGrid
-
-
 class TiledMapFolder:
     """Writer of a map in tiles, in local metres: `dem_ROW_COL.tif` etc. for each tile, and `dem.vrt` etc. for all.
 
@@ -30,7 +22,7 @@ class TiledMapFolder:
     """
 
     def __init__(self, folder: Path):
-        self.folder, self._tiles = folder, list[_Written]()
+        self.folder, self._tiles = folder, dict[str, MapGrid]()
 
     def add(self, row: int, col: int, elevation: ElevationMap) -> None:
         """Writes the map of the tile with these numbers, if it has a height; raises OSError if it cannot."""
@@ -41,7 +33,7 @@ class TiledMapFolder:
         geotiff.write_elevations(self.folder / f"dem_{name}.tif", elevation.height_m, grid, "elevation [m]")
         geotiff.write_layer(self.folder / f"dem_sigma_{name}.tif", elevation.sigma_m, grid, "standard deviation [m]")
         geotiff.write_mosaic(self.folder / f"mosaic_{name}.tif", elevation.mosaic, grid)
-        self._tiles.append(_Written(name, grid))
+        self._tiles[name] = grid
 
     @property
     def n_tiles(self) -> int:
@@ -55,12 +47,13 @@ class TiledMapFolder:
                 (self.folder / f"{layer}.vrt").write_text(_virtual_raster(layer, bands, self._tiles), encoding="utf-8")
 
 
-def _virtual_raster(layer: str, bands: tuple[str, ...], tiles: list[_Written]) -> str:
+def _virtual_raster(layer: str, bands: tuple[str, ...], tiles: dict[str, MapGrid]) -> str:
     """Returns the text of a GDAL VRT that shows one layer of all tiles, whose cells have the same size."""
-    cell = tiles[0].grid.cell_m
-    west, north = min(t.grid.west_m for t in tiles), max(t.grid.north_m for t in tiles)
-    places = [(round((t.grid.west_m - west) / cell), round((north - t.grid.north_m) / cell), t) for t in tiles]
-    width, height = max(x + t.grid.cols for x, _, t in places), max(y + t.grid.rows for _, y, t in places)
+    cell = next(iter(tiles.values())).cell_m
+    west, north = min(t.west_m for t in tiles.values()), max(t.north_m for t in tiles.values())
+    places = {name: (round((t.west_m - west) / cell), round((north - t.north_m) / cell)) for name, t in tiles.items()}
+    width = max(places[name][0] + t.cols for name, t in tiles.items())
+    height = max(places[name][1] + t.rows for name, t in tiles.items())
     lines = [
         f'<VRTDataset rasterXSize="{width}" rasterYSize="{height}">',
         f"<SRS>{LOCAL_METRES.to_wkt().replace('&', '&amp;')}</SRS>",
@@ -71,10 +64,10 @@ def _virtual_raster(layer: str, bands: tuple[str, ...], tiles: list[_Written]) -
         lines.append(f"<NoDataValue>{'nan' if kind == 'Float32' else 0}</NoDataValue>")
         if len(bands) == len(_COLOURS):
             lines.append(f"<ColorInterp>{_COLOURS[band - 1]}</ColorInterp>")
-        for x, y, tile in places:
-            size = f'xSize="{tile.grid.cols}" ySize="{tile.grid.rows}"'
+        for name, (x, y) in places.items():
+            size = f'xSize="{tiles[name].cols}" ySize="{tiles[name].rows}"'
             lines.append(
-                f'<SimpleSource><SourceFilename relativeToVRT="1">{layer}_{tile.name}.tif</SourceFilename>'
+                f'<SimpleSource><SourceFilename relativeToVRT="1">{layer}_{name}.tif</SourceFilename>'
                 f'<SourceBand>{band}</SourceBand><SrcRect xOff="0" yOff="0" {size}/>'
                 f'<DstRect xOff="{x}" yOff="{y}" {size}/></SimpleSource>'
             )

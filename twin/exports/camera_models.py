@@ -1,6 +1,8 @@
-"""Believed and true calibration of the images of a scenario, as camera models of OpenCV."""
+"""True calibration of the images of a scenario, as camera models of OpenCV."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -8,18 +10,12 @@ from scipy.optimize import least_squares
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
-from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix, rectified_calibration
 from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
 from twin.scenario.model import Scenario
 
 _N_COLUMNS = 13  # columns, and rows, of the grid of pixels for the fit
 _RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as multiples of the planned altitude
-
-
-def believed_calibration(rig: StereoRig) -> StereoCalibration:
-    """Returns the believed calibration of rectified images: two equal pinhole cameras without distortion."""
-    camera = RecordedCamera((rig.width_px, rig.height_px), rig.matrix, np.zeros(5))
-    return StereoCalibration(camera, camera, geometry.inverse(rig.left_from_right))
 
 
 def true_calibration(scenario: Scenario) -> StereoCalibration:
@@ -38,8 +34,7 @@ def true_calibration(scenario: Scenario) -> StereoCalibration:
     rig = scenario.believed_rig()
     rendered_from_left = geometry.inverse(cameras.rendered_rig.left_from_right)
     if cameras.sampling is None:
-        camera = believed_calibration(rig).left
-        return StereoCalibration(camera, camera, rendered_from_left)
+        return replace(rectified_calibration(rig), right_from_left=rendered_from_left)
     points_m = _points(rig, scenario.plan.altitude_m)
     left, _, left_px = _fitted(cameras, 0, points_m, rig)
     right, right_from_rendered, right_px = _fitted(cameras, 1, points_m, rig)

@@ -22,7 +22,7 @@ from twin.datasets.run_contents import POSES, RecordedFrame, RunContents, TrueLa
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.geotiff import Raster
-from twin.exports.camera_models import believed_calibration, true_calibration
+from twin.exports.camera_models import true_calibration
 from twin.exports.formats import FORMATS, check_needs, chosen_formats
 from twin.exports.recorded_frames import missing_files, recorded_frames, recorded_imu
 from twin.report.replay_description import replayed_rig
@@ -134,10 +134,8 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         name=str(run.scenario.get("name", folder.name)),
         scenario=run.scenario,
         rig=rig,
-        believed=believed_calibration(rig),
         true=None if scenario is None else true_calibration(scenario),
         trajectories=run.trajectories,
-        keyframe_rows=run.keyframes.frames,
         frames=frames,
         imu=None if scenario is None else recorded_imu(folder, scenario),
         elevation=elevation,

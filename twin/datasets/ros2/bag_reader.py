@@ -12,9 +12,8 @@ from twin.core.records import Trajectory
 from twin.datasets.calibration import StereoCalibration
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, value_or_error
 from twin.datasets.ros2.bag import Bag, BagMessage, is_bag
-from twin.datasets.ros2.bag_images import BagImage
+from twin.datasets.ros2.bag_images import BagImage, StereoTopics, image_topics, stereo_topics
 from twin.datasets.ros2.bag_readings import read_bag
-from twin.datasets.ros2.bag_topics import StereoTopics, image_topics, stereo_topics
 from twin.datasets.ros2.camera_info import stereo_calibration
 from twin.datasets.ros2.frame_transforms import Transforms, pose_of_transform, relative_pose, static_transforms
 from twin.errors import TwinError

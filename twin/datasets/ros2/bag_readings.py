@@ -12,19 +12,9 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import PASCAL_PER_METRE
+from twin.datasets import readings
 from twin.datasets.dataset import are_rotations
-from twin.datasets.inertial import USUAL_BIAS_MPS2, InertialErrorModel, vertical_series
-from twin.datasets.readings import (
-    ATTITUDE,
-    HEIGHT,
-    INERTIAL,
-    VELOCITY,
-    RecordedReadings,
-    SensorQuantity,
-    SensorSeries,
-    UncheckedReadings,
-    checked_series,
-)
+from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries, UncheckedReadings
 from twin.datasets.ros2.bag import Bag
 from twin.datasets.ros2.frame_transforms import Transforms, relative_pose
 from twin.errors import TwinError
@@ -35,14 +25,8 @@ _DVL = "geometry_msgs/msg/TwistWithCovarianceStamped"
 _NO_ORIENTATION = "states an orientation."  # end of the note on topics without attitude
 _USUAL_WALK = 1e-4  # random walk of the bias of a gyroscope, which messages do not state [rad/s2/sqrt(Hz)]
 _N_FIRST = 100  # number of messages of a topic that are searched for an orientation
+_Converter = Callable[[Any, str], tuple[Array, Array]]  # from a message and its place to values and variances
 _SAME_PLACE_M = 0.01  # largest distance between the origins of two frames that count as one place
-
-
-class _Sensor(NamedTuple):
-    """A quantity, and the function that returns its values and variances in a message, given the place of this."""
-
-    quantity: SensorQuantity
-    convert: Callable[[Any, str], tuple[Array, Array]]
 
 
 class _Recorded(NamedTuple):
@@ -70,12 +54,12 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     """
     notes: list[str] = []
     topics = {kind: [name for name, one in bag.topics.items() if one == kind] for kind in (_PRESSURE, _IMU, _DVL)}
-    height = _read(bag, topics[_PRESSURE], _Sensor(HEIGHT, _height), notes)
-    attitude = _read(bag, _with_orientation(bag, topics[_IMU], notes), _Sensor(ATTITUDE, _attitude), notes)
-    velocity = _read(bag, topics[_DVL], _Sensor(VELOCITY, _velocity), notes)
+    height = _read(bag, topics[_PRESSURE], readings.HEIGHT, _height, notes)
+    attitude = _read(bag, _with_orientation(bag, topics[_IMU], notes), readings.ATTITUDE, _attitude, notes)
+    velocity = _read(bag, topics[_DVL], readings.VELOCITY, _velocity, notes)
     inertial = None
     if attitude is None:
-        inertial = _read(bag, _with_motion(bag, topics[_IMU]), _Sensor(INERTIAL, _motion), notes)
+        inertial = _read(bag, _with_motion(bag, topics[_IMU]), readings.INERTIAL, _motion, notes)
     if inertial is not None:
         notes = [note for note in notes if not note.endswith(_NO_ORIENTATION)]
     if height is velocity is attitude is inertial is None and not notes:
@@ -128,8 +112,8 @@ def _vertical(inertial: _Recorded, body_from_sensor: Array | None, notes: list[s
     times_s, _, sigmas = inertial.series
     root_s = float(np.sqrt(np.median(np.diff(times_s)))) if len(times_s) > 1 else 0.0  # a density is sigma / sqrt(rate)
     noise = InertialNoise(float(sigmas[:3].max()) * root_s, _USUAL_WALK, float(sigmas[3:].max()) * root_s)
-    sensor = InertialErrorModel(inertial.topic, noise, USUAL_BIAS_MPS2, body_from_sensor[:3, :3])
-    return vertical_series(inertial.series, sensor, notes)
+    turn = body_from_sensor[:3, :3]
+    return readings.vertical_series(inertial.topic, inertial.series, turn, noise, readings.USUAL_BIAS_MPS2, notes)
 
 
 def _first(bag: Bag, topic: str) -> Iterable[Any]:
@@ -180,13 +164,14 @@ def _listed(topics: list[str]) -> str:
     return ", ".join(sorted(topics))[:200]
 
 
-def _read(bag: Bag, topics: list[str], sensor: _Sensor, notes: list[str]) -> _Recorded | None:
+def _read(
+    bag: Bag, topics: list[str], quantity: SensorQuantity, convert: _Converter, notes: list[str]
+) -> _Recorded | None:
     """Returns the readings of the only one of some topics; all values of a message that is not finite are left out.
 
     The result is None if there is no topic; also, with a note, if there are several, if a finite reading has no
     covariance, or if no reading is finite. The standard deviations are the largest ones of the finite readings.
     """
-    quantity = sensor.quantity
     if len(topics) > 1:
         notes.append(f"The {quantity.name} is not used: several topics have it ({_listed(topics)}).")
     if len(topics) != 1:
@@ -195,7 +180,7 @@ def _read(bag: Bag, topics: list[str], sensor: _Sensor, notes: list[str]) -> _Re
     stamps_ns, logged_ns, values = array("q"), array("q"), array("d")  # compact, as a bag may have millions of messages
     largest, frame = np.zeros(quantity.n), ""
     for recorded_ns, message in bag.messages(topic):
-        value, variance = sensor.convert(message, _place(bag, topic, len(stamps_ns)))
+        value, variance = convert(message, _place(bag, topic, len(stamps_ns)))
         finite = bool(np.isfinite(value).all() and np.isfinite(variance).all())
         if finite and not np.any(variance > 0):
             notes.append(f"The readings of {topic} are not used: they state no covariance.")
@@ -209,7 +194,7 @@ def _read(bag: Bag, topics: list[str], sensor: _Sensor, notes: list[str]) -> _Re
     times_s = np.array(stamps_ns if stamped else logged_ns, np.float64) * 1e-9
     table = np.array(values, np.float64).reshape(-1, quantity.n)
     recorded = UncheckedReadings(topic, times_s, table, lambda k: _place(bag, topic, k))
-    series = checked_series(quantity, recorded, np.sqrt(largest), notes)
+    series = readings.checked_series(quantity, recorded, np.sqrt(largest), notes)
     if series is None:
         return None
     if not stamped:

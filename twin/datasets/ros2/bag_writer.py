@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +22,7 @@ from twin.errors import TwinError
 
 BAG = "ros2_bag"  # folder of the bag, and the name of its MCAP file
 _AIR_PA = 101_325.0  # standard air pressure
-
-
-class Message(NamedTuple):
-    """A message to be written: its time [ns], its topic, and the message itself."""
-
-    time_ns: int
-    topic: str
-    message: Any
+Messages = Iterator[tuple[int, str, Any]]  #: time [ns], topic and message
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
@@ -50,13 +44,13 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         raise TwinError(str(path), "exists already", "a new folder")
     with rosbag2.Writer(path, version=8, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
-        for one in _messages(contents, factory):
-            if one.topic not in connections:
-                kind, qos = one.message.__msgtype__, _static_qos() if one.topic == "/tf_static" else []
-                connections[one.topic] = writer.add_connection(
-                    one.topic, kind, typestore=factory.typestore, offered_qos_profiles=qos
+        for time_ns, topic, message in _messages(contents, factory):
+            if topic not in connections:
+                qos = _static_qos() if topic == "/tf_static" else []
+                connections[topic] = writer.add_connection(
+                    topic, message.__msgtype__, typestore=factory.typestore, offered_qos_profiles=qos
                 )
-            writer.write(connections[one.topic], one.time_ns, factory.serialised(one.message))
+            writer.write(connections[topic], time_ns, factory.serialised(message))
     return [path]
 
 
@@ -70,7 +64,7 @@ def pressure_pa(height_m: float, surface_m: float) -> float:
     return air_pa + PASCAL_PER_METRE * (surface_m - height_m)
 
 
-def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+def _messages(contents: RunContents, factory: MessageFactory) -> Messages:
     """Returns an iterator over all messages of a run in the order of time; images are read one by one."""
     streams = [_static(contents, factory), _images(contents, factory), _readings(contents, factory)]
     if contents.imu is not None:
@@ -78,18 +72,18 @@ def _messages(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
     for topic, name in (("/odometry", "final"), ("/ground_truth/odometry", "truth")):
         if name in contents.trajectories and len(contents.trajectories[name]):
             streams.append(_odometry(factory, topic, contents.trajectories[name], contents.rig.body_from_camera))
-    return heapq.merge(*streams, key=lambda one: one.time_ns)
+    return heapq.merge(*streams, key=itemgetter(0))
 
 
-def _static(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+def _static(contents: RunContents, factory: MessageFactory) -> Messages:
     """Yields one message with the static poses of the two cameras in the body."""
     rig = contents.rig
     poses = {(BODY, LEFT): rig.body_from_camera, (BODY, RIGHT): rig.body_from_camera @ rig.left_from_right}
     time_ns = timestamp_ns(0.0)
-    yield Message(time_ns, "/tf_static", factory.transforms(time_ns, poses))
+    yield time_ns, "/tf_static", factory.transforms(time_ns, poses)
 
 
-def _images(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+def _images(contents: RunContents, factory: MessageFactory) -> Messages:
     """Yields the images of the recorded frames, each with its CameraInfo."""
     left, right = contents.believed.left, contents.believed.right
     for k, frame in enumerate(contents.frames):
@@ -100,20 +94,20 @@ def _images(contents: RunContents, factory: MessageFactory) -> Iterator[Message]
         ):
             if file is not None:
                 image = factory.compressed_image(time_ns, name, *encoded_image(file, contents.jpeg_quality))
-                yield Message(time_ns, f"/{side}/image_rect/compressed", image)
-                yield Message(time_ns, f"/{side}/camera_info", factory.camera_info(time_ns, name, camera, distance_m))
+                yield time_ns, f"/{side}/image_rect/compressed", image
+                yield time_ns, f"/{side}/camera_info", factory.camera_info(time_ns, name, camera, distance_m)
         contents.progress((k + 1) / len(contents.frames))
 
 
-def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_from_left: Array) -> Iterator[Message]:
+def _odometry(factory: MessageFactory, topic: str, trajectory: Trajectory, body_from_left: Array) -> Messages:
     """Yields pose and twist of the body at each frame; with the topic /odometry, also the pose as a message of /tf."""
     poses = trajectory.world_from_camera @ geometry.inverse(body_from_left)
     twists = body_twists(trajectory.times_s, poses)
     for time_s, pose, twist in zip(trajectory.times_s, poses, twists, strict=True):
         time_ns = timestamp_ns(time_s)
-        yield Message(time_ns, topic, factory.odometry(time_ns, pose, twist))
+        yield time_ns, topic, factory.odometry(time_ns, pose, twist)
         if topic == "/odometry":
-            yield Message(time_ns, "/tf", factory.transforms(time_ns, {(WORLD, BODY): pose}))
+            yield time_ns, "/tf", factory.transforms(time_ns, {(WORLD, BODY): pose})
 
 
 def body_twists(times_s: Array, poses: Array) -> Array:
@@ -130,7 +124,7 @@ def body_twists(times_s: Array, poses: Array) -> Array:
     return found
 
 
-def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Message]:
+def _readings(contents: RunContents, factory: MessageFactory) -> Messages:
     """Yields the readings of AHRS, pressure sensor and DVL at the recorded frames, with the stated covariances."""
     surface_m = float(contents.scenario.get("sun", {}).get("depth_m", 0.0))
     level_rad, heading_rad, height_m, sigma_mps = contents.sigmas(
@@ -140,21 +134,21 @@ def _readings(contents: RunContents, factory: MessageFactory) -> Iterator[Messag
     for frame in contents.frames:
         time_ns, readings = timestamp_ns(frame.time_s), frame.readings
         if readings.ahrs_rpy_rad is not None:
-            yield Message(time_ns, "/imu/data", factory.attitude(time_ns, readings.ahrs_rpy_rad, sigmas_rad))
+            yield time_ns, "/imu/data", factory.attitude(time_ns, readings.ahrs_rpy_rad, sigmas_rad)
         if readings.pressure_z_m is not None:
             value_pa = pressure_pa(readings.pressure_z_m, surface_m)
-            yield Message(time_ns, "/pressure", factory.pressure(time_ns, value_pa, sigma_pa))
+            yield time_ns, "/pressure", factory.pressure(time_ns, value_pa, sigma_pa)
         if readings.dvl_mps is not None:
-            yield Message(time_ns, "/dvl", factory.velocity(time_ns, readings.dvl_mps, sigma_mps))
+            yield time_ns, "/dvl", factory.velocity(time_ns, readings.dvl_mps, sigma_mps)
 
 
-def _inertial(imu: RecordedImu, factory: MessageFactory) -> Iterator[Message]:
+def _inertial(imu: RecordedImu, factory: MessageFactory) -> Messages:
     """Yields the readings of the IMU; the variances are s^2 f of white noise of density s, sampled at the rate f."""
     root = np.sqrt(imu.rate_hz)
     sigmas = imu.noise.gyroscope_noise_density * root, imu.noise.accelerometer_noise_density * root
     for time_s, rates, forces in zip(*imu.readings, strict=True):
         time_ns = timestamp_ns(time_s)
-        yield Message(time_ns, "/imu/data_raw", factory.inertial(time_ns, rates, forces, sigmas))
+        yield time_ns, "/imu/data_raw", factory.inertial(time_ns, rates, forces, sigmas)
 
 
 def _static_qos() -> list[Any]:
