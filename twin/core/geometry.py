@@ -23,10 +23,7 @@ BODY_FROM_DOWN_CAMERA: Array = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.
 
 @kernel
 def copy_into(target: Array, values: Array) -> None:
-    """Assigns target[...] = values, both of the same shape (n,) or (n, m).
-
-    Used instead of Numba's slice assignment, which compiles a shape check with an error message into every caller.
-    """
+    """Assigns target[...] = values of one shape (n,) or (n, m), without the shape check that Numba compiles."""
     for i in range(target.shape[0]):
         if target.ndim == 1:
             target[i] = values[i]
@@ -108,10 +105,7 @@ def product(a: Array, b: Array) -> Array:
 
 
 def nearest_rigid(matrices: Array) -> Array:
-    """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices (..., 4, 4).
-
-    Products accumulate rounding errors, and `inverse`, a transpose, is exact only for an orthogonal rotation.
-    """
+    """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices, such as products with rounding errors."""
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
 
@@ -132,10 +126,7 @@ def _nearest_rigid(matrices):
 
 @kernel
 def so3_exp(w: Array) -> Array:
-    """Returns the rotation matrix (3, 3) of a rotation vector (3,) [rad] by Rodrigues' formula.
-
-    Near the identity, the coefficients are computed from their Taylor series.
-    """
+    """Returns the rotation matrix (3, 3) of a rotation vector (3,) [rad] by Rodrigues' formula."""
     angle2 = w[0] * w[0] + w[1] * w[1] + w[2] * w[2]
     angle = np.sqrt(angle2)
     if angle < 1e-4:
@@ -163,9 +154,8 @@ def _skew_polynomial(w: Array, a: float, b: float) -> Array:
     x, y, z = w[0], w[1], w[2]
     angle2 = x * x + y * y + z * z
     result = np.empty((3, 3))
-    result[0, 0], result[1, 1], result[2, 2] = (
-        1.0 + b * (x * x - angle2), 1.0 + b * (y * y - angle2), 1.0 + b * (z * z - angle2),
-    )  # fmt: skip
+    result[0, 0], result[1, 1] = 1.0 + b * (x * x - angle2), 1.0 + b * (y * y - angle2)
+    result[2, 2] = 1.0 + b * (z * z - angle2)
     result[0, 1], result[1, 0] = b * x * y - a * z, b * x * y + a * z
     result[0, 2], result[2, 0] = b * x * z + a * y, b * x * z - a * y
     result[1, 2], result[2, 1] = b * y * z - a * x, b * y * z + a * x
@@ -226,8 +216,8 @@ def log(a_from_b: Array) -> Array:
 def log_derivative(motion: Array) -> Array:
     """Returns the inverse right Jacobian J (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
 
-    For [w, v] and K = skew(w), the diagonal blocks are I + K / 2 + c K^2 (`_inverse_jacobian_coefficient`); the lower
-    left block is their derivative with respect to w in the direction v (Selig 2005).
+    For [w, v] and K = skew(w), the diagonal blocks are I + K / 2 + c K^2; the lower left block is their derivative with
+    respect to w in the direction v (Selig 2005).
     """
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
     c, slope = _inverse_jacobian_coefficient(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
@@ -280,12 +270,7 @@ def transform(a_from_b: Array, points_b: Array) -> Array:
 
 @kernel
 def transport_covariance(cov: Array, a_from_b: Array) -> Array:
-    """Returns the covariance (6, 6) of the pose of frame b, which is rigidly attached to frame a.
-
-    Args:
-        cov: (6, 6) covariance of the pose of a, in the axes of a; the result is in the axes of b.
-        a_from_b: (4, 4) pose of b in a.
-    """
+    """Returns the covariance (6, 6) of the pose of frame b, in its axes, given that of a frame a rigidly attached."""
     return transform_covariance(adjoint(inverse(a_from_b)), cov)
 
 
@@ -341,10 +326,7 @@ def quaternion_xyzw(rotation: Array) -> Array:
 
 @kernel
 def quaternions_xyzw(rotations: Array) -> Array:
-    """Returns the quaternions [x, y, z, w] (n, 4) of rotation matrices (n, 3, 3), w >= 0.
-
-    For precision, each is computed from its component of largest magnitude (Shepperd 1978).
-    """
+    """Returns the quaternions [x, y, z, w] (n, 4) of rotation matrices (n, 3, 3), w >= 0 (Shepperd 1978)."""
     out = np.empty((len(rotations), 4))
     for k in range(len(rotations)):
         r = rotations[k]
@@ -369,10 +351,7 @@ def heading_of_camera(world_from_camera: Array) -> Array:
 
 
 def rotations_of_down_camera(yaw: Array) -> Array:
-    """Returns world_from_camera rotations (..., 3, 3) of level cameras that look down, with the bow at `yaw` (...).
-
-    The yaw is the direction of the bow [rad, counter-clockwise from east]; the top of the image points to the bow.
-    """
+    """Returns world_from_camera rotations (..., 3, 3) of level cameras that look down, with the bow at `yaw` (...)."""
     c, s = np.cos(yaw), np.sin(yaw)
     zero, one = np.zeros_like(c), np.ones_like(c)
     world_from_body = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(*np.shape(c), 3, 3)

@@ -16,11 +16,7 @@ from twin.kernels import kernel
 
 
 class HeightField(NamedTuple):
-    """Floor as a triangulated height grid.
-
-    Each cell is split along the diagonal from node (r, c) to (r + 1, c + 1), as in `terrains.Terrain`. There is no
-    floor in cells with a NaN corner and outside the grid.
-    """
+    """Floor as a triangulated height grid. There is no floor in cells with a NaN corner and outside the grid."""
 
     height_m: Array  #: (ny, nx) heights of the nodes, row 0 = south, column 0 = west
     spacing_m: float  #: distance between neighbouring nodes
@@ -35,9 +31,8 @@ class HeightField(NamedTuple):
 def height_field(height_m: NDArray[np.floating], spacing_m: float, west_m: float, south_m: float) -> HeightField:
     """Returns the height field with node heights (ny, nx) [m]: at least 2 x 2 nodes, at least one of them finite."""
     height = np.ascontiguousarray(height_m, np.float64)
-    return HeightField(
-        height, float(spacing_m), float(west_m), float(south_m), float(np.nanmin(height)), float(np.nanmax(height))
-    )
+    lowest_m, highest_m = float(np.nanmin(height)), float(np.nanmax(height))
+    return HeightField(height, float(spacing_m), float(west_m), float(south_m), lowest_m, highest_m)
 
 
 def map_height_field(height_m: NDArray[np.floating], grid: MapGrid) -> HeightField:
@@ -151,26 +146,19 @@ def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
 
 
 def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
-    """Returns the triangles of a grid, counter-clockwise as seen from above, cell by cell.
+    """Returns the triangles (2 (rows - 1) (cols - 1), 3) of a grid, counter-clockwise from above, cell by cell.
 
     Args:
         vertices: (rows, cols) vertex numbers; rows run from south to north, columns from west to east.
-
-    Returns:
-        (2 (rows - 1) (cols - 1), 3) vertex numbers, of the same integer type.
     """
     sw, se, ne, nw = vertices[:-1, :-1], vertices[:-1, 1:], vertices[1:, 1:], vertices[1:, :-1]
     return np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
 
 
 def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Returns the triangles that connect the centres of valid raster cells, counter-clockwise as seen from above.
+    """Returns the triangles (n, 3) between the centres of valid raster cells, counter-clockwise from above.
 
-    Args:
-        valid: (rows, cols) bool; row 0 is the northernmost.
-
-    Returns:
-        (n, 3) indices of the cells at the corners, in the flattened (row-major) raster.
+    They are indices of the flattened (row-major) raster, whose row 0 is the northernmost.
     """
     cells = np.arange(valid.size).reshape(valid.shape)
     triangles = grid_triangles(cells[::-1])
@@ -188,10 +176,7 @@ def rises(south_west, south_east, north_west, north_east, east_part, north_part)
 def map_slopes(height_m: Array, cell_m: float) -> tuple[Array, Array]:
     """Returns the slopes of a map towards the east and towards the north, each (rows, cols), by central differences.
 
-    At the edges of the map, the differences are one-sided. Along an axis with a single cell, the slope is 0.
-
-    Args:
-        height_m: (rows, cols) heights; row 0 is the northernmost, column 0 the westernmost.
+    At the edges, they are one-sided. Along an axis with a single cell, the slope is 0. Row 0 is the northernmost.
     """
     south, east = (
         np.gradient(height_m, cell_m, axis=axis) if height_m.shape[axis] > 1 else np.zeros_like(height_m)

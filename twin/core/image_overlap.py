@@ -57,12 +57,10 @@ def _share_seen(field, pose, camera, cell, x, y, z, depth):
     """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
 
     Args:
-        pose: (4, 4) world_from_camera of the second camera.
         camera: fx, fy, cx, cy, width and height [px].
         cell: width and height of a cell in the first image [px].
         x, y, z: floor point at the centre of the cell [m].
-        depth: depth of this point in the first camera [m]; with the depth in the second camera, it gives the size of
-            the cell in the second image.
+        depth: depth of this point in the first camera [m].
     """
     fx, fy, cx, cy, width, height = camera
     dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]

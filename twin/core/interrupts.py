@@ -16,11 +16,9 @@ T = TypeVar("T")
 class StageGuard:
     """Context manager that delivers interrupts only within a stage.
 
-    An interrupt that arrives between two stages is delivered at the start of the second one.
-
-    A delivered signal is passed to the handler of SIGINT or SIGTERM that was installed when the context was entered.
-    This handler usually raises KeyboardInterrupt. A signal without a Python handler is not intercepted. Outside the
-    main thread, which alone receives signals, the context has no effect.
+    An interrupt that arrives between two stages is delivered at the start of the second one, to the handler that was
+    installed when the context was entered and usually raises KeyboardInterrupt. A signal without a Python handler is
+    not intercepted. Outside the main thread, which alone receives signals, the context has no effect.
 
     Attributes:
         cause: why the survey is aborted, set by the caller; "" if there is no such cause.
@@ -46,11 +44,7 @@ class StageGuard:
 
     @contextmanager
     def stage(self) -> Iterator[None]:
-        """Delivers interrupts within this context, including a pending one that arrived before it.
-
-        Raises:
-            KeyboardInterrupt: an interrupt is pending or arrives within the context.
-        """
+        """Delivers interrupts within this context, including a pending one that arrived before it."""
         self._open = True
         try:
             if self._waiting:
@@ -60,10 +54,7 @@ class StageGuard:
             self._open = False
 
     def attempt(self, name: str, function: Callable[[], T]) -> T | None:
-        """Runs `function` as a stage and returns its result.
-
-        If an interrupt ends the stage, adds `name` to `skipped` and returns None.
-        """
+        """Returns the result of `function` as a stage; None, with `name` in `skipped`, if an interrupt ends it."""
         try:
             with self.stage():
                 return function()

@@ -12,13 +12,11 @@ def optional(module: str, extra: str, purpose: str) -> Any:
     """Returns a module of an optional package.
 
     Args:
-        module: full name of the module, for example "rosbags.rosbag2".
         extra: name of the extra of this project that installs the package.
         purpose: command or option that needs the package, for the message.
 
     Raises:
         TwinError: the package, or this module of it, is not installed.
-        ModuleNotFoundError: another package, which the module imports, is not installed.
     """
     try:
         return import_module(module)

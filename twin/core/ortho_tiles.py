@@ -35,20 +35,12 @@ def finer_grid(grid: MapGrid, pixel_m: float) -> MapGrid:
 
 
 def tile_side_px(n: int) -> int:
-    """Returns the side of a tile [px]: the largest multiple of n up to `TILE_PX`, but at least n.
-
-    Args:
-        n: number of pixels along the side of a map cell.
-    """
+    """Returns the side of a tile [px]: the largest multiple of n up to `TILE_PX`, but at least n."""
     return max(TILE_PX - TILE_PX % n, n)
 
 
 def mean_colours(tile: OrthoTile, n: int) -> Image:
-    """Returns the mean colours (rows // n, cols // n, 3) of squares of n x n pixels.
-
-    Only known pixels count; a square without known pixels is black. Incomplete squares at the east and south edges of
-    the tile are left out.
-    """
+    """Returns the mean colours (rows // n, cols // n, 3) of the known pixels of squares of n x n pixels, or black."""
     rows, cols = (size // n for size in tile.rgba.shape[:2])
     squares = tile.rgba[: rows * n, : cols * n].reshape(rows, n, cols, n, 4).astype(np.float32)
     known = (squares[..., 3:] > 0).sum(axis=(1, 3))

@@ -36,11 +36,7 @@ _ONE_FILE = "one file that contains them, as gdal_translate IN OUT writes it"
 def open_raster(
     file: Path, key: str = "", allowed: str = "", drivers: Sequence[str] = ("GTiff",)
 ) -> Iterator[rasterio.DatasetReader]:
-    """Opens a raster file by one of the named drivers of GDAL; any exception within the context becomes a TwinError.
-
-    Args:
-        key: key of the scenario that names the file; "": the error names the file itself.
-        allowed: the files that are allowed, for the error.
+    """Opens a raster file by one of the named drivers of GDAL; `key` and `allowed` are those of `user_files.reading`.
 
     Raises:
         TwinError: the file is missing, damaged or of another format, names another file, or has larger tiles than it

@@ -47,17 +47,15 @@ class StereoRig:
 
     @property
     def fx_px(self) -> float:
-        """Returns the focal length along the rows of the image [px]."""
         return self.focal_px
 
     @property
     def fy_px(self) -> float:
-        """Returns the focal length along the columns of the image [px]."""
         return self.focal_px if self.focal_y_px is None else self.focal_y_px
 
     @property
     def focals_px(self) -> Array:
-        """Returns the focal lengths (fx, fy) along the rows and the columns of the image [px]."""
+        """Returns (fx, fy) [px]."""
         return np.array([self.fx_px, self.fy_px])
 
     @property
@@ -81,23 +79,15 @@ class StereoRig:
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
-        """Returns the calibration of images in which blocks of `by` x `by` pixels are averaged to one pixel.
-
-        Columns at the right border and rows at the lower border that do not fill a block are cut off.
-        """
+        """Returns the calibration of images in which whole blocks of `by` x `by` pixels are averaged to one pixel."""
         if by == 1:
             return self
         divisible = self.width_px % by == 0 and self.height_px % by == 0
         has_default = self.principal_point_px is None and divisible
         centre = (self.cx_px + 0.5) / by - 0.5, (self.cy_px + 0.5) / by - 0.5
-        return replace(
-            self,
-            width_px=self.width_px // by,
-            height_px=self.height_px // by,
-            focal_px=self.focal_px / by,
-            focal_y_px=None if self.focal_y_px is None else self.focal_y_px / by,
-            principal_point_px=None if has_default else centre,
-        )
+        focals = {"focal_px": self.focal_px / by, "focal_y_px": self.focal_y_px and self.focal_y_px / by}
+        size = {"width_px": self.width_px // by, "height_px": self.height_px // by}
+        return replace(self, **size, **focals, principal_point_px=None if has_default else centre)
 
     def with_square_pixels(self) -> StereoRig:
         """Returns the calibration of images that are resampled along their columns so that fy equals fx."""
@@ -126,15 +116,12 @@ class SensorNoise:
     attitude_rad: float = float(np.deg2rad(0.2))  #: standard deviation of roll and of pitch from the AHRS [rad]
     heading_rad: float = float(np.deg2rad(0.5))  #: standard deviation of the heading from the AHRS [rad]
     dvl_mps: float = 0.005  #: standard deviation of the white noise of each axis of the DVL velocity [m/s]
-    #: standard deviation of the relative scale error of the DVL, which is constant over a survey (due to errors of
-    #: speed of sound and beam angles).
-    dvl_scale: float = 0.002
+    dvl_scale: float = 0.002  #: standard deviation of the relative scale error of the DVL, constant over a survey
     usbl_m: float = 0.3  #: standard deviation of each axis of an acoustic position fix [m]
     beacon_px: float = 0.2  #: standard deviation of column and of row of a beacon in the image [px]
     #: (x, y, z) of each beacon in the world [m], treated as exact.
     beacons_m: tuple[tuple[float, float, float], ...] = ()
-    #: standard deviation of the direction of the vertical about each horizontal axis [rad]. It is that of an error
-    #: which all readings share: no number of readings reduces it.
+    #: standard deviation of the direction of the vertical about each horizontal axis [rad], common to all readings.
     up_rad: float = float(np.deg2rad(1.2))
 
     @property
@@ -179,12 +166,8 @@ class Displacement(NamedTuple):
     """Displacement of the body's origin since a node, measured by the DVL, in the axes of the body at that node."""
 
     since: int  #: keyframe number of the node
-    #: (3,) measured displacement [m]: (1 + s) times the true displacement, plus noise. The scale error s is constant
-    #: over the survey.
-    displacement_m: Array
-    #: (3, 3) covariance due to the white noise of the DVL and the attitude error since the node, without the scale
-    #: error.
-    cov: Array
+    displacement_m: Array  #: (3,) measured displacement [m], with the scale error of the DVL
+    cov: Array  #: (3, 3) covariance due to white noise and the attitude error since the node, without the scale error
 
 
 @dataclass(frozen=True)
@@ -291,14 +274,12 @@ class SurveyResult:
     final: Trajectory  #: trajectory after the last global alignment; `online` if `EstimatorSettings.use_ga` is false
     keyframe_rows: NDArray[np.int64]  #: (n_keyframes,) row of each keyframe in the trajectories
     track_of_keyframe: NDArray[np.int64]  #: (n_keyframes,) track number of each keyframe, from 1
-    #: (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the final pose of the latest node up to it (its
-    #: own pose if every keyframe is a node), [rotation, translation] (rad, m) in the camera axes of that node; without
-    #: a final alignment, the covariance of the last online pose for every keyframe.
+    #: (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the final pose of the latest node up to it,
+    #: [rotation, translation] (rad, m) in the camera axes of that node; without a final alignment, the covariance of
+    #: the last online pose for every keyframe.
     node_cov: Array
-    #: (n_keyframes,) median depth of the matched points [m].
-    keyframe_depth_m: Array = field(default_factory=lambda: np.zeros(0))
+    keyframe_depth_m: Array = field(default_factory=lambda: np.zeros(0))  #: (n_keyframes,) of the matched points
     links: Links = field(default_factory=Links)  #: measured motions of the network
-    #: size and wall time of each global alignment.
     alignments: list[Alignment] = field(default_factory=list[Alignment])
     #: before_ga, after_ga: for each global alignment at the end of a track, positions (n, 3) of the keyframes so far,
     #: just before and just after it [m].
@@ -312,8 +293,8 @@ class SurveyResult:
     def unlinked(self) -> NDArray[np.bool_]:
         """Returns the mask (n_keyframes,) of the keyframes whose pose is dead reckoning from an earlier keyframe.
 
-        No measured link joins them, or the node whose pose they follow, to another node. If no link was measured at all
-        (a plug-in), there are none.
+        No measured link joins them, or the node whose pose they follow, to another node. Without any measured link (a
+        plug-in), there are none.
         """
         links, n = self.links, len(self.keyframe_rows)
         measured = links.n_points > 0
@@ -346,10 +327,8 @@ class MapGrid:
 
     def centres(self) -> tuple[Array, Array]:
         """Returns x (cols,) and y (rows,) of the cell centres [m]."""
-        return (
-            self.west_m + (np.arange(self.cols, dtype=np.float64) + 0.5) * self.cell_m,
-            self.north_m - (np.arange(self.rows, dtype=np.float64) + 0.5) * self.cell_m,
-        )
+        across, down = ((np.arange(n, dtype=np.float64) + 0.5) * self.cell_m for n in (self.cols, self.rows))
+        return self.west_m + across, self.north_m - down
 
 
 @dataclass
@@ -380,13 +359,11 @@ class Truth:
     height_m: NDArray[np.float32]  #: (rows, cols) float32, true height at the cell centres of the map grid [m]
     seen: NDArray[np.bool_]  #: (rows, cols) bool, cells that both cameras observed in at least one keyframe
     asked: NDArray[np.bool_]  #: (rows, cols) bool, cells whose centre lies in the asked area
-    #: (n_frames,) planned heading of the bow [rad, counter-clockwise from east]; None: constant, the heading at the
-    #: start.
-    reference_yaw: Array | None = None
-    #: function that returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from above, 255 =
-    #: white; NaN where there is no floor or an object lies on it. None: not known.
+    reference_yaw: Array | None = None  #: (n_frames,) planned heading of the bow [rad]; None: that at the start
+    #: returns the true albedo (rows, cols, 3) of the floor at the cells of a grid, seen from above, 255 = white; NaN
+    #: where there is no floor or an object lies on it. None: not known.
     albedo: Callable[[MapGrid], NDArray[np.float32]] | None = None
-    #: function that returns whether points (x, y) [m] lie in the asked area. None: not known.
+    #: returns whether points (x, y) [m] lie in the asked area. None: not known.
     in_area: Callable[[Array, Array], NDArray[np.bool_]] | None = None
     #: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a height grid
     #: without objects and for the surrogate. `height_m` is the height of the highest surface, floor or object.

@@ -24,7 +24,6 @@ def reading(file: Path, key: str = "", allowed: str = "", most_bytes: int = _MOS
     Args:
         key: key of the scenario that names the file; "": the error names the file itself.
         allowed: the files that are allowed, for the error.
-        most_bytes: largest size of the file.
 
     Raises:
         TwinError: the file is missing, not a regular file or too large, or its reader raised an exception.
@@ -99,10 +98,7 @@ def is_file(path: Path) -> bool:
 
 
 def resolved(path: Path) -> Path:
-    """Returns the absolute path without symbolic links; a path that cannot be resolved is only made absolute.
-
-    Opening such a path later raises an error that states the reason.
-    """
+    """Returns the absolute path without symbolic links; a path that cannot be resolved is only made absolute."""
     try:
         return path.resolve()
     except (OSError, ValueError, RuntimeError):  # too long; null byte; loop of links
@@ -110,11 +106,7 @@ def resolved(path: Path) -> Path:
 
 
 def path_problem(path: Path) -> str | None:
-    """Returns why the file system rejects a path, or None; the path need not exist.
-
-    The reasons are a null byte, bytes that are not UTF-8, excessive length, a loop of links, a link to a missing file,
-    or a missing permission in the folders above.
-    """
+    """Returns why the file system rejects a path, or None; the path need not exist."""
     text = str(path)
     if "\0" in text:
         return "contains a null byte"

@@ -28,8 +28,8 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
     """Returns the area of a survey in the scene.
 
     Raises:
-        TwinError: the keys of the plan contradict each other, the polygon cannot be read or is invalid, the terrain
-            lacks the coordinates that the plan needs, or the polygon or the centre lies outside the terrain.
+        TwinError: keys of the plan contradict each other, the polygon is invalid, or the terrain lacks the coordinates
+            that the plan needs or does not contain the polygon or the centre.
     """
     heading = math.radians(plan.heading_deg)
     if plan.polygon is None:
@@ -46,7 +46,6 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
 
 
 def _centre(plan: PlanConfig, terrain: Terrain) -> Corner:
-    """Returns the centre of the area in the scene [m]."""
     if plan.centre_crs is None:
         _check_inside("plan.centre_m", np.array([plan.centre_m]), terrain)
         return plan.centre_m
@@ -59,15 +58,12 @@ def _centre(plan: PlanConfig, terrain: Terrain) -> Corner:
             [terrain.west_m, terrain.east_m], [terrain.south_m, terrain.north_m]
         )
         shown = ", ".join(f"{c:.2f}" for c in plan.centre_crs)
-        raise TwinError(
-            "plan.centre_crs", f"[{shown}] lies outside the DEM",
-            f"easting {west:.2f} to {east:.2f}, northing {south:.2f} to {north:.2f}",
-        )  # fmt: skip
+        allowed = f"easting {west:.2f} to {east:.2f}, northing {south:.2f} to {north:.2f}"
+        raise TwinError("plan.centre_crs", f"[{shown}] lies outside the DEM", allowed)
     return x, y
 
 
 def _georeference(field: str, terrain: Terrain) -> Georeference:
-    """Returns the georeference of a terrain. Raises TwinError if it has none."""
     if terrain.georeference is None:
         raise TwinError(field, "the terrain has no coordinates", "a GeoTIFF with coordinates as terrain.height_file")
     return terrain.georeference
@@ -78,10 +74,12 @@ def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
     outside = np.isnan(terrain.height_at(*points.T))
     if outside.any():
         x, y = points[outside][0]
-        raise TwinError(
-            field, f"({x:.2f}, {y:.2f}) lies outside the terrain",
-            f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m",
-        )  # fmt: skip
+        raise TwinError(field, f"({x:.2f}, {y:.2f}) lies outside the terrain", extent_of(terrain))
+
+
+def extent_of(terrain: Terrain) -> str:
+    """Returns the extent of a terrain as text, for errors."""
+    return f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m"
 
 
 def read_geojson(file: Path, terrain: Terrain) -> Array:
@@ -91,13 +89,9 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
     latitude (RFC 7946) if the DEM names its CRS, all of them lie within +-180 and +-90 degrees and, read in the CRS of
     the DEM, no corner lies on the DEM; otherwise they are in the CRS of the DEM.
 
-    Args:
-        file: the GeoJSON file.
-        terrain: the floor, which determines the position of the scene in the CRS of the DEM.
-
     Raises:
-        TwinError: the file cannot be read or does not contain exactly one polygon without holes, its coordinates cannot
-            be transformed, or the terrain has no coordinates.
+        TwinError: the file does not contain exactly one polygon without holes, its coordinates cannot be transformed,
+            or the terrain has no coordinates.
     """
     tree = read_json(file, "plan.polygon", _ONE_POLYGON, _MAX_GEOJSON_BYTES)
     corners = shapely.get_coordinates(_polygon(tree, file).exterior)

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from twin.controllers.segments import Reference
 from twin.core.geometry import Array
 from twin.core.records import Frame
-from twin.world.mission import FrameSequence, Mission, Step
+from twin.world.mission import FrameSequence, Mission
 from twin.world.pace import FULL, Pace
 from twin.world.world import FastForward, World
 
@@ -15,17 +15,14 @@ from twin.world.world import FastForward, World
 class Flight:
     """Flight of a mission through its world: all tracks, with station keeping after each of them.
 
-    `start` returns the first frame; `step` moves the vehicle and returns the next one, or None after the last frame.
-
     Args:
-        mission: the survey to fly.
         world: simulates the vehicle and returns the frames; nothing has been flown in it before.
         fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
 
     Attributes:
         track: number of the track of the current frame, from 1.
-        aligns: whether the current frame is the first one of the second half of the station keeping after a track: the
-            network is aligned before this frame is estimated.
+        aligns: whether the network is aligned before the current frame is estimated: it is the first one of the second
+            half of the station keeping after a track.
         n_skipped: number of frames that `fast_forward` simulated in the last step.
     """
 
@@ -37,7 +34,7 @@ class Flight:
 
     @property
     def reference(self) -> Reference:
-        """Returns the planned position, velocity, yaw and acceleration of the left camera at the current frame."""
+        """Returns the plan of the left camera at the current frame."""
         return self._step.reference
 
     @property
@@ -82,20 +79,18 @@ class Flight:
         return self._observe(keyframe)
 
     def _planned_parts(self) -> Iterator[tuple[FrameSequence, int, bool]]:
-        """Yields the planned sequences of frames, each with its track and whether the network is aligned before it."""
+        """Yields the planned sequences, each with its track and the value of `aligns` at its first frame."""
         for track in self.mission.tracks:
             yield self.mission.planned_frames(track), track, False
             yield self.mission.station_keeping_frames(track), track, False
             yield self.mission.station_keeping_frames(track), track, True
 
     def _enter(self, sequence: FrameSequence, track: int, aligns: bool = False) -> None:
-        """Starts a sequence of frames of a track; `aligns` is the value of the attribute at its first frame."""
         self._sequence, self._k = sequence, 0
         self.track, self.aligns = track, aligns
         self.world.start_sequence(sequence, track)
 
     def _observe(self, keyframe: bool | None = None) -> Frame:
-        """Returns the frame at the current pose; `keyframe` is whether it is a keyframe (None: as planned)."""
         planned = self._sequence[self._k]
-        self._step: Step = planned if keyframe is None else planned._replace(keyframe=keyframe)
+        self._step = planned if keyframe is None else planned._replace(keyframe=keyframe)
         return self.world.observe(self._step)

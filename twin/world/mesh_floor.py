@@ -84,10 +84,9 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
 
 
 def floor_surface(floor: MeshFloor, grid: MapGrid) -> TopSurface:
-    """Returns the highest surface of a mesh floor at the cell centres of a grid.
+    """Returns the highest surface of a mesh floor at the cell centres of a grid; in its holes, that of `floor.under`.
 
-    In holes of the mesh, it is the height of `floor.under`. A cell is overhung if the highest surface of the mesh that
-    faces down lies more than OVERHANG_M above the lowest one that faces up.
+    A cell is overhung if the highest surface that faces down lies more than OVERHANG_M above the lowest that faces up.
     """
     meshes = [tile.placed.model.levels[0].mesh for tile in floor.tiles.tiles]
     top = -_depth(meshes, grid, FROM_ABOVE)
@@ -111,7 +110,7 @@ def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
     """Returns the grid whose cell centres are the nodes of the height grid, centred at the origin as the mesh is.
 
     The spacing is the median length of an edge, but at least FINEST_GRID_M and at most `coarsest_m`, or as large as
-    MOST_NODES requires. Raises TwinError if the mesh is too small for two nodes along x or y.
+    MOST_NODES requires.
     """
     low, high = extent(mesh)
     size = (high - low)[:2]
@@ -133,10 +132,7 @@ def _depth(meshes: Sequence[Mesh], grid: MapGrid, axes: Array) -> Layer:
 
 
 def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
-    """Returns the least height (rows, cols) of the surfaces that face up in each cell; inf where there are none.
-
-    It is taken over the points of the surfaces at the cell centre and over their vertices in the cell.
-    """
+    """Returns the least height (rows, cols) of the surfaces that face up, at the centre and the vertices in a cell."""
     low = _depth([upward], grid, FROM_BELOW)
     x, y, z = upward.vertices_m[np.unique(upward.faces)].T
     col, row = (x - grid.west_m) / grid.cell_m, (grid.north_m - y) / grid.cell_m
@@ -192,10 +188,7 @@ def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) 
 
 
 def _terrain(height_m: Layer, grid: MapGrid, texture: Image, covered: NDArray[np.bool_]) -> terrains.Terrain:
-    """Returns the terrain with a texture and the heights (rows, cols) of the nodes at the cell centres of a grid.
-
-    Row 0 of the heights is in the north. `covered` (rows, cols) marks the nodes that the mesh covers.
-    """
+    """Returns the terrain with the heights (rows, cols) of the nodes, of which the mesh covers those in `covered`."""
     west_m, south_m = grid.west_m + grid.cell_m / 2, grid.north_m - (grid.rows - 0.5) * grid.cell_m
     heights = np.ascontiguousarray(height_m[::-1], np.float32)
     texel_m = (grid.cols - 1) * grid.cell_m / texture.shape[1]

@@ -27,6 +27,7 @@ from twin.scenario.model import BeaconConfig, Scenario, Source
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
+from twin.world.asked_area import extent_of
 from twin.world.floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
@@ -226,10 +227,7 @@ def _illumination(scenario: Scenario) -> Illumination:
 
 
 def motion_rate_hz(scenario: Scenario) -> float:
-    """Returns the number of simulated steps of the vehicle per second.
-
-    These are the timesteps of the physics or, for a kinematic vehicle, the frames.
-    """
+    """Returns the rate of the simulated steps of the vehicle: timesteps or, for a kinematic vehicle, frames."""
     frame_rate_hz = scenario.rig.frame_rate_hz
     rigid = scenario.vehicle.dynamics == "rigid"
     return round(1 / (frame_rate_hz * physics_timestep_s(frame_rate_hz))) * frame_rate_hz if rigid else frame_rate_hz
@@ -240,8 +238,7 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
     x, y, z = beacon.position_m
     field, floor_m = f"beacons.{number}.position_m", float(terrain.height_at(x, y))
     if np.isnan(floor_m):
-        allowed = f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m"
-        raise TwinError(field, f"({x:g}, {y:g}) lies outside the terrain", allowed)
+        raise TwinError(field, f"({x:g}, {y:g}) lies outside the terrain", extent_of(terrain))
     if z < floor_m:
         raise TwinError(field, f"z {z:g} is below the floor", f"above {floor_m:.3f} m")
 
@@ -259,10 +256,7 @@ def _check_path(
 
 
 def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
-    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m.
-
-    Footprints may be larger than on the reference plane where the path is higher or the floor lower.
-    """
+    """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
     highest_m = plan.altitude_m if plan.surface is None else planned_references(plan).position[:, 2].max()
     widest = max(1.0, float(highest_m - terrain.lowest_m) / plan.altitude_m)
     corners, margin = plan.outline()[:, :2], np.array(_half_extent_m(plan)) * widest + 0.5

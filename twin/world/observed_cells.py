@@ -20,11 +20,9 @@ class Coverage:
 
     A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
     left image, both cameras see these points, and there is no depth edge between them. With `top_m`, the quad must not
-    lie more than the side of a cell below that surface: floor that the cameras see below an overhang is not observed,
-    as the map has the height of the overhang there.
+    lie more than the side of a cell below that surface, as the map has the height of overhangs.
 
     Args:
-        grid: grid of the map.
         rig: calibration of the cameras of the depth images.
         top_m: (rows, cols) true height of the surface seen from above [m]; None: the floor has no overhangs.
 
@@ -81,8 +79,7 @@ def _mark_seen(seen, raster, pose, camera, left, right, top):
 def _in_both(u, v, left, right, camera):
     """Returns whether both cameras see the floor point at pixel (u, v) of the left image.
 
-    The right camera sees the point if its projection lies in the right image, and its depth lies between the depths of
-    the two right pixels next to the projection, within DEPTH_TOLERANCE.
+    Its depth must lie between those of the two right pixels next to its projection, within DEPTH_TOLERANCE.
     """
     z = left[v, u]
     if not (z > 0 and z < np.inf):

@@ -18,11 +18,7 @@ def floor_of(mission: Mission) -> FloorField:
 
 
 class Obstacles:
-    """Floor and objects of a mission. Plants are upright and rigid.
-
-    Args:
-        mission: the mission.
-    """
+    """Floor and objects of a mission. Plants are upright and rigid."""
 
     def __init__(self, mission: Mission):
         self._floor, self._objects = floor_of(mission), mission.objects

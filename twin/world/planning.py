@@ -40,10 +40,7 @@ _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """Returns the plan of a survey, with height and spacing adapted to the floor if the scenario requests it.
 
-    They are not adapted if the path leaves the terrain, nor the spacing if it meets the floor, which `prepare` reports.
-
-    Args:
-        terrain: the floor; None: the survey is planned over the reference plane.
+    They are not adapted without a terrain or if the path leaves it, nor the spacing if the path meets the floor.
 
     Raises:
         TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `check_plan_size`.
@@ -67,9 +64,8 @@ def check_plan_size(plan: SurveyPlan, hold_s: float) -> None:
     """Raises TwinError if a plan has more than `MAX_FRAMES` frames or `MAX_KEYFRAMES` keyframes."""
     duration_s = sum(plan.track_duration_s(track) for track in range(1, plan.n_tracks + 1))
     n_frames = (duration_s + hold_s * plan.n_tracks) * plan.frame_rate_hz
-    _check_number(
-        "plan.area_m", n_frames, MAX_FRAMES, "frames", "fewer plan.tracks, a smaller area, less overlap, more speed"
-    )
+    remedy = "fewer plan.tracks, a smaller area, less overlap, more speed"
+    _check_number("plan.area_m", n_frames, MAX_FRAMES, "frames", remedy)
     n_keyframes = duration_s * plan.frame_rate_hz / plan.n_frames_per_keyframe
     _check_number("plan.overlap_along", n_keyframes, MAX_KEYFRAMES, "keyframes", "less overlap, or fewer plan.tracks")
 
@@ -82,16 +78,12 @@ def check_map_size(grid: MapGrid) -> None:
 
 
 def _check_number(field: str, number: float, limit: int, items: str, remedy: str) -> None:
-    """Raises TwinError if a number of items exceeds its limit."""
     if number > limit:
         raise TwinError(field, f"{number:.4g} {items} are too many", f"up to {limit}: {remedy}")
 
 
 def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest:
-    """Returns the requirements of the survey of a scenario.
-
-    Args:
-        terrain: the floor, in which the area is placed; None: the area lies at the origin.
+    """Returns the requirements of a survey; without a terrain, its area lies at the origin.
 
     Raises:
         TwinError: the area cannot be placed, or the vehicle cannot turn on the spot.

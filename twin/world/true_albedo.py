@@ -53,12 +53,11 @@ def _samples(texture: Image, across: Layer, down: Layer) -> Image:
 
 
 def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | None, map_grid: MapGrid) -> Layer:
-    """Returns the albedo (rows, cols, 3) of the floor with NaN where an object is the true surface of the map.
+    """Returns the albedo (rows, cols, 3) of the floor on `grid`, with NaN where an object is the surface of the map.
 
     Args:
-        albedo: (rows, cols, 3) albedo of the floor on `grid`.
         grid: grid of the albedo, within `map_grid`.
-        objects: 1 + number of the object at the top of each cell of `map_grid`, 0 for the floor; None without objects.
+        objects: `TopSurface.objects` on `map_grid`.
     """
     if objects is None:
         return albedo

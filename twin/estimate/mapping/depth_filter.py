@@ -48,8 +48,7 @@ class PropagatedDepth(NamedTuple):
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
     """Returns the depth map of a disparity map: Z = f b / d with the standard deviation Z^2 / (f b) sigma_d.
 
-    f is the focal length [px], b the baseline [m], d the disparity [px] and sigma_d its standard deviation [px].
-    Disparities below 0.5 px are set to 0.5 px.
+    Disparities d below 0.5 px are set to 0.5 px.
     """
     focal_baseline = np.float32(rig.focal_px * rig.baseline_m)
     depth = focal_baseline / np.maximum(disparity.disparity_px, np.float32(0.5))
@@ -60,8 +59,7 @@ def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
 def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
     """Returns the fusion of two depth maps of the same image, by a scalar Kalman update of each pixel.
 
-    A pixel is updated if its innovation passes the gate (see `GATE`); otherwise it keeps its prior depth. A pixel whose
-    depth is known in only one of the maps is taken from that map.
+    A pixel whose innovation does not pass the `GATE` keeps its prior depth. A depth known in only one map is taken.
     """
     fused = DepthMap(prior.depth_m.copy(), prior.variance_m2.copy())
     _fuse(*fused, *measured, GATE)
@@ -71,10 +69,9 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
 def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
     """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth (as `fuse` does).
 
-    Backward warping: each new pixel is linearised at its stereo depth (or, without one, at the smallest depth of the
-    old points that project there) and projected into the old image, whose map is interpolated except across
-    discontinuities. The difference of depth is converted, with the surface normal, to one along the ray of the new
-    pixel.
+    Each new pixel is linearised at its stereo depth (or, without one, at the smallest depth of the old points that
+    project there) and projected into the old image, whose map is interpolated except across discontinuities. The
+    difference of depth is converted, with the surface normal, to one along the ray of the new pixel.
 
     Args:
         new_from_old: (4, 4) pose of the old camera in the new camera.
@@ -100,8 +97,7 @@ def motion_depth(
 
     Args:
         gray, old_gray: (H, W) float32 grey levels of the left images of the new and the old keyframe.
-        old_from_new: (4, 4) pose of the new camera in the old camera.
-        step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
+        step_cov: as in `propagate`.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
@@ -170,10 +166,9 @@ def _transform_pixel(u, v, depth, pose, camera):
 
 @kernel(inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
-    """Returns depth and variance at column x and row y, interpolated between the four neighbouring pixels.
+    """Returns depth and variance at column x and row y, interpolated (inverse depth, linear on planes, and variance).
 
-    NaN if a neighbour is unknown, on another surface (disparities differ by `jump` [px]) or outside. Inverse depth is
-    linear on planes. The variance is interpolated too, because neighbouring matching windows overlap.
+    NaN if a neighbouring pixel is unknown, on another surface (disparities differ by `jump` [px]) or outside.
     """
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
@@ -194,8 +189,7 @@ def _bilinear(depth, variance, x, y, focal_baseline, jump):
 def _normal(depth, u, v, camera, focal_baseline, jump):
     """Returns the surface normal (x, y, z) at a pixel, scaled so that normal . ray = 1 / depth, for a ray with z = 1.
 
-    The gradient of inverse depth is set to zero across a depth discontinuity, next to an unknown pixel and at the
-    image border.
+    The gradient of inverse depth is zero across discontinuities, next to unknown pixels and at the image border.
     """
     (focal, cx, cy), (height, width) = camera, depth.shape
     slope_u, slope_v = 0.0, 0.0
@@ -213,10 +207,7 @@ def _normal(depth, u, v, camera, focal_baseline, jump):
 
 @kernel
 def _backward_warp(old, old_variance, guess, pose, step_cov, camera, focal_baseline, jump):
-    """Returns depth and variance (H, W) of the old map in the new image, linearised at the depths `guess` (H, W).
-
-    They are NaN where the old map gives no depth. `pose` is that of the new camera in the old one.
-    """
+    """Returns depth and variance (H, W) of the old map in the new image, linearised at `guess` (H, W); NaN: none."""
     height, width = old.shape
     focal, cx, cy = camera
     depth, variance = np.full(old.shape, np.float32(np.nan)), np.full(old.shape, np.float32(np.nan))

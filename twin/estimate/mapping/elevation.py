@@ -40,14 +40,13 @@ class ElevationMapper:
     edge in another. A height z of variance R updates the best-fitting hypothesis h of variance P if (z - h)^2 < GATE (P
     + R). Otherwise it becomes another one, or replaces the one with the larger depth variance if its own is smaller.
     The lower one is the result unless the higher one has less than a tenth of its depth variance (right in 84 % of the
-    cells of the horseshoe reef) or too few neighbours support it (`_isolated`). Hypotheses that their last camera
-    cannot have seen are dropped (`visibility`), and cells that contradict all neighbours have no result
-    (`_contradicted`).
+    cells of the horseshoe reef) or too few neighbours support it. Hypotheses that their last camera cannot have seen
+    are dropped (`visibility`), and cells that contradict all neighbours have no result.
 
-    The depth variance is independent between patches and decreases with each fusion; the variance of pose and smoothing
-    is common to them, so it is averaged. The result adds, with f the standard deviation of the lateral error per two
-    cells, f^2 times the squared range of heights around the cell, f times the squared step across it if larger than a
-    cell, and the variance of the choice between hypotheses.
+    The depth variance is independent between patches; the variance of pose and smoothing is common to them, so it is
+    averaged. The result adds, with f the standard deviation of the lateral error per two cells, f^2 times the squared
+    range of heights around the cell, f times the squared step across it if larger than a cell, and the variance of the
+    choice between hypotheses.
     """
 
     def __init__(self, grid: MapGrid):
@@ -65,7 +64,7 @@ class ElevationMapper:
         """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
 
         A cell was propagated if the successor has a height for it, at a pixel whose depth contains information from
-        this keyframe, and the two heights agree. The information on each cell therefore enters the map exactly once.
+        this keyframe, and the two heights agree.
 
         Args:
             successor: heights of the next keyframe; None for the last one, or if the next one is outside the grid.
@@ -87,8 +86,6 @@ class ElevationMapper:
         """Adds an image to the orthomosaic, a weighted mean of images whose weights decrease from their centres.
 
         Args:
-            patch: heights of the keyframe, with the pixel of each cell.
-            rgb: (H, W, 3) left image of the keyframe.
             gain: (H, W, 3) factors by which the image is multiplied to make its illumination uniform.
         """
         _add_colours(patch.row, patch.col, patch.height_m, patch.pixel, rgb, gain, self._colour)
@@ -237,11 +234,7 @@ def _remove_propagated(
 def _fuse_cells(
     row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
 ):  # fmt: skip
-    """Fuses each height of a patch with the hypothesis of its cell that fits best within the gate, in place.
-
-    A height that fits none becomes a hypothesis, or replaces the one with the larger depth variance if its own is
-    smaller.
-    """
+    """Fuses each height of a patch with the hypotheses of its cell (see `ElevationMapper`), in place."""
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]

@@ -39,10 +39,7 @@ class PatchColours(NamedTuple):
 
 
 def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
-    """Returns the factors (n, 3) by which to multiply n images so that the given exposures become equal.
-
-    None if any exposure is unknown, or without images.
-    """
+    """Returns the factors (n, 3) that make the exposures of n images equal; None if one is unknown, or n is 0."""
     known = [exposure for exposure in exposures if exposure is not None]
     if not known or len(known) < len(exposures):
         return None
@@ -51,10 +48,10 @@ def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
 
 
 def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the centres (n, 3) of the patches, in the axes of the map [m].
+    """Returns the centres (n, 3) of the patches in the axes of the map [m]: known cells about `_PATCH_PX` pixels apart.
 
-    They are known cells of the map on a square grid, whose spacing is about `_PATCH_PX` pixels in an image at the depth
-    `depth_m` [m].
+    Args:
+        depth_m: depth of the floor in the images.
     """
     step = max(1, round(_PATCH_PX * depth_m / rig.focal_px / elevation.grid.cell_m))
     x, y = elevation.grid.centres()
@@ -64,14 +61,10 @@ def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Arr
 
 
 def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points: Array) -> PatchColours:
-    """Returns the mean colours of patches of the floor in one image.
+    """Returns the mean colours of the patches at points (n, 3) of the floor in one image, weighted by a Gaussian.
 
-    The mean is weighted by a Gaussian. Patches that are not completely in the image, or are too dark, are left out.
-
-    Args:
-        image: (H, W, 3) image.
-        world_from_camera: (4, 4) pose of the camera in the axes of the map.
-        points: (n, 3) centres of the patches in the axes of the map [m] (`patch_points`).
+    Patches that are not completely in the image, or are too dark, are left out. Pose and points are in the axes of the
+    map [m].
     """
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)
     last = np.array([rig.width_px - 1, rig.height_px - 1]) - _PATCH_PX / 2
@@ -87,10 +80,7 @@ def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points
 
 
 def estimated_factors(colours: Iterable[PatchColours]) -> Array:
-    """Returns the factors (n, 3) by which to multiply n images so that their exposures are equal.
-
-    They are estimated from the colours of the patches in each image, and are 1 if no image shows a patch.
-    """
+    """Returns the factors (n, 3) that make the exposures of n images equal, from their patches; 1 without patches."""
     views = list(colours)
     image = np.repeat(np.arange(len(views)), [len(view.patch) for view in views])
     if not len(image):

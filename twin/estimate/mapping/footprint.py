@@ -32,10 +32,7 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MO
     """Returns the grid that covers all keyframe images, each projected to the median depth of its matched points.
 
     A cell is as large as three pixels at the median depth of all keyframes, or larger to limit the grid to about
-    `most_cells` cells.
-
-    Args:
-        result: result of a survey with at least one keyframe, whose final trajectory is in the axes of the map.
+    `most_cells` cells. The final trajectory of the result, with at least one keyframe, is in the axes of the map.
     """
     seen = _corners(result, rig).reshape(-1, 2)
     cell = _CELL_PX * float(np.median(result.keyframe_depth_m)) / rig.focal_px
@@ -74,14 +71,10 @@ def footprint_tiles(
 
 
 def steps_between(step_cov: Array, keyframes: NDArray[np.int64]) -> Array:
-    """Returns the covariance (m, 6, 6) of each chosen keyframe relative to the chosen one before it.
+    """Returns the covariance (m, 6, 6) of each of the chosen keyframes (m,), m > 0, relative to the chosen one before.
 
-    It is the sum of the covariances of the steps between them, without their lever arms: between keyframes that are far
-    apart, nothing is propagated.
-
-    Args:
-        step_cov: (n, 6, 6) covariance of each keyframe relative to the keyframe before it.
-        keyframes: (m,) increasing numbers of the chosen keyframes, m > 0.
+    It is the sum of the covariances `step_cov` (n, 6, 6) of the steps between them, without their lever arms: between
+    keyframes that are far apart, nothing is propagated.
     """
     first, until = step_cov[keyframes[:1]], step_cov[: keyframes[-1] + 1]
     if len(keyframes) == 1:

@@ -77,7 +77,7 @@ def build_map(
 
     Args:
         progress: called with the number of keyframes processed so far.
-        pattern: light pattern of the images, which is subtracted before matching; None: it is not known.
+        pattern: light pattern of the images, which is subtracted before matching.
     """
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     search_range = disparity.SearchRange(rig)
@@ -124,11 +124,7 @@ def _measure_depth(
 def _advance(
     old: _FilterState, stereo_depth: DepthMap, gray: Map, pose: Array, step_cov: Array, rig: StereoRig
 ) -> tuple[DepthMap, Mask]:
-    """Advances the filter to the next keyframe: propagation, fusion with stereo depth, fusion with depth from motion.
-
-    Returns:
-        The filtered depth map, and a mask (H, W) of its pixels whose depth contains information from the old depth map.
-    """
+    """Returns the filtered depth of the next keyframe, and a mask (H, W) of the pixels that inherit from `old`."""
     old_from_new = geometry.inverse(old.pose) @ pose
     propagated = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)
     motion = depth_filter.motion_depth(gray, old.gray, propagated.fused, old_from_new, step_cov, rig)

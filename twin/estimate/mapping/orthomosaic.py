@@ -88,21 +88,14 @@ def orthomosaic(
 
 
 def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid:
-    """Returns the grid of an orthomosaic, whose pixels divide the cells of the map.
-
-    A pixel is not larger than the ground sample distance of the images at the median of their depths.
-    """
+    """Returns the grid of an orthomosaic: pixels that divide the cells of the map, up to the median sample distance."""
     return finer_grid(elevation.grid, float(np.median(views.depth_m)) / rig.focal_px)
 
 
 def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
-    """Returns the heights (rows, cols) [m] of a map at the pixels of a finer grid, linearly interpolated.
+    """Returns the heights (rows, cols) [m] of a map at the pixels of a grid that divide its cells, by interpolation.
 
-    Small holes of the map are filled with the height of the nearest mapped cell; other holes and pixels outside the map
-    are NaN.
-
-    Args:
-        part: grid whose pixels divide the cells of the map; it may extend beyond the map.
+    Small holes of the map have the height of the nearest mapped cell; other holes and pixels outside are NaN.
     """
     grid, n = elevation.grid, round(elevation.grid.cell_m / part.cell_m)
     first = np.array([grid.north_m - part.north_m, part.west_m - grid.west_m]) / grid.cell_m
@@ -135,7 +128,6 @@ def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
 
 
 def _exposure_factors(views: Views, elevation: ElevationMap, rig: StereoRig) -> Array:
-    """Returns the factors (n, 3) by which to multiply the n images so that their exposures are equal."""
     if (reported := reported_factors(views.exposures)) is not None:
         return reported
     points, poses = patch_points(elevation, rig, float(np.median(views.depth_m))), views.world_from_camera

@@ -53,9 +53,6 @@ def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, 
 
     It encloses the parts of the corner rays between the highest and the lowest floor (`heights_m`), from the camera if
     that is lower; infinite if the camera is not above the lowest floor or a ray does not point downwards.
-
-    Args:
-        world_from_camera: (4, 4) pose of the camera in the axes of the map.
     """
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
     corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -80,11 +77,7 @@ class Colours(NamedTuple):
 def add_view(
     layers: OrthoLayers, colours: Colours, world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]
 ) -> None:
-    """Adds an image to the layers, in place.
-
-    Args:
-        world_from_camera: (4, 4) pose of the camera in the axes of the map.
-    """
+    """Adds an image to the layers, in place; the pose (4, 4) of its camera is in the axes of the map."""
     grid = layers.grid
     bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)
     if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
@@ -105,9 +98,7 @@ def add_view(
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
-    """Returns first row, end row, first column and end column of the pixels within a box (west, south, east, north)
-    [m].
-    """
+    """Returns first row, end row, first and end column of the pixels within a box (west, south, east, north) [m]."""
     west, south, east, north = box_m
     rows = np.clip([(grid.north_m - north) / grid.cell_m, (grid.north_m - south) / grid.cell_m + 1], 0, grid.rows)
     cols = np.clip([(west - grid.west_m) / grid.cell_m, (east - grid.west_m) / grid.cell_m + 1], 0, grid.cols)
@@ -116,10 +107,7 @@ def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
 
 @kernel(error_model="numpy")
 def _mark_nearest(height, first, end, left, right, steps, origin, _, camera, nearest):
-    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each image pixel shows, inf if none.
-
-    An orthomosaic pixel is shown by the 2 x 2 image pixels around its projection.
-    """
+    """Writes to `nearest` (H, W) the smallest depth of the orthomosaic pixels that each image pixel shows, or inf."""
     focal, cx, cy = camera
     for i in range(first, end):
         for j in range(left, right):

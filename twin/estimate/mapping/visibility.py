@@ -25,12 +25,7 @@ _SIGMAS = 3.0
 def main_surface(height: Map, variance: Map) -> Mask:
     """Returns a mask (rows, cols) of the known cells in connected groups of more than `LARGEST_ISLAND` cells.
 
-    Neighbouring cells, of heights h and k, are connected if (h - k)^2 < GATE (P + Q), with P and Q the variances of the
-    two cells.
-
-    Args:
-        height: (rows, cols) heights [m]; NaN where unknown.
-        variance: (rows, cols) variance of the difference from a level floor [m2].
+    Neighbouring cells, of heights h and k and variances P and Q, are connected if (h - k)^2 < GATE (P + Q).
     """
     return _large_groups(height, variance, GATE, LARGEST_ISLAND)
 
@@ -98,13 +93,7 @@ def _large_groups(height, variance, gate, largest):
 
 @kernel
 def _blocked(height, camera, cameras_m, low, variance, highest, corner):
-    """Compiled kernel of `hidden`.
-
-    Args:
-        low: (rows, cols) from `_lowest`.
-        highest: greatest height of the surface [m]; a line of sight is free above it.
-        corner: west, north and cell size of the grid [m].
-    """
+    """Compiled kernel of `hidden`, with `low` from `_lowest`; a line of sight is free above `highest`."""
     rows, cols = height.shape
     blocked = np.zeros((rows, cols), np.bool_)
     for row in range(rows):
