@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
-from typer import Argument, Option
 
 from twin import api
 from twin.app import console, outputs
@@ -41,33 +40,43 @@ reproductions = typer.Typer(
 )
 app.add_typer(reproductions, name="reproduce")
 
+
+def option(text: str, metavar: str | None = None, flag: str = "", **limits: Any) -> Any:
+    """Returns the declaration of an option with its help text; the flag is by default the name of the parameter."""
+    return typer.Option(*([flag] if flag else []), metavar=metavar, help=text, **limits)
+
+
+def argument(text: str, metavar: str) -> Any:
+    """Returns the declaration of an argument with its help text and its name in the usage."""
+    return typer.Argument(metavar=metavar, help=text)
+
+
 # Arguments and options of several commands. In help texts, a bracket is escaped, because Rich takes words in brackets
 # for style tags.
-Scene = Annotated[str, Argument(metavar="SCENE", help="Scenario: a name in scenes/ or the path of a TOML file.")]
-RunFolder = Annotated[Path, Argument(metavar="RUN", help="Folder of a run.")]
+Scene = Annotated[str, argument("Scenario: a name in scenes/ or the path of a TOML file.", "SCENE")]
+RunFolder = Annotated[Path, argument("Folder of a run.", "RUN")]
 Overrides = Annotated[
-    list[str],
-    Option("--set", metavar="KEY=VALUE", help="Override a key of the scenario, as in plan.tracks=2; repeatable."),
+    list[str], option("Override a key of the scenario, as in plan.tracks=2; repeatable.", "KEY=VALUE", flag="--set")
 ]
-RunOut = Annotated[Path | None, Option("--out", help="Folder to write. Default: runs/NAME-SEED.")]
-OutFolder = Annotated[Path, Option("--out", help="Folder to write.")]
-Quick = Annotated[bool, Option("--quick", help="Use smaller plans, images or selections of cases.")]
+RunOut = Annotated[Path | None, option("Folder to write. Default: runs/NAME-SEED.")]
+OutFolder = Annotated[Path, option("Folder to write.")]
+Quick = Annotated[bool, option("Use smaller plans, images or selections of cases.", flag="--quick")]
 Jobs = Annotated[
     int | None,
-    Option("--jobs", min=1, max=1024, help="Parallel surveys, each a process or a SLURM job. Default: one per core."),
+    option("Parallel surveys, each a process or a SLURM job. Default: one per core.", min=1, max=1024),
 ]
 Extrapolate = Annotated[
     bool,
-    Option(
-        "--extrapolate",
-        help="Fly surrogate surveys outside the range of the error model's fit, with a warning, instead of refusing.",
+    option(
+        "Fly surrogate surveys outside the range of the error model's fit, with a warning, instead of refusing.",
+        flag="--extrapolate",
     ),
 ]
 AllowPlugins = Annotated[
-    bool, Option("--allow-plugins", help="Load plug-ins named as module:Class, which run code of any module.")
+    bool, option("Load plug-ins named as module:Class, which run code of any module.", flag="--allow-plugins")
 ]
-MetricsJson = Annotated[bool, Option("--json", help="Print only the metrics, as JSON.")]
-SummaryJson = Annotated[bool, Option("--json", help="Print only a summary, as JSON.")]
+MetricsJson = Annotated[bool, option("Print only the metrics, as JSON.", flag="--json")]
+SummaryJson = Annotated[bool, option("Print only a summary, as JSON.", flag="--json")]
 
 
 def main() -> None:
@@ -93,9 +102,9 @@ def demo(out: RunOut = None) -> None:
 def run(
     scene: Scene,
     overrides: Overrides = [],  # noqa: B006 (typer copies it)
-    seed: Annotated[int | None, Option(min=0, help="Seed of all random numbers.")] = None,
+    seed: Annotated[int | None, option("Seed of all random numbers.", min=0)] = None,
     out: RunOut = None,
-    live: Annotated[bool, Option("--live", help="Show the survey in Rerun while it runs.")] = False,
+    live: Annotated[bool, option("Show the survey in Rerun while it runs.", flag="--live")] = False,
     as_json: MetricsJson = False,
     extrapolate: Extrapolate = False,
     allow_plugins: AllowPlugins = False,
@@ -109,10 +118,10 @@ def run(
 def plan(
     scene: Scene,
     overrides: Overrides = [],  # noqa: B006 (typer copies it)
-    out: Annotated[Path | None, Option(help="PNG to write. Default: runs/NAME-plan.png.")] = None,
-    as_json: Annotated[bool, Option("--json", help="Print only the predicted properties, as JSON.")] = False,
+    out: Annotated[Path | None, option("PNG to write. Default: runs/NAME-plan.png.")] = None,
+    as_json: Annotated[bool, option("Print only the predicted properties, as JSON.", flag="--json")] = False,
     strict: Annotated[
-        bool, Option("--strict", help="Exit with status 1 if a requirement is expected to be missed.")
+        bool, option("Exit with status 1 if a requirement is expected to be missed.", flag="--strict")
     ] = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
@@ -135,18 +144,17 @@ def look(
     scene: Scene,
     overrides: Overrides = [],  # noqa: B006 (typer copies it)
     at: Annotated[
-        str | None,
-        Option(metavar="X,Y,Z", help="Position of the left camera \\[m]. Default: centre of the survey."),
+        str | None, option("Position of the left camera \\[m]. Default: centre of the survey.", "X,Y,Z")
     ] = None,
     twist: Annotated[
         str | None,
-        Option(
-            metavar="VX,VY,VZ,WX,WY,WZ",
-            help="Velocity of the vehicle during the exposure: forward, left, up \\[m/s], and about these axes "
+        option(
+            "Velocity of the vehicle during the exposure: forward, left, up \\[m/s], and about these axes "
             "\\[deg/s]. Default: at rest.",
+            "VX,VY,VZ,WX,WY,WZ",
         ),
     ] = None,
-    out: Annotated[Path | None, Option(help="PNG to write. Default: runs/NAME-look.png.")] = None,
+    out: Annotated[Path | None, option("PNG to write. Default: runs/NAME-look.png.")] = None,
     as_json: SummaryJson = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
@@ -177,9 +185,9 @@ def turbidity(out: OutFolder = Path("runs/turbidity"), as_json: SummaryJson = Fa
 def light(
     out: OutFolder = Path("runs/light"),
     quick: Quick = False,
-    walks: Annotated[int, Option(min=64, help="Largest number of random walks for a value of light.")] = 1_500_000,
+    walks: Annotated[int, option("Largest number of random walks for a value of light.", min=64)] = 1_500_000,
     phase: Annotated[
-        str, Option(help="Phase function for lamps, in model and reference: a value of water.phase_function.")
+        str, option("Phase function for lamps, in model and reference: a value of water.phase_function.")
     ] = "sea",
     as_json: SummaryJson = False,
 ) -> None:
@@ -246,8 +254,8 @@ def all_experiments(out: OutFolder = Path("runs/reproduce"), quick: Quick = Fals
 
 @reproductions.command()
 def chapter(
-    file: Annotated[Path, Argument(metavar="FILE", help="results.json of `twin reproduce all`.")],
-    page: Annotated[Path | None, Option(help="Markdown page whose chapter is replaced.")] = None,
+    file: Annotated[Path, argument("results.json of `twin reproduce all`.", "FILE")],
+    page: Annotated[Path | None, option("Markdown page whose chapter is replaced.")] = None,
 ) -> None:
     """Print the chapter of docs/paper.md that shows the results of `twin reproduce all`, or replace it in a page."""
     from twin.reproduce import page_chapter
@@ -264,12 +272,12 @@ def chapter(
 @app.command("fit-surrogate")
 def fit_surrogate(
     files: Annotated[
-        list[str] | None, Argument(metavar="FILE", help="Studies of rendered surveys. Default: the built-in ones.")
+        list[str] | None, argument("Studies of rendered surveys. Default: the built-in ones.", "FILE")
     ] = None,
-    out: Annotated[Path, Option(help="Error model to write (TOML), for the key imaging.error_model.")] = Path(
+    out: Annotated[Path, option("Error model to write (TOML), for the key imaging.error_model.")] = Path(
         "error_model.toml"
     ),
-    runs: Annotated[Path, Option(help="Folder of the rendered surveys; finished ones are reused.")] = Path(
+    runs: Annotated[Path, option("Folder of the rendered surveys; finished ones are reused.")] = Path(
         "runs/fit-surrogate"
     ),
     jobs: Jobs = None,
@@ -287,25 +295,23 @@ def _add_study_command(name: str, text: str, verify_text: str) -> None:
 
     @app.command(name, help=text)
     def command(
-        file: Annotated[
-            str, Argument(metavar="FILE", help="Study: a name in scenes/studies/ or the path of a TOML file.")
-        ],
-        out: Annotated[Path | None, Option(help=f"Folder to write. Default: runs/{name}-NAME.")] = None,
+        file: Annotated[str, argument("Study: a name in scenes/studies/ or the path of a TOML file.", "FILE")],
+        out: Annotated[Path | None, option(f"Folder to write. Default: runs/{name}-NAME.")] = None,
         jobs: Jobs = None,
         scheduler: Annotated[
             str | None,
-            Option(
-                metavar="ADDRESS",
-                help="Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the "
+            option(
+                "Run on the Dask cluster at this address, e.g. tcp://host:8786, or on new SLURM jobs with the "
                 "word slurm.",
+                "ADDRESS",
             ),
         ] = None,
         resume: Annotated[
-            bool, Option("--resume", help="Run only surveys that are missing in the folder or failed.")
+            bool, option("Run only surveys that are missing in the folder or failed.", flag="--resume")
         ] = False,
-        live: Annotated[bool, Option("--live", help="Print a line for each finished survey.")] = False,
+        live: Annotated[bool, option("Print a line for each finished survey.", flag="--live")] = False,
         as_json: SummaryJson = False,
-        verify: Annotated[int | None, Option(min=0, max=1000, metavar="N", help=verify_text)] = None,
+        verify: Annotated[int | None, option(verify_text, "N", min=0, max=1000)] = None,
         extrapolate: Extrapolate = False,
         allow_plugins: AllowPlugins = False,
     ) -> None:
@@ -332,50 +338,42 @@ _add_study_command(
 @app.command()
 def replay(
     dataset: Annotated[
-        Path,
-        Argument(
-            metavar="DATASET", help="Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3)."
-        ),
+        Path, argument("Stereo data set: EuRoC/ASL, KITTI, left/ and right/, or a ROS 2 bag (MCAP, db3).", "DATASET")
     ],
     calibration: Annotated[
-        Path | None, Option(metavar="FILE", help="OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt.")
+        Path | None, option("OpenCV, Kalibr, ROS, ORB-SLAM3, or COLMAP cameras.txt.", "FILE")
     ] = None,
     truth: Annotated[
         Path | None,
-        Option(
-            metavar="FILE|TOPIC",
-            help="True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
+        option(
+            "True poses, only for the comparison: TUM, KITTI or EuRoC; or the topic of a ROS 2 bag that has them.",
+            "FILE|TOPIC",
         ),
     ] = None,
     align: Annotated[
-        str, Option(metavar="NAME", help="Alignment with the truth before the comparison: first, se3 or none.")
+        str, option("Alignment with the truth before the comparison: first, se3 or none.", "NAME")
     ] = "first",
-    bayer: Annotated[str | None, Option(metavar="PATTERN", help="Raw images: RGGB, GRBG, GBRG or BGGR.")] = None,
-    out: Annotated[Path | None, Option(help="Folder to write (--preview: PNG). Default: runs/NAME-replay.")] = None,
+    bayer: Annotated[str | None, option("Raw images: RGGB, GRBG, GBRG or BGGR.", "PATTERN")] = None,
+    out: Annotated[Path | None, option("Folder to write (--preview: PNG). Default: runs/NAME-replay.")] = None,
     preview: Annotated[
-        bool,
-        Option("--preview", help="Only draw the first stereo pair: matches, disparity, light before and after."),
+        bool, option("Only draw the first stereo pair: matches, disparity, light before and after.", flag="--preview")
     ] = False,
     topics: Annotated[
-        str | None,
-        Option(metavar="LEFT,RIGHT", help="Image topics of a ROS 2 bag. Default: its only stereo pair."),
+        str | None, option("Image topics of a ROS 2 bag. Default: its only stereo pair.", "LEFT,RIGHT")
     ] = None,
     estimator: Annotated[
         str | None,
-        Option(
-            metavar="NAME",
-            help="Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
+        option(
+            "Estimator of another package, module:Class or its entry point. Default: the estimators of the twin.",
+            "NAME",
         ),
     ] = None,
     aiding: Annotated[
-        bool, Option("--aiding/--no-aiding", help="Use recorded readings of pressure, attitude and DVL.")
+        bool, option("Use recorded readings of pressure, attitude and DVL.", flag="--aiding/--no-aiding")
     ] = True,
     true_map: Annotated[
         Path | None,
-        Option(
-            metavar="FILE",
-            help="True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.",
-        ),
+        option("True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.", "FILE"),
     ] = None,
     as_json: MetricsJson = False,
     allow_plugins: AllowPlugins = False,
@@ -425,8 +423,8 @@ def report(folder: RunFolder) -> None:
 
 @app.command()
 def compare(
-    folders: Annotated[list[Path], Argument(metavar="RUN...", help="Folders of two to eight runs.")],
-    out: Annotated[Path, Option(help="HTML page to write.")] = Path("runs/compare.html"),
+    folders: Annotated[list[Path], argument("Folders of two to eight runs.", "RUN...")],
+    out: Annotated[Path, option("HTML page to write.")] = Path("runs/compare.html"),
     as_json: SummaryJson = False,
 ) -> None:
     """Compare runs: a table of metrics with differences from the first run, overlaid curves, one HTML page."""
@@ -451,8 +449,8 @@ def view(folder: RunFolder) -> None:
 
 @app.command("new-plugin")
 def new_plugin(
-    kind: Annotated[str, Argument(metavar="KIND", help="controller, estimator, terrain or reader.")],
-    folder: Annotated[Path, Argument(metavar="DIR", help="New folder; names the package.")],
+    kind: Annotated[str, argument("controller, estimator, terrain or reader.", "KIND")],
+    folder: Annotated[Path, argument("New folder; names the package.", "DIR")],
 ) -> None:
     """Write a package with a working plug-in (controller, estimator, terrain or reader) and its test."""
     from twin.plugin import skeleton
@@ -467,20 +465,15 @@ def new_plugin(
 
 @app.command()
 def export(
-    folder: Annotated[Path | None, Argument(metavar="RUN", help="Folder of a run.")] = None,
-    to: Annotated[
-        list[str], Option(metavar="FORMAT", help="Format to write; repeatable, or separated by commas.")
-    ] = [],  # noqa: B006 (typer copies it)
-    out: Annotated[Path | None, Option(help="Folder to write. Default: RUN/export.")] = None,
-    crs: Annotated[str | None, Option(help="CRS of the exported coordinates, as in EPSG:32633.")] = None,
+    folder: Annotated[Path | None, argument("Folder of a run.", "RUN")] = None,
+    to: Annotated[list[str], option("Format to write; repeatable, or separated by commas.", "FORMAT")] = [],  # noqa: B006 (typer copies it)
+    out: Annotated[Path | None, option("Folder to write. Default: RUN/export.")] = None,
+    crs: Annotated[str | None, option("CRS of the exported coordinates, as in EPSG:32633.")] = None,
     origin: Annotated[
-        str | None,
-        Option(metavar="E,N,H", help="Scene origin in --crs; H is its elevation \\[m], by default 0."),
+        str | None, option("Scene origin in --crs; H is its elevation \\[m], by default 0.", "E,N,H")
     ] = None,
-    jpeg: Annotated[
-        int | None, Option(metavar="QUALITY", help="Write images as JPEG of this quality, 1 to 100.")
-    ] = None,
-    show_list: Annotated[bool, Option("--list", help="List the formats.")] = False,
+    jpeg: Annotated[int | None, option("Write images as JPEG of this quality, 1 to 100.", "QUALITY")] = None,
+    show_list: Annotated[bool, option("List the formats.", flag="--list")] = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
     """Write a run in the formats of other programs: data sets, camera models, truth, maps."""
