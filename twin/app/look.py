@@ -95,11 +95,7 @@ def parse_twist(text: str) -> Array:
 
 
 def _numbers(text: str, option: str, meaning: str, allowed: str) -> list[float]:
-    """Returns the numbers of a text, separated by commas; there are as many as in the example at the end of `allowed`.
-
-    Raises:
-        TwinError: the text has another number of numbers, or one that is not finite.
-    """
+    """Returns the finite numbers of a text; there must be as many as in the example at the end of `allowed`."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:

@@ -165,11 +165,7 @@ def load(file: str, options: StudyOptions) -> Study:
 
 
 def _folder(options: StudyOptions, command: str, study: Study) -> Path:
-    """Returns the absolute path of the folder to write, because workers run in other folders.
-
-    Raises:
-        TwinError: the path can neither exist nor be created, or cannot be written.
-    """
+    """Returns the absolute path of the folder to write, because workers run in other folders; checks the path."""
     folder = options.out or Path("runs") / f"{command}-{file_stem(study.name or command)}"
     output_file(folder / "study.html")
     return folder.absolute()

@@ -103,8 +103,6 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     Args:
         x: (n,) value of the key in each survey.
     """
-    if len(x) == 0:
-        return []
     bins = pass_bins(x, np.where(record.unknown, 2, record.passed))
     n_bins = int(bins.max()) + 1
     searched = record.for_ranges(n_bins)

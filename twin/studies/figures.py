@@ -41,6 +41,9 @@ def draw_all(analysis: StudyAnalysis, compared: bool) -> dict[str, str]:
         return {name: to_data_uri(figure) for name, figure in drawn.items() if figure is not None}
 
 
+# The functions that draw a figure return None without data for it.
+
+
 def make_panels(count: int, columns: int = 3, row_in: float = 2.7) -> tuple[Figure, list[Axes]]:
     """Returns a figure and its `count` axes, in rows of at most `columns`; by default, four axes form a square."""
     columns = 2 if count == 4 and columns == 3 else min(columns, count)
@@ -77,7 +80,7 @@ def axis_label(metric: str) -> str:
 
 
 def pass_probability(analysis: StudyAnalysis) -> Figure | None:
-    """Plots the pass probability against each varied key; returns None if no key varies or no survey was evaluated."""
+    """Plots the pass probability against each varied key."""
     if not analysis.keys or not analysis.evaluated.any():
         return None
     figure, panels = make_panels(len(analysis.keys))
@@ -128,10 +131,7 @@ def _error_bars(axes: Axes, x: Array, intervals: list[Interval]) -> None:
 
 
 def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
-    """Plots the histogram of each metric with its median, its 95th (or 5th) percentile and its limit.
-
-    Returns None if no metric has values of two or more surveys.
-    """
+    """Plots the histogram of each metric that has two or more values, with its median, 95 % bound and limit."""
     summaries = [summary for summary in summaries if summary.surveys > 1]
     if not summaries:
         return None
@@ -164,10 +164,7 @@ def _histogram(axes: Axes, samples: list[Array], values: Array, ticks: int | Non
 
 
 def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
-    """Plots a metric against each varied key: each survey as a dot, group medians with confidence intervals.
-
-    Returns None if no key varies, or if fewer than two surveys have a value.
-    """
+    """Plots a metric against each varied key: each survey as a dot, group medians with confidence intervals."""
     y, included = analysis.numbers(metric), analysis.included(metric)
     if not analysis.keys or included.sum() < 2:
         return None
@@ -198,10 +195,7 @@ def _dots(axes: Axes, x: Array, y: Array, passed: Mask, rng: np.random.Generator
 
 
 def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
-    """Plots the rank correlation of each metric with each numeric key, with its confidence interval.
-
-    Returns None if no correlation is defined.
-    """
+    """Plots the rank correlation of each metric with each numeric key, with its confidence interval."""
     shown = [s for s in sensitivities if np.isfinite(s.correlation.value)]
     metrics, keys = list(dict.fromkeys(s.metric for s in shown)), list(dict.fromkeys(s.key for s in shown))
     if not shown:
@@ -222,10 +216,7 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
 
 
 def key_histograms(analysis: StudyAnalysis) -> Figure | None:
-    """Plots a stacked histogram of each numeric key: surveys that passed, and surveys that did not pass.
-
-    Returns None if no key is numeric or one of the two sets is empty.
-    """
+    """Plots a stacked histogram of each numeric key: surveys that passed, and surveys that did not pass."""
     good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
     numeric = {key: x for key in analysis.keys if (x := analysis.key_numbers(key)) is not None}
     if not numeric or not good.any() or not bad.any():

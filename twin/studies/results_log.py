@@ -80,10 +80,11 @@ class ResultsLog:
         def included_rows() -> Iterator[Row]:
             return (row for number, row in enumerate(self.rows()) if number in included)
 
-        types: dict[str, pa.DataType] = {}
+        kinds: dict[str, set[type]] = {}
         for row in included_rows():
             for name, value in row.items():
-                types[name] = _common_type(types.get(name, pa.null()), _type(value))
+                kinds.setdefault(name, set()).add(type(value))
+        types = {name: _column_type(found - {type(None)}) for name, found in kinds.items()}
         rows, chunks = included_rows(), []
         while chunk := list(islice(rows, _CHUNK)):
             chunks.append(pa.table({name: _column([row.get(name) for row in chunk], types[name]) for name in types}))
@@ -112,26 +113,15 @@ def _column_order(name: str) -> tuple[int, int, str]:
     return {"vary": 1, "timing": 3}.get(name.partition(".")[0], 2), 0, name
 
 
-def _type(value: Any) -> pa.DataType:
-    """Returns the column type of a value; lists and dictionaries are stored as JSON text."""
-    if value is None:
+def _column_type(kinds: set[type]) -> pa.DataType:
+    """Returns the type of a column with values of these kinds; lists, dictionaries and mixtures are stored as text."""
+    if not kinds:
         return pa.null()
-    kinds = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
-    return kinds.get(type(value), pa.string())
-
-
-def _common_type(one: pa.DataType, other: pa.DataType) -> pa.DataType:
-    """Returns a column type that can store the values of both types."""
-    if one == other or pa.types.is_null(other):
-        return one
-    if pa.types.is_null(one):
-        return other
-    return pa.float64() if {one, other} == {pa.int64(), pa.float64()} else pa.string()
+    columns = (({bool}, pa.bool_()), ({int}, pa.int64()), ({int, float}, pa.float64()))
+    return next((column for numbers, column in columns if kinds <= numbers), pa.string())
 
 
 def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
     if kind == pa.string():
         values = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
-    elif kind == pa.float64():
-        values = [None if value is None else float(value) for value in values]
     return pa.array(values, kind)

@@ -99,11 +99,7 @@ def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyRe
 
 
 def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLog) -> Iterator[Survey]:
-    """Logs the refused surveys and returns the others that have no result.
-
-    Raises:
-        TwinError: the log has the results of another study.
-    """
+    """Logs the refused surveys and returns the others that have no result; refuses the log of another study."""
     hashes = {survey.key: survey.scenario_hash for survey in surveys(study, folder, without=refused)}
     refusals_of = [sample for sample in samples(study) if sample.number in refused]
     rows = [refused_row(one, seed, refused[one.number]) for one in refusals_of for seed in seeds_of_sample(study, one)]

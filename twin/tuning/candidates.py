@@ -127,12 +127,7 @@ class CandidateSurveys:
     """Surveys of the candidates, with the results obtained so far.
 
     All candidates are flown with the samples and seeds of the study. Samples that are invalid with the original plan of
-    the study's scenario are left out.
-
-    Args:
-        study: study with the samples, the seeds and a section [tune].
-        folder: results folder; the run folders are created in its subfolder `runs`.
-        rows: rows of the surveys flown so far.
+    the study's scenario are left out. The run folders are created in the subfolder `runs` of the results folder.
 
     Raises:
         TwinError: the study has no section [tune].
@@ -158,11 +153,7 @@ class CandidateSurveys:
         return scenario_of_sample(self.study, self.base, self.conditions[0])
 
     def scenario(self, values: Values) -> Scenario:
-        """Returns the scenario of the study with a plan; varied keys keep their original values.
-
-        Raises:
-            ScenarioError: this scenario is not valid.
-        """
+        """Returns the scenario of the study with a plan, if it is valid; varied keys keep their original values."""
         return scenario_of_sample(self.study, self.base, Sample(0, 0, values))
 
     def check_bounds(self) -> None:
@@ -243,18 +234,12 @@ class CandidateSurveys:
         return sum(self._result(key) is None for key in self.keys(number, values))
 
     def warnings(self, plans: Iterable[Candidate]) -> dict[str, int]:
-        """Returns {warning: number of surveys of the candidates that have it}, the most frequent first.
-
-        Warnings that differ only in numbers count as one; see `count_similar`.
-        """
+        """Returns {warning: number of surveys of the candidates that have it}; see `count_similar`."""
         scores = (score for plan in plans for score in self.scores(plan.number, plan.values))
         return count_similar(score.warning for score in scores if score.warning)
 
     def refusals(self, plans: Mapping[int, Values]) -> dict[str, int]:
-        """Returns {reason: number of plans whose surveys were all refused for it}, the most frequent first.
-
-        The reason of a plan is that of its first survey; reasons that differ only in numbers count as one.
-        """
+        """Returns {reason of the first survey: number of plans whose surveys were all refused}; see `count_similar`."""
         of_plans = [self.scores(*plan) for plan in plans.items()]
         refused = [scores for scores in of_plans if {score.status for score in scores} == {"refused"}]
         return count_similar(scores[0].reason for scores in refused)

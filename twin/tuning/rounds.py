@@ -100,11 +100,7 @@ class Tuning:
 
         Each round evaluates candidates, confirms the cheapest plans with new seeds, and flies their rendered surveys.
         The first round is the only one if no plan was verified in it. After a plan has passed, cheaper plans that the
-        surrogate rejects are verified; see `_verify_cheaper`.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed.
-            TwinError: the engine lost its connection, or the folder contains another search or another scenario.
+        surrogate rejects are verified. Ctrl-C raises KeyboardInterrupt; the results until then are logged.
         """
         search_round = 0
         for search_round in range(1 + self.config.rounds):
@@ -139,11 +135,7 @@ class Tuning:
         )
 
     def _fly(self, surveys: CandidateSurveys, plans: dict[int, Values]) -> None:
-        """Flies those surveys of the given plans that have no result yet.
-
-        Raises:
-            KeyboardInterrupt: Ctrl-C was pressed; the results obtained until then are logged.
-        """
+        """Flies those surveys of the given plans that have no result yet."""
 
         def add_row(row: Row) -> None:
             self.log.add(row)

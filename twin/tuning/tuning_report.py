@@ -106,11 +106,7 @@ def _missing_plan(result: TuningResult, count: str) -> str:
 
 
 def warnings(result: TuningResult) -> list[str]:
-    """Returns the warnings of a search.
-
-    They concern a plan that was not verified, large errors of the surrogate, refused plans, and the warnings of
-    surveys.
-    """
+    """Returns warnings on a plan that was not verified, on errors of the surrogate, refused plans, and of surveys."""
     chosen = result.recommended_verification
     texts = [NOT_VERIFIED] if result.recommended and result.needs_rendering and chosen is None else []
     for verification in [chosen] if chosen else result.verifications:
@@ -171,10 +167,9 @@ def _rendered(verification: Verification) -> dict[str, Any]:
 
 
 def recommended_toml(result: TuningResult) -> str:
-    """Returns the recommended plan as the text of a scenario file; "" if no plan is recommended.
+    """Returns the recommended plan as the text of a scenario file with rendered images; "" if there is none.
 
-    Comments at the start contain the headline and the warnings. The scenario selects rendered images, even if the
-    search used the surrogate.
+    Comments at the start contain the headline and the warnings.
     """
     if result.scenario is None:
         return ""
