@@ -64,11 +64,7 @@ def read_calibration(file: Path) -> StereoCalibration:
 
 
 def _read_tree(file: Path) -> Mapping[str, Any]:
-    """Returns the keys and values of a YAML or JSON file, or of an XML file that OpenCV wrote.
-
-    Raises:
-        TwinError: the file cannot be read, or is of neither kind.
-    """
+    """Returns the keys and values of a YAML or JSON file, or of an XML file that OpenCV wrote."""
     if file.suffix.lower() != ".xml":
         return read_yaml(file)  # JSON is YAML
     text = read_text(file, 2**20)

@@ -67,11 +67,7 @@ ImageSource = Path | StoredImage
 
 
 def image_size(image: ImageSource) -> tuple[int, int]:
-    """Returns (width, height) of an image [px], from its header.
-
-    Raises:
-        UnreadableImage: the image is missing, damaged, too large or of an unknown encoding or file format.
-    """
+    """Returns (width, height) of an image [px], from its header; raises UnreadableImage if it cannot be used."""
     width, height = encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
     if width * height > _MOST_PIXELS:
         raise UnreadableImage("too many pixels")
@@ -86,10 +82,8 @@ def encoded_size(data: bytes) -> tuple[int, int]:
 def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) -> Image:
     """Returns an image of (width, height) `size_px` as 8-bit RGB (H, W, 3).
 
-    The Bayer pattern of `form` is ignored for an image that has colours already.
-
-    Raises:
-        UnreadableImage: the image is missing, damaged, too large, not in a supported format, or has another size.
+    The Bayer pattern of `form` is ignored for an image that has colours already. Raises UnreadableImage if the image is
+    missing, damaged, too large, not in a supported format, or has another size.
     """
     pixels = _pixels(image, size_px)
     if pixels.dtype == np.uint16:
@@ -157,9 +151,8 @@ def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
 def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
     """Returns the values of the contents of a PNG, JPEG or TIFF file (`StoredImage.pixels`).
 
-    Raises:
-        UnreadableImage: the data are damaged, not a PNG, JPEG or TIFF image, or not grey or RGB with 8 or 16 bits, or
-            the image has another size or too many pixels.
+    Raises UnreadableImage if the data are damaged, not grey or RGB with 8 or 16 bits, or have another size or too many
+    pixels.
     """
     width, height, kind = _header(data)
     if (width, height) != size_px:

@@ -33,9 +33,7 @@ class KittiReader:
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a folder.
 
-        Raises:
-            TwinError: times.txt is missing or damaged or has no time for an image, or an image folder is not valid
-                (`image_files`).
+        Raises TwinError if times.txt is missing, damaged or has no time for an image, or an image folder is not valid.
         """
         number = 2 if (folder / "image_2").is_dir() else 0
         left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))

@@ -31,8 +31,7 @@ class PlainFolderReader:
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a folder.
 
-        Raises:
-            TwinError: there are no images, times.txt is damaged, or an image folder is not valid (`image_files`).
+        Raises TwinError if there are no images, times.txt is damaged, or an image folder is not valid.
         """
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
@@ -57,11 +56,8 @@ def _calibration(folder: Path) -> StereoCalibration | None:
 def image_files(folder: Path) -> dict[str, Path]:
     """Returns the image files of a folder, by file name without suffix; empty if the folder does not exist.
 
-    Hidden files (".NAME") and files with other suffixes than `SUFFIXES` are ignored.
-
-    Raises:
-        TwinError: an image is a symbolic link that leads out of the folder, or two images have the same name without
-            suffix.
+    Hidden files (".NAME") and files with other suffixes than `SUFFIXES` are ignored. Raises TwinError if an image is a
+    link that leads out of the folder, or two images have the same name without suffix.
     """
     if not folder.is_dir():
         return {}

@@ -82,8 +82,7 @@ def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
 def read_yaml(file: Path) -> dict[str, Any]:
     """Returns the contents of a YAML file; files written by OpenCV (`%YAML:1.0`, matrices) are accepted.
 
-    Raises:
-        TwinError: the file is missing, too large, not valid YAML, or not a table (keys and values).
+    Raises TwinError if the file is missing, too large, not valid YAML, or not a table (keys and values).
     """
     text = re.sub(r"\A%YAML[: ][^\n]*\n", "", read_text(file, _MOST_YAML_BYTES))
     try:
@@ -125,10 +124,8 @@ def read_numbered_table(file: Path, columns: int, n_finite: int) -> tuple[list[i
 def text_rows(file: Path) -> list[tuple[int, list[str]]]:
     """Returns line number and columns of each line of a text file, without blank lines and comments (#).
 
-    Columns are separated by commas or white space.
-
-    Raises:
-        TwinError: the file cannot be read, or a column of a line with commas is longer than 131072 characters.
+    Columns are separated by commas or white space. Raises TwinError if the file cannot be read, or a column of a line
+    with commas is longer than 131072 characters.
     """
     lines = read_text(file).splitlines()
     try:

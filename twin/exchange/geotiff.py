@@ -144,8 +144,7 @@ class OrthomosaicFile:
 def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
     """Returns the grid of an open raster in scene coordinates, and the offset [m] to subtract from its values.
 
-    The offset is the elevation of the scene origin if the tags of the raster state that its values are elevations,
-    otherwise 0.
+    The offset is the elevation of the scene origin if the values are elevations by the tags of the raster, otherwise 0.
 
     Raises:
         ValueError: the raster is rotated, its cells are not square, or its tags are damaged.
@@ -174,20 +173,16 @@ def _origin(source: rasterio.DatasetReader) -> Georeference | None:
 
 
 def read_georeference(path: Path) -> Georeference | None:
-    """Returns the position of the scene in the CRS of a map file; None if the file is in scene coordinates.
+    """Returns the position of the scene in the CRS of a map file, None if the file is in scene coordinates.
 
-    Raises:
-        TwinError: the file cannot be read, or its tags are damaged.
+    Raises TwinError if the file cannot be read, or its tags are damaged.
     """
     with open_raster(path, "", "a map file, written by `twin run`") as source:
         return _origin(source)
 
 
 def read_raster(file: Path) -> Raster:
-    """Reads a GeoTIFF as a raster in scene coordinates; row 0 is the northernmost.
-
-    In a raster with one band, cells without data become NaN, and elevations in a vertical datum become heights in the
-    scene.
+    """Reads a GeoTIFF; in one band, cells without data become NaN, and elevations become heights in the scene.
 
     Raises:
         TwinError: the file is not a readable GeoTIFF or has more than MOST_CELLS cells, the raster is rotated, its
@@ -207,10 +202,8 @@ def read_raster(file: Path) -> Raster:
 def read_mosaic(file: Path, most_side_px: int | None = None) -> Raster:
     """Reads the RGB values of an orthomosaic, averaged to at most `MAX_MOSAIC_PX` pixels, or `most_side_px` per side.
 
-    Rows and columns at the south and east edges that do not fill a reduced pixel are left out.
-
-    Raises:
-        TwinError: see `read_raster`.
+    Rows and columns at the south and east edges that do not fill a reduced pixel are left out. Raises TwinError as
+    `read_raster` does.
     """
     with open_raster(file) as source:
         grid, _ = scene_placement(source)

@@ -55,12 +55,8 @@ def _points(rig: StereoRig, altitude_m: float) -> Array:
 def _fitted(cameras: TrueCameras, side: int, points_m: Array, rig: StereoRig) -> tuple[RecordedCamera, Array, Array]:
     """Returns the model fitted to one camera, its rotation (3, 3) camera_from_rendered, and the residuals (2 n,) [px].
 
-    The rotation of the left camera is the identity: its axes are those of the true poses.
-
-    Args:
-        side: 0 left, 1 right.
-        points_m: (n, 3) points in the axes of the rendered camera [m]; those without an image are left out.
-        rig: believed calibration; it has the image size and is the start of the fit.
+    The rotation of the left camera (`side` 0) is the identity: its axes are those of the true poses. Points (n, 3) in
+    the axes of the rendered camera without an image are left out. `rig` has the image size and is the start of the fit.
     """
     seen = cameras.project(points_m, side)
     known = np.isfinite(seen).all(axis=1)

@@ -47,8 +47,7 @@ def true_layers(folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, .
 def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
     """Returns the true poses (n, 4, 4) of the left camera and velocities (n, 6) of the body, at frames 0 to n - 1.
 
-    The velocities are [angular, linear] in body axes [rad/s, m/s]. Raises TwinError if the file is damaged or lacks the
-    frame with the number `last`.
+    The velocities are [angular, linear] in body axes [rad/s, m/s]. The file must have the frame with the number `last`.
     """
     with reading(file, "", "an undamaged file, written by `twin run`"):
         if not is_zipfile(file):

@@ -217,10 +217,7 @@ def _attitude(message: Any, place: str) -> tuple[Array, Array]:
     """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) [rad2] of a message Imu.
 
     Both are zero if the message marks its orientation as not measured or states no variance. The angles are NaN if the
-    orientation is not finite.
-
-    Raises:
-        TwinError: the orientation is not a unit quaternion.
+    orientation is not finite; TwinError is raised if it is no rotation.
     """
     variances = np.array(message.orientation_covariance).reshape(3, 3).diagonal()
     if variances[0] < 0 or not variances.any():

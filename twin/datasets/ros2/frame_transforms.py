@@ -19,11 +19,7 @@ _MOST_TRANSFORMS = 10_000
 
 
 def static_transforms(bag: Bag) -> Transforms:
-    """Returns the transforms in /tf_static.
-
-    Raises:
-        TwinError: the bag is damaged, there are more than 10,000 frames, or a transform is not a pose.
-    """
+    """Returns the transforms in /tf_static; raises TwinError if one is not a pose, or there are more than 10,000."""
     found: Transforms = {}
     if bag.topics.get("/tf_static") != "tf2_msgs/msg/TFMessage":
         return found
@@ -38,11 +34,7 @@ def static_transforms(bag: Bag) -> Transforms:
 
 
 def pose_of_transform(transform: Any, file: Path) -> Array:
-    """Returns the pose (4, 4) of a message Transform (`translation`, `rotation`) or Pose (`position`, `orientation`).
-
-    Raises:
-        TwinError: the numbers are not a pose.
-    """
+    """Returns the pose (4, 4) of a message Transform or Pose; raises TwinError if the numbers are not a pose."""
     t = transform.translation if hasattr(transform, "translation") else transform.position
     q = transform.rotation if hasattr(transform, "rotation") else transform.orientation
     quaternion, position = np.array([q.w, q.x, q.y, q.z]), np.array([t.x, t.y, t.z])
