@@ -103,11 +103,13 @@ def _write(
     tags: Mapping[str, str] | None = None,
     **options: Any,
 ) -> None:
-    """Writes bands (n, rows, cols) with their descriptions and tags; `options` are those of rasterio."""
+    """Writes bands (n, rows, cols), one by one if they have descriptions and tags; `options` are those of rasterio."""
     layout = profile(grid, len(bands), str(bands.dtype), georeference)
     with rasterio.open(path, "w", **layout, **options) as file:
-        file.write(bands)
+        if not descriptions:
+            file.write(bands)
         for band, description in enumerate(descriptions, start=1):
+            file.write(bands[band - 1], band)
             file.set_band_description(band, description)
             file.update_tags(band, **(tags or {}))
         file.update_tags(**placement_tags(georeference))
