@@ -12,7 +12,8 @@ from scipy.ndimage import map_coordinates
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.imaging.camera.lens import Distortion, distort, fold, undistort
-from twin.imaging.camera.resample import interpolate, sample
+from twin.imaging.camera.ray_sampling import sample_rays
+from twin.imaging.camera.resample import interpolate
 from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.light.illumination import illumination_of
@@ -159,7 +160,7 @@ def test_sampling_preserves_uniform_light_and_linear_gradients():
     u, v = np.meshgrid(np.arange(30.0), np.arange(20.0))
     light = np.stack([np.full(u.shape, 7.0), 3 * u + v, 100 - u], axis=-1).astype(np.float32)
     positions = np.random.default_rng(0).uniform((2, 2), (27, 17), (12, 9, 2)).astype(np.float32)
-    sampled, (x, y) = sample(light, positions), np.moveaxis(positions, -1, 0)
+    sampled, (x, y) = sample_rays(light, np.ones(light.shape[:2], np.float32), positions), np.moveaxis(positions, -1, 0)
     np.testing.assert_allclose(sampled, np.stack([np.full(x.shape, 7.0), 3 * x + y, 100 - x], axis=-1), rtol=1e-5)
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from twin.core import geometry
 from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
-from twin.imaging.camera.resample import sample
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.scenario.model import Scenario
@@ -103,7 +102,7 @@ def test_rows_equal_those_of_images_rendered_from_the_poses_of_the_rows(twist):
 def test_without_motion_rays_are_sampled_at_their_intersections():
     depth = depth_of(FLOOR_PER_M)
     light = np.random.default_rng(0).random((*depth.shape, 3), np.float32)
-    expected = sample(light, met_px(depth, POSITIONS, PARALLAX))
+    expected = sample_rays(light, depth, met_px(depth, POSITIONS, PARALLAX))
     for motion in (None, row_motion(np.zeros(6))):
         found = sample_rays(light, depth, POSITIONS, PARALLAX, motion)
         np.testing.assert_allclose(found, expected, atol=3e-4)  # positions are rounded by 1e-4 px
@@ -125,4 +124,4 @@ def test_sampling_equals_the_definition_of_the_spline():
             for i in range(int(np.floor(x)) - 1, int(np.floor(x)) + 3):
                 pixel = light[np.clip(j, 0, 19), np.clip(i, 0, 29)]
                 expected[v, u] += spline(x - i) * spline(y - j) * pixel
-    np.testing.assert_allclose(sample(light, at), expected, atol=2e-6)
+    np.testing.assert_allclose(sample_rays(light, light[..., 0] + 1, at), expected, atol=2e-6)

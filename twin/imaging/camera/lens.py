@@ -8,6 +8,7 @@ With x = X / Z, y = Y / Z and r^2 = x^2 + y^2, the distorted coordinates in unit
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,8 @@ from twin.scenario.model import CalibrationErrorConfig, LensConfig
 
 Array = NDArray[np.float64]
 
-STEPS, TOLERANCE = 30, 1e-12  # Newton's method: maximum number of steps; residual at which it stops (about 1e-9 px)
+STEPS = 40  # maximum number of steps of Newton's method
+TOLERANCE = 1e-12  # of distorted coordinates, about 1e-9 px
 
 
 class Distortion(NamedTuple):
@@ -59,15 +61,11 @@ def undistort(distorted: Array, lens: Distortion) -> Array:
 
     `distort` is inverted by Newton's method; the result is NaN where it does not converge to a radius below `fold`.
     """
-    normalised = distorted
-    for _ in range(STEPS):
-        residual = distort(normalised, lens) - distorted
-        if np.nanmax(np.abs(residual), initial=0.0) < TOLERANCE:
-            break
-        normalised = normalised - solve(_jacobian(normalised, lens), residual)
-    converged = np.abs(distort(normalised, lens) - distorted).max(axis=-1) < 1e3 * TOLERANCE
-    converged &= np.hypot(normalised[..., 0], normalised[..., 1]) < fold(lens)
-    return np.where(converged[..., None], normalised, np.nan)
+    normalised = newton(
+        lambda at: distort(at, lens) - distorted, lambda at, _: _jacobian(at, lens), distorted, TOLERANCE, 1e3
+    )
+    before_fold = np.hypot(normalised[..., 0], normalised[..., 1]) < fold(lens)
+    return np.where(before_fold[..., None], normalised, np.nan)
 
 
 def fold(lens: Distortion) -> float:
@@ -79,7 +77,26 @@ def fold(lens: Distortion) -> float:
     return float(1 / np.sqrt(real.max())) if real.size else np.inf
 
 
-def solve(jacobian: Array, residual: Array) -> Array:
+def newton(
+    residual_at: Callable[[Array], Array], jacobian_at: Callable[[Array, Array], Array], start: Array,
+    tolerance: float, factor: float,
+) -> Array:  # fmt: skip
+    """Returns the points (..., 2) where a function (..., 2) is zero, by Newton's method from `start` (..., 2).
+
+    The method stops where the function is below `tolerance`; a point is NaN where it is not below `factor` times that.
+    `jacobian_at` returns the Jacobian (..., 2, 2) at points with their residuals.
+    """
+    at = start
+    for _ in range(STEPS):
+        residual = residual_at(at)
+        if np.nanmax(np.abs(residual), initial=0.0) < tolerance:
+            break
+        at = at - _solved(jacobian_at(at, residual), residual)
+    converged = np.abs(residual_at(at)).max(axis=-1) < factor * tolerance
+    return np.where(converged[..., None], at, np.nan)
+
+
+def _solved(jacobian: Array, residual: Array) -> Array:
     """Returns the Newton step jacobian^-1 residual (..., 2); not finite where the Jacobian (..., 2, 2) is singular."""
     (a, b), (c, d) = (jacobian[..., 0, 0], jacobian[..., 0, 1]), (jacobian[..., 1, 0], jacobian[..., 1, 1])
     with np.errstate(all="ignore"):

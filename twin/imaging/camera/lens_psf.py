@@ -12,7 +12,8 @@ over the disc of its own depth.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,8 +86,7 @@ class LensPsf:
             return light
         near, out = np.reciprocal(depth), np.empty_like(light)
         scale, focus = np.float32(self._defocus.aperture_m * self._focal_px), np.float32(self._defocus.focus_per_m)
-        flat, filled = light.reshape(len(light), -1), out.reshape(len(light), -1)
-        in_row_bands(lambda first, end: _defocus(flat, near, scale, focus, filled, first, end), len(light))
+        _run(_defocus, len(light), light.reshape(len(light), -1), near, scale, focus, out.reshape(len(light), -1))
         return out
 
     def transfer(self, light: Radiance) -> Radiance:
@@ -96,19 +96,22 @@ class LensPsf:
         """
         if self._taps is None and self._scales is None:
             return light
-        rows, width, taps = *light.shape[:2], self._taps
-        if taps is None:
-            bands = np.ascontiguousarray(light.swapaxes(1, 2))
-        else:
-            flat, bands = np.ascontiguousarray(light).reshape(rows, -1), np.empty((rows, 3, width), np.float32)
-            in_row_bands(lambda first, end: _convolve(flat, *taps, bands, first, end), rows)
-        out = np.empty((rows, 3 * width), np.float32)
+        rows, width = light.shape[:2]
+        bands, out = np.empty((rows, 3, width), np.float32), np.empty((rows, 3 * width), np.float32)
+        _run(_split_rows, rows, np.ascontiguousarray(light).reshape(rows, -1), bands)
+        if self._taps is not None:
+            sharp, bands = bands, np.empty_like(bands)
+            _run(_convolve, rows, sharp, *self._taps, bands)
         if self._scales is None:
-            in_row_bands(lambda first, end: _join_rows(bands, out, first, end), rows)
+            _run(_join_rows, rows, bands, out)
         else:
-            tables = self._scales
-            in_row_bands(lambda first, end: _magnify(bands, *tables, out, first, end), rows)
+            _run(_magnify, rows, bands, *self._scales, out)
         return out.reshape(rows, width, 3)
+
+
+def _run(kernel: Callable[..., None], rows: int, *scene: Any) -> None:
+    """Runs a kernel over all rows, in parallel bands."""
+    in_row_bands(lambda first, end: kernel(*scene, first, end), rows)
 
 
 def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:
@@ -200,17 +203,19 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
 
 
 @kernel
+def _split_rows(light, bands, first, end):
+    """Fills rows `first` to `end` - 1 of `bands` (H, 3, W) from `light` (H, 3 W), where R, G, B alternate."""
+    for v in range(first, end):
+        row, red, green, blue = light[v], bands[v, 0], bands[v, 1], bands[v, 2]
+        for u in range(red.size):
+            red[u], green[u], blue[u] = row[3 * u], row[3 * u + 1], row[3 * u + 2]
+
+
+@kernel
 def _join_rows(bands, out, first, end):
     """Fills rows `first` to `end` - 1 of `out` (H, 3 W) from `bands` (H, 3, W)."""
     for v in range(first, end):
         _join_row(bands[v, 0], bands[v, 1], bands[v, 2], out[v])
-
-
-@kernel
-def _split_row(row, red, green, blue):
-    """Copies R, G, B, which alternate in `row` (3 W,), to one array (W,) each."""
-    for u in range(red.size):
-        red[u], green[u], blue[u] = row[3 * u], row[3 * u + 1], row[3 * u + 2]
 
 
 @kernel
@@ -223,29 +228,22 @@ def _join_row(red, green, blue, row):
 
 @kernel
 def _convolve(light, down, across, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with the sum of separable convolutions of `light` (H, 3 W)."""
+    """Fills rows `first` to `end` - 1 of `out` (H, 3, W) with sums of separable convolutions of `light` (H, 3, W)."""
     rows, _, width = out.shape
-    n, terms = 2 * REACH_PX + 1, down.shape[1]
-    lines, wide = np.empty((n, 3, width), np.float32), np.empty(width + 2 * REACH_PX, np.float32)
+    wide = np.empty(width + 2 * REACH_PX, np.float32)
     middle = wide[REACH_PX : REACH_PX + width]
-    for v in range(first - REACH_PX, end + REACH_PX):
-        line = lines[v % n]
-        _split_row(light[min(max(v, 0), rows - 1)], line[0], line[1], line[2])
-        at = v - REACH_PX
-        if at < first:
-            continue
+    for v in range(first, end):
         for band in range(3):
-            filled = out[at, band]
-            for i in range(terms):
+            for i in range(down.shape[1]):
                 weights = down[band, i]
-                _weigh_line(lines[at % n, band], weights[0], middle)
+                _weigh_line(light[v, band], weights[0], middle)
                 for t in range(1, REACH_PX + 1, 2):
-                    above, below = lines[(at - t) % n, band], lines[(at + t) % n, band]
-                    higher, lower = lines[(at - t - 1) % n, band], lines[(at + t + 1) % n, band]
+                    above, below = light[max(v - t, 0), band], light[min(v + t, rows - 1), band]
+                    higher, lower = light[max(v - t - 1, 0), band], light[min(v + t + 1, rows - 1), band]
                     _add_pairs(above, below, weights[t], higher, lower, weights[t + 1], middle)
                 for k in range(REACH_PX):
                     wide[k], wide[REACH_PX + width + k] = middle[0], middle[width - 1]
-                _add_across(wide, across[band, i], filled, i == 0)
+                _add_across(wide, across[band, i], out[v, band], i == 0)
 
 
 @kernel(forceinline=True, fastmath={"contract"})

@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.imaging.camera.lens import solve
+from twin.imaging.camera.lens import newton
 from twin.scenario.model import PortConfig
 
 Array = NDArray[np.float64]
 
-STEPS, STEP, TOLERANCE = 40, 1e-6, 1e-11  # Newton's method: maximum steps; finite difference and tolerance of X / Z
+STEP, TOLERANCE = 1e-6, 1e-11  # Newton's method: finite difference and tolerance of X / Z
 SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
 
 
@@ -70,23 +70,15 @@ def air_coordinates(port: PortConfig, points_m: Array) -> Array:
     normalised = points_m[..., :2] / (points_m[..., 2:] - equivalent.centre_m) * equivalent.focal_ratio
 
     def miss(at: Array) -> Array:
-        """Returns the vector (..., 2) across the axis by which rays miss their points, divided by the points' depth.
-
-        Args:
-            at: (..., 2) normalised coordinates of the rays in air.
-        """
+        """Returns the vector (..., 2) across the axis by which rays miss their points, divided by the points' depth."""
         origin, direction = water_rays(port, at)
         along = (points_m[..., 2:] - origin[..., 2:]) / direction[..., 2:]
         return (origin + along * direction - points_m)[..., :2] / points_m[..., 2:]
 
-    for _ in range(STEPS):
-        residual = miss(normalised)
-        if np.nanmax(np.abs(residual), initial=0.0) < TOLERANCE:
-            break
-        columns = [(miss(normalised + step) - residual) / STEP for step in STEP * np.eye(2)]
-        normalised = normalised - solve(np.stack(columns, axis=-1), residual)
-    converged = np.abs(miss(normalised)).max(axis=-1) < 100 * TOLERANCE
-    return np.where(converged[..., None], normalised, np.nan)
+    def jacobian(at: Array, residual: Array) -> Array:
+        return np.stack([(miss(at + step) - residual) / STEP for step in STEP * np.eye(2)], axis=-1)
+
+    return newton(miss, jacobian, normalised, TOLERANCE, 100)
 
 
 def refract(ray: Array, normal: Array, ratio: float) -> Array:

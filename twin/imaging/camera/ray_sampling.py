@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.threads import in_row_bands
-from twin.imaging.camera.resample import Positions, Radiance, spline_row
+from twin.imaging.camera.resample import Positions, Radiance, spline_row, unpack
 from twin.kernels import kernel
 
 Array = NDArray[np.float64]
@@ -35,12 +35,9 @@ class RowMotion(NamedTuple):
 
 
 def sample_rays(
-    light: Radiance,
-    depth: Depth,
-    positions: Positions,
-    parallax_px_m: Positions | None,
+    light: Radiance, depth: Depth, positions: Positions, parallax_px_m: Positions | None = None,
     motion: RowMotion | None = None,
-) -> Radiance:
+) -> Radiance:  # fmt: skip
     """Returns the radiance (h, w, 3) where the rays of pixels intersect the floor.
 
     A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
@@ -53,17 +50,10 @@ def sample_rays(
         parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
     """
     out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
-    source = np.ascontiguousarray(light).reshape(len(light), -1)
-    rays = near, positions, parallax_px_m, _arguments(motion)
-    in_row_bands(lambda first, end: _sample_rays(source, *rays, out, first, end), len(positions))
+    moves = None if motion is None else (np.ascontiguousarray(motion.twist, np.float64), *motion[1:])
+    scene = np.ascontiguousarray(light).reshape(len(light), -1), near, positions, parallax_px_m, moves
+    in_row_bands(lambda first, end: _sample_rays(*scene, out, first, end), len(positions))
     return out
-
-
-def _arguments(motion: RowMotion | None) -> tuple[Array, float, float, tuple[float, float]] | None:
-    """Returns the motion as a tuple of its fields, for the compiled kernels; None if `motion` is None."""
-    if motion is None:
-        return None
-    return np.ascontiguousarray(motion.twist, np.float64), motion.readout_s, motion.focal_px, motion.principal_px
 
 
 @kernel
@@ -72,7 +62,10 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
     n = out.shape[1]
     rays, cells, weights = np.empty((8, n), np.float32), np.empty(n, np.int32), np.empty((8, n), np.float32)
     for v in range(first, end):
-        _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
+        if parallax is None and motion is None:
+            unpack(positions[v].reshape(-1), rays[0], rays[1])
+        else:
+            _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
         spline_row(source, rays[0], rays[1], weights, cells, out[v].reshape(-1))
 
 
@@ -86,16 +79,12 @@ def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]
     inverse, part_x, part_y = rays[6], rays[0], rays[1]
-    place = positions[v].reshape(-1)
-    for u in range(x.size):
-        base_x[u], base_y[u] = place[2 * u], place[2 * u + 1]
+    unpack(positions[v].reshape(-1), base_x, base_y)
     if parallax is None:
         slope_x[:] = np.float32(0.0)
         slope_y[:] = np.float32(0.0)
     else:
-        step = parallax[v].reshape(-1)
-        for u in range(x.size):
-            slope_x[u], slope_y[u] = step[2 * u], step[2 * u + 1]
+        unpack(parallax[v].reshape(-1), slope_x, slope_y)
     if motion is not None:
         twist, readout_s, focal, principal = motion
         then = geometry.exp(twist * (readout_s * (v / (positions.shape[0] - 1) - 0.5)))

@@ -1,11 +1,12 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps round positions to 1/32 px. For radiance, the B-spline is the point spread function of a pixel; sensor
-images are interpolated after a prefilter (Unser et al. 1993, doi 10.1109/78.193221).
+OpenCV's warps round positions to 1/32 px. For radiance (`ray_sampling`), the B-spline is the point spread function of a
+pixel; sensor images are interpolated after a prefilter (Unser et al. 1993, doi 10.1109/78.193221).
 """
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,43 +25,25 @@ BLOCK = 128  # columns filtered at a time, so that they stay in the second-level
 TAPS = 8  # pixels to each side in the prefilter of rows; POLE^9 is 7e-6
 
 
-def sample(light: Radiance, positions: Positions) -> Radiance:
-    """Returns the radiance (h, w, 3) recorded by pixels at these positions in a radiance image (H, W, 3).
-
-    Beyond the image border, the values of the nearest border pixel are repeated.
-    """
-    source, out = np.ascontiguousarray(light).reshape(len(light), -1), np.empty((*positions.shape[:2], 3), np.float32)
-    in_row_bands(lambda first, end: _fill_from(source, positions, out, first, end), len(positions))
-    return out
-
-
 def interpolate(image: Image, positions: Positions) -> Image:
     """Returns the image (h, w, 3) interpolated from `image` (H, W, 3) at `positions`; exact at pixel centres."""
     spline, out = image.reshape(len(image), -1).astype(np.float32), np.empty((*positions.shape[:2], 3), np.uint8)
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
-    in_row_bands(lambda first, end: _filter_rows(spline, first, end), len(spline))
-    in_row_bands(lambda first, end: _fill_rounded_from(spline, positions, out, first, end), len(positions))
+    wide = cv2.copyMakeBorder(spline.reshape(image.shape), 0, 0, TAPS, TAPS, cv2.BORDER_REFLECT_101)
+    flat = wide.reshape(len(wide), -1)
+    in_row_bands(lambda first, end: _filter_rows(flat, spline, first, end), len(spline))
+    in_row_bands(lambda first, end: _fill_from(spline, positions, out, first, end), len(positions))
     return out
 
 
 @kernel
 def _fill_from(source, positions, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W)."""
-    n = out.shape[1]
-    x, y, weights, cells = _row_memory(n)
+    """Fills rows `first` to `end` - 1 of 8-bit `out` (h, w, 3) with rounded and clipped values of a spline (H, 3 W)."""
+    n, least, most = out.shape[1], np.float32(0.0), np.float32(255.0)
+    x, y, row = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(3 * n, np.float32)
+    weights, cells = np.empty((8, n), np.float32), np.empty(n, np.int32)
     for v in range(first, end):
-        _unpack(positions[v].reshape(-1), x, y)
-        spline_row(source, x, y, weights, cells, out[v].reshape(-1))
-
-
-@kernel
-def _fill_rounded_from(source, positions, out, first, end):
-    """Fills rows `first` to `end` - 1 of 8-bit `out` as `_fill_from` does; the values are rounded and clipped."""
-    n = out.shape[1]
-    x, y, weights, cells = _row_memory(n)
-    row, least, most = np.empty(3 * n, np.float32), np.float32(0.0), np.float32(255.0)
-    for v in range(first, end):
-        _unpack(positions[v].reshape(-1), x, y)
+        unpack(positions[v].reshape(-1), x, y)
         spline_row(source, x, y, weights, cells, row)
         filled = out[v].reshape(-1)
         for k in range(row.size):
@@ -68,17 +51,10 @@ def _fill_rounded_from(source, positions, out, first, end):
 
 
 @kernel
-def _row_memory(n):
-    """Returns uninitialised source columns and rows (n,) of n output pixels, `weights` and `cells` of `spline_row`."""
-    x, y = np.empty(n, np.float32), np.empty(n, np.float32)
-    return x, y, np.empty((8, n), np.float32), np.empty(n, np.int32)
-
-
-@kernel
-def _unpack(place, x, y):
-    """Copies columns and rows, which alternate in `place` (2 w,), to x and y (w,)."""
+def unpack(pairs, x, y):
+    """Copies columns and rows, which alternate in `pairs` (2 w,), to x and y (w,)."""
     for u in range(x.size):
-        x[u], y[u] = place[2 * u], place[2 * u + 1]
+        x[u], y[u] = pairs[2 * u], pairs[2 * u + 1]
 
 
 @kernel
@@ -141,17 +117,17 @@ def _sum_at_border(source, x, y, weights, u, out):
 
 @kernel
 def _filter_columns(image, first, end):
-    """Replaces columns `first` to `end` - 1 of an image (H, n) by cubic B-spline coefficients; borders are mirrored."""
+    """Replaces columns `first` to `end` - 1 of an image (H, n) by cubic B-spline coefficients; borders are mirrored.
+
+    The filter 6 / (1 - p z^-1) is followed by -p / (1 - p z), with p the pole (Unser et al. 1993).
+    """
     for start in range(first, end, BLOCK):
         _filter_block(image, start, min(start + BLOCK, end))
 
 
 @kernel
 def _filter_block(image, first, end):
-    """Filters columns `first` to `end` - 1 of an image, see `_filter_columns`.
-
-    The filter 6 / (1 - p z^-1) is followed by -p / (1 - p z), with p the pole (Unser et al. 1993).
-    """
+    """Filters columns `first` to `end` - 1 of an image, see `_filter_columns`."""
     pole, rows = np.float32(POLE), image.shape[0]
     for k in range(first, end):
         total, power = image[0, k], np.float32(1.0)
@@ -173,36 +149,19 @@ def _filter_block(image, first, end):
 
 
 @kernel(fastmath={"contract"})
-def _filter_rows(image, first, end):
-    """Replaces rows `first` to `end` - 1 of an image (H, 3 W) as `_filter_columns` does with columns.
+def _filter_rows(wide, image, first, end):
+    """Fills rows `first` to `end` - 1 of an image (H, 3 W) with the coefficients of rows that are mirrored by TAPS.
 
     The two recursive filters have the impulse response -6 p / (1 - p^2) p^|n|, which is symmetric and is summed up to
     |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the previous pixel.
     """
-    n = image.shape[1]
-    width = n // 3
-    wide = np.empty(n + 6 * TAPS, np.float32)
     pole = np.float32(POLE)
     middle_weight = np.float32(-6.0) * pole / (np.float32(1.0) - pole * pole)
     for v in range(first, end):
-        row = image[v]
-        wide[3 * TAPS : 3 * TAPS + n] = row
-        for i in range(1, TAPS + 1):
-            before, after = _mirrored(-i, width), _mirrored(width - 1 + i, width)
-            for band in range(3):
-                wide[3 * (TAPS - i) + band] = row[3 * before + band]
-                wide[3 * (TAPS + width - 1 + i) + band] = row[3 * after + band]
-        for k in range(n):
-            total, weight, at = middle_weight * wide[k + 3 * TAPS], middle_weight, np.uint32(k)
+        row, line = image[v], wide[v]
+        for k in range(row.size):
+            total, weight, at = middle_weight * line[k + 3 * TAPS], middle_weight, np.uint32(k)
             for i in range(1, TAPS + 1):  # the innermost loop, so that each value is written once
                 weight *= pole
-                total += weight * (wide[at + np.uint32(3 * (TAPS - i))] + wide[at + np.uint32(3 * (TAPS + i))])
+                total += weight * (line[at + np.uint32(3 * (TAPS - i))] + line[at + np.uint32(3 * (TAPS + i))])
             row[k] = total
-
-
-@kernel
-def _mirrored(at, size):
-    """Returns the position of a pixel in an image that is mirrored at the centres of its first and last pixel."""
-    period = max(2 * (size - 1), 1)
-    at = abs(at) % period
-    return min(at, period - at) if size > 1 else 0

@@ -14,6 +14,7 @@ backscatter and lamp pattern are blurred like the floor behind them. Beyond the 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -55,23 +56,24 @@ def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMo
 
 
 def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
-    """Returns the radiance (H, W, 3) with motion blur.
+    """Returns the radiance (H, W, 3) with motion blur; points at inf move by rotation alone.
 
-    `twist` (6,) is the [angular, linear] velocity of the camera in its own axes [rad/s, m/s]; points at inf move by
-    rotation alone.
+    `twist` (6,) is the [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
     """
-    out, motion = np.empty_like(light), twist.astype(np.float32)
-    flat, focal, open_s = light.reshape(-1, 3), np.float32(focal_px), np.float32(exposure_s)
-    in_row_bands(lambda first, end: _blur_by_motion(flat, depth, focal, motion, open_s, out, first, end), len(light))
-    return out
+    return _by_rows(_blur_by_motion, light, depth, focal_px, twist, exposure_s)
 
 
 def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
     """Returns the radiance (H, W, 3) that a camera with a rolling shutter records."""
-    out, motion = np.empty_like(light), twist.astype(np.float32)
-    focal, whole_s = np.float32(focal_px), np.float32(readout_s)
-    scene = light, depth, focal, motion, whole_s, out
-    in_row_bands(lambda first, end: _apply_rolling_shutter(*scene, first, end), len(light))
+    return _by_rows(_apply_rolling_shutter, light, depth, focal_px, twist, readout_s)
+
+
+def _by_rows(
+    kernel: Callable[..., None], light: Radiance, depth: Depth, focal_px: float, twist: Array, time_s: float
+) -> Radiance:
+    out = np.empty_like(light)
+    scene = light, depth, np.float32(focal_px), twist.astype(np.float32), np.float32(time_s), out
+    in_row_bands(lambda first, end: kernel(*scene, first, end), len(light))
     return out
 
 
@@ -85,10 +87,11 @@ def _flow(x, y, near, scale, twist):
 
 
 @kernel(error_model="numpy")
-def _blur_by_motion(flat, depth, focal, twist, exposure_s, out, first, end):
+def _blur_by_motion(light, depth, focal, twist, exposure_s, out, first, end):
     """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur."""
     height, width = depth.shape
-    values, filled = flat.reshape(height, 3 * width), out.reshape(height, 3 * width)
+    flat = light.reshape(-1, 3)
+    values, filled = light.reshape(height, 3 * width), out.reshape(height, 3 * width)
     x, weights = np.empty(width, np.float32), np.empty((4, width), np.float32)
     of_bands = np.empty((4, 3 * width), np.float32)
     for u in range(width):

@@ -111,17 +111,11 @@ class TrueCameras:
         if self.sampling is None:
             return light
         positions, parallax = self.sampling[camera]
-        rows = self._row_motion(motion, len(light), len(positions))
-        if parallax is None and rows is None:
-            return resample.sample(light, positions)
+        rows, rig = None, self.rendered_rig
+        if motion is not None and motion.readout_s:
+            readout_s = motion.readout_s * (len(positions) - 1) / (len(light) - 1)
+            rows = RowMotion(motion.twist, readout_s, rig.focal_px, (rig.cx_px, rig.cy_px))
         return sample_rays(light, depth, positions, parallax, rows)
-
-    def _row_motion(self, motion: ExposureMotion | None, n_rendered: int, n_raw: int) -> RowMotion | None:
-        """Returns the motion during the read-out of the raw rows; None without rolling shutter."""
-        if motion is None or not motion.readout_s:
-            return None
-        rig, readout_s = self.rendered_rig, motion.readout_s * (n_raw - 1) / (n_rendered - 1)
-        return RowMotion(motion.twist, readout_s, rig.focal_px, (rig.cx_px, rig.cy_px))
 
     def rectify(self, raw: Image) -> Image:
         """Returns the frame: the raw image of either camera, rectified with the believed calibration."""
