@@ -118,8 +118,7 @@ class ImageFormation:
         self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None
     ) -> Radiance:
         """Returns the light (H, W, 3) of floor and water [cd/m2]; the arguments are those of `radiance`."""
-        floor, surface = self._floor_view(depth, camera, pose, objects), self._water_surface(camera, pose)
-        return self._optics.radiance(albedo, depth, camera, floor, surface)
+        return self._optics.radiance(albedo, depth, camera, *self._surroundings(depth, camera, pose, objects))
 
     def add_snow(
         self, light: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None = None
@@ -132,39 +131,33 @@ class ImageFormation:
         self, albedo: Image, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None = None
     ) -> RadianceComponents:
         """Returns the components of the light that reaches a camera; the arguments are those of `radiance`."""
-        floor, surface = self._floor_view(depth, camera, pose, objects), self._water_surface(camera, pose)
-        direct, forward, backscatter = self._optics.parts(albedo, depth, camera, floor, surface)
-        snow = None
+        around, snow = self._surroundings(depth, camera, pose, objects), None
+        direct, forward, backscatter = self._optics.parts(albedo, depth, camera, *around)
         if self._snow is not None:
             before = direct + backscatter if forward is None else direct + backscatter + forward
             snow = before.copy()
             self.add_snow(snow, depth, camera, pose)
             snow -= before
         total = self.radiance(albedo, depth, camera, pose, objects)
-        floor_lx = self._optics.floor_lx(depth, camera, floor, surface)
+        floor_lx = self._optics.floor_lx(depth, camera, *around)
         return RadianceComponents(floor_lx, direct, forward, backscatter, snow, total)
 
-    def _floor_view(self, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None) -> FloorView:
-        """Returns facets, shadows and material of the floor, and normals of the objects, for a camera."""
-        world_from_camera = self._world_from_camera(camera, pose)
+    def _surroundings(
+        self, depth: Depth, camera: int, pose: StampedPose, objects: ObjectView | None
+    ) -> tuple[FloorView, WaterSurface | None]:
+        """Returns facets, shadows and material of the floor with the objects, and the water surface, for a camera."""
+        world_from_camera, lit, surface = self._world_from_camera(camera, pose), None, None
         facets = None if self._facets is None else self._facets.seen_from(world_from_camera)
-        if self._shadows is None:
-            return FloorView(facets, None, self._material, objects)
-        label = None if objects is None else objects.label
-        lit = self._shadows.lit(depth, world_from_camera, camera, label)
-        if objects is not None and self._object_shadows is not None:
-            self._object_shadows.darken(lit, depth, objects, world_from_camera, (camera, pose.time_s))
-        return FloorView(facets, lit, self._material, objects)
-
-    def _water_surface(self, camera: int, pose: StampedPose) -> WaterSurface | None:
-        """Returns the water surface above a camera; None without daylight."""
-        if not self._daylight_on:
-            return None
-        calm = calm_surface(self._world_from_camera(camera, pose), self._reference_depth_m)
-        if self._caustics is None:
-            return calm
-        calm.from_camera[:2] *= self._caustics.cells_per_m
-        return calm._replace(caustics=self._caustics.closed_pattern(pose.time_s))
+        if self._shadows is not None:
+            lit = self._shadows.lit(depth, world_from_camera, camera, None if objects is None else objects.label)
+            if objects is not None and self._object_shadows is not None:
+                self._object_shadows.darken(lit, depth, objects, world_from_camera, (camera, pose.time_s))
+        if self._daylight_on:
+            surface = calm_surface(world_from_camera, self._reference_depth_m)
+            if self._caustics is not None:
+                surface.from_camera[:2] *= self._caustics.cells_per_m
+                surface = surface._replace(caustics=self._caustics.closed_pattern(pose.time_s))
+        return FloorView(facets, lit, self._material, objects), surface
 
     def _world_from_camera(self, camera: int, pose: StampedPose) -> Array:
         return pose.world_from_left @ (self._rig.left_from_right if camera else np.eye(4))

@@ -34,7 +34,6 @@ NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the cam
 APERTURE_M = 0.004  # diameter of the lens aperture where the scenario has no depth of field
 PIXEL_BLUR_PX = 1.0  # blur of the image of a particle by the lens
 FOOTPRINT_PX = 4096  # most pixels of a footprint whose weights are stored; those of a larger one are computed twice
-BLOCK = 512  # number of particles whose positions are computed at a time
 
 
 class VisibleParticles(NamedTuple):
@@ -58,15 +57,9 @@ class MarineSnow:
     """
 
     def __init__(
-        self,
-        snow: SnowConfig,
-        current_mps: Array,
-        rig: StereoRig,
-        water: Medium,
-        lamp_light: list[LampLight],
-        rng: np.random.Generator,
-        defocus: Defocus | None = None,
-    ):
+        self, snow: SnowConfig, current_mps: Array, rig: StereoRig, water: Medium, lamp_light: list[LampLight],
+        rng: np.random.Generator, defocus: Defocus | None = None,
+    ):  # fmt: skip
         self._start_m = rng.uniform(0, BOX_M, (round(snow.density_per_m3 * BOX_M**3), 3))
         self._diameter_m = diameters(snow, len(self._start_m), rng)
         self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, water
@@ -86,37 +79,32 @@ class MarineSnow:
         """Returns the particles in view of a camera (0 left, 1 right) with their radiance."""
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
-        low = world_from_left[:3, 3] - BOX_M / 2
-        middle = np.array([rig.cx_px, rig.cy_px])
-        size = np.array([rig.width_px, rig.height_px])
-        view = rig.focals_px, middle, size, self._margin_px, rig.focal_px * reach_m, farthest_m
-        found, points, pixel = _in_view(
-            self._start_m, self._current_mps * time_s - low, low, geometry.inverse(world_from_camera), *view
-        )
+        low, middle = world_from_left[:3, 3] - BOX_M / 2, (rig.cx_px, rig.cy_px)
+        view = rig.focal_px, *middle, rig.width_px, rig.height_px, self._margin_px, rig.focal_px * reach_m, farthest_m
+        points, seen = np.empty((3, len(self._start_m))), np.empty(len(self._start_m), np.bool_)
+        pose = geometry.inverse(world_from_camera)
+        _into_camera(self._start_m, self._current_mps * time_s - low, low, pose, points)
+        _test_view(points, view, seen)
+        found = np.flatnonzero(seen)
+        points = np.ascontiguousarray(points[:, found].T)
+        pixel = points[:, :2] / points[:, 2:] * rig.focal_px + np.array(middle)
         diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
         return VisibleParticles(
             pixel, points, self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])), diameter_m
         )
 
     def draw(
-        self,
-        light: Radiance,
-        depth: Depth,
-        world_from_left: Array,
-        camera: int,
-        time_s: float,
+        self, light: Radiance, depth: Depth, world_from_left: Array, camera: int, time_s: float,
         motion: ExposureMotion | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance (H, W, 3) `light`."""
         rig, defocus = self._rig, self._defocus
-        farthest_m = float(depth.max())
-        still = motion is None
-        reach_m = 0.0 if still else self._reach_m(motion)
-        seen = self.visible_particles(world_from_left, camera, time_s, reach_m, farthest_m)
+        reach_m = 0.0 if motion is None else self._reach_m(motion)
+        seen = self.visible_particles(world_from_left, camera, time_s, reach_m, float(depth.max()))
         z = seen.depth_m
         width_px = _width_px(rig.focal_px, seen.diameter_m, z, defocus)
         cover_px2 = np.pi / 4 * (rig.focal_px * seen.diameter_m / z) ** 2
-        if still:
+        if motion is None:
             centre_px, path_px = seen.pixel, np.zeros_like(seen.pixel)
         else:
             centre_px, path_px = self._paths(seen, depth, world_from_left, camera, motion)
@@ -150,14 +138,13 @@ class MarineSnow:
         """
         day, loss_per_m = lamps.sources.daylight, self._water.attenuation_per_m
         below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
-        fading, path_loss = np.empty_like(points), np.empty_like(points)
-        _exponents(points, day.attenuation_per_m, below_plan_m, loss_per_m, fading, path_loss)
-        lux = np.exp(fading, out=fading)
+        x, y, z = points.T
+        lux = np.exp(-day.attenuation_per_m * (z + below_plan_m)[:, None])
         lux *= day.illuminance_lx
         for lamp in range(len(lamps.sources.intensity_cd)):
             lux += lamps.lux(lamp, points)[0]
         lux *= self._snow.albedo / np.pi
-        lux *= np.exp(path_loss, out=path_loss)
+        lux *= np.exp(-loss_per_m * np.sqrt(x * x + y * y + z * z)[:, None])
         return lux
 
 
@@ -174,16 +161,6 @@ def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float
     """Returns the diameter of the image of a particle with the given diameter and depth [m], including blur [px]."""
     z = np.asarray(depth_m)
     return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
-
-
-@kernel(error_model="numpy")
-def _exponents(points, day_per_m, below_m, loss_per_m, fading, path_loss):
-    """Fills the exponents of the attenuation of daylight and of the path to the camera, see `MarineSnow._radiance`."""
-    for k in range(points.shape[0]):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        range_m = np.sqrt(x * x + y * y + z * z)
-        for c in range(3):
-            fading[k, c], path_loss[k, c] = -day_per_m[c] * (z + below_m), -loss_per_m[c] * range_m
 
 
 @kernel(error_model="numpy")
@@ -217,37 +194,18 @@ def _image_velocity(x, y, z, focal, drift, twist):
 
 
 @kernel
-def _in_view(start, shift, low, camera_from_world, focals, middle, size, margin_px, reach_px_m, farthest_m):
-    """Returns indices (n,), positions (n, 3) in camera axes [m] and pixels (n, 2) of the particles in view.
+def _into_camera(start, shift, low, pose, points):
+    """Computes the positions (3, n) of particles [m] in the axes of the camera, of pose camera_from_world (4, 4).
 
-    In view are depths between NEAREST_M and `farthest_m` and projections up to `margin_px` + `reach_px_m` / depth
-    outside the image. Positions in the world are `low` + mod(`start` + `shift`, BOX_M) [m].
+    Positions in the world are `low` + mod(`start` + `shift`, BOX_M).
     """
-    found, points, n = np.empty(len(start), np.int64), np.empty((len(start), 3)), 0
-    pixel, focal, (cx, cy) = np.empty((len(start), 2)), focals[0], (middle[0], middle[1])
-    xs, ys, zs, seen = np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK), np.empty(BLOCK, np.uint8)
-    for begin in range(0, len(start), BLOCK):
-        block = start[begin : begin + BLOCK]
-        _into_camera(block.reshape(-1), shift, low, camera_from_world, xs, ys, zs)
-        _test_view(xs, ys, zs, focal, cx, cy, size[0], size[1], margin_px, reach_px_m, farthest_m, seen)
-        for k in range(len(block)):
-            if seen[k]:
-                found[n], points[n, 0], points[n, 1], points[n, 2] = begin + k, xs[k], ys[k], zs[k]
-                pixel[n, 0], pixel[n, 1] = xs[k] / zs[k] * focals[0] + cx, ys[k] / zs[k] * focals[1] + cy
-                n += 1
-    return found[:n], points[:n], pixel[:n]
-
-
-@kernel
-def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
-    """Computes the positions of particles in the axes of the camera, see `_in_view`; `start` (3 n,) is flattened."""
-    per_box, (px, py, pz), (lx, ly, lz) = 1 / BOX_M, (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
-    pose = camera_from_world
+    per_box, flat, xs, ys, zs = 1 / BOX_M, start.reshape(-1), points[0], points[1], points[2]
+    (px, py, pz), (lx, ly, lz) = (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     e, f, g, h = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     i, j, m, o = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
-    for k in range(start.size // 3):
-        x, y, z = start[3 * k] + px, start[3 * k + 1] + py, start[3 * k + 2] + pz
+    for k in range(xs.size):
+        x, y, z = flat[3 * k] + px, flat[3 * k + 1] + py, flat[3 * k + 2] + pz
         x = lx + x - BOX_M * np.floor(x * per_box)
         y = ly + y - BOX_M * np.floor(y * per_box)
         z = lz + z - BOX_M * np.floor(z * per_box)
@@ -257,8 +215,14 @@ def _into_camera(start, shift, low, camera_from_world, xs, ys, zs):
 
 
 @kernel
-def _test_view(xs, ys, zs, focal, cx, cy, width, height, margin_px, reach_px_m, farthest_m, seen):
-    """Fills `seen` with whether each particle is in view, see `_in_view`; a loop that the compiler can vectorize."""
+def _test_view(points, view, seen):
+    """Fills `seen` (n,) with whether each of `points` (3, n) is in view; a loop that the compiler can vectorize.
+
+    In view are depths between NEAREST_M and `farthest_m` and projections up to `margin_px` + `reach_px_m` / depth
+    outside the image.
+    """
+    focal, cx, cy, width, height, margin_px, reach_px_m, farthest_m = view
+    xs, ys, zs = points[0], points[1], points[2]
     for k in range(seen.size):
         z = zs[k]
         margin = margin_px * z + reach_px_m

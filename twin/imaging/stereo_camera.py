@@ -17,7 +17,7 @@ from twin.imaging.camera.lens_psf import LensPsf
 from twin.imaging.camera.photo_sensor import PhotoSensor, Sensor, sensor_of
 from twin.imaging.camera.pixels import Raw
 from twin.imaging.camera.sensor import ExposureSetting, Radiance
-from twin.imaging.camera.shutter import ExposureMotion, integrate
+from twin.imaging.camera.shutter import integrate
 from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
 from twin.imaging.scene.mesh_raster import ObjectView
@@ -67,15 +67,12 @@ class DecomposedImage(NamedTuple):
 
 
 class _View(NamedTuple):
-    """Rendered view of one camera (0 left, 1 right): albedo, depth [m], and the objects in it.
+    """Rendered view of one camera: the arguments of `ImageFormation.radiance`."""
 
-    `pose` is that of the left camera, with the time; `objects` is None for a scene without objects.
-    """
-
-    pose: StampedPose
-    camera: int
     albedo: Image
     depth: Depth
+    camera: int
+    pose: StampedPose
     objects: ObjectView | None
 
 
@@ -117,14 +114,12 @@ class StereoCamera:
         """
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
         self._n_captures += 1
-        cameras = (0, 1) if stereo else (0,)
-        views = [self._render(pose, camera) for camera in cameras]
+        views = [self._render(pose, camera) for camera in ((0, 1) if stereo else (0,))]
         with self._stopwatch("optics"):
             setting = self._sensor.setting
             metered = setting is not None
             if setting is None:  # metered on the first left image at rest
-                light = self._image_formation.radiance(views[0].albedo, views[0].depth, 0, pose, views[0].objects)
-                setting = self._meter(self._sensor, light, views[0].depth)
+                setting = self._meter(self._sensor, self._image_formation.radiance(*views[0]), views[0].depth)
             expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
             if stereo:
                 (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
@@ -157,54 +152,47 @@ class StereoCamera:
 
         The motion affects the image and the digital numbers, not the components.
         """
-        albedo, depth = self._renderer.render(world_from_left)
-        pose = StampedPose(world_from_left, time_s)
-        objects = self._image_formation.draw_objects(albedo, depth, 0, pose)
-        components = self._image_formation.components(albedo, depth, 0, pose, objects)
-        cameras = self._cameras
-        sensor = sensor_of(self._scenario, cameras.raw_rig)
-        floor = self._image_formation.radiance_without_snow(albedo, depth, 0, pose, objects)
-        setting = self._meter(sensor, components.total, depth)
-        motion = sensor.motion(self.twist_of_camera(0, twist_body), setting, len(depth))
-        light = self._through_lens(floor, depth, 0, pose, motion)
+        cameras, sensor = self._cameras, sensor_of(self._scenario, self._cameras.raw_rig)
+        view = self._rendered(StampedPose(world_from_left, time_s), 0)
+        components = self._image_formation.components(*view)
+        setting = self._meter(sensor, components.total, view.depth)
+        light = self._at_raw_pixels(view, sensor, twist_body, setting)
         noise_free = cameras.rectify(sensor.image(light, setting, None))
-        next_rng = copy.deepcopy(self._rngs[0])
-        raw = sensor.raw(light, setting, next_rng) if isinstance(sensor, PhotoSensor) else None
+        raw = sensor.raw(light, setting, copy.deepcopy(self._rngs[0])) if isinstance(sensor, PhotoSensor) else None
         cropped = {name: cameras.crop(part) for name, part in components._asdict().items() if part is not None}
-        components = components._replace(**cropped)
-        shown = None if objects is None else ObjectView(*(cameras.crop(layer) for layer in objects))
+        objects = None if view.objects is None else ObjectView(*(cameras.crop(layer) for layer in view.objects))
         return DecomposedImage(
-            cameras.crop(albedo), cameras.crop(depth), components, setting, noise_free, raw, self._linear, shown
-        )
+            cameras.crop(view.albedo), cameras.crop(view.depth), components._replace(**cropped), setting, noise_free,
+            raw, self._linear, objects,
+        )  # fmt: skip
 
     def _render(self, pose: StampedPose, camera: int) -> _View:
+        with self._stopwatch("render"):
+            return self._rendered(pose, camera)
+
+    def _rendered(self, pose: StampedPose, camera: int) -> _View:
         """Returns the rendered view of a camera, with the objects."""
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
-        with self._stopwatch("render"):
-            albedo, depth = self._renderer.render(world_from_camera)
-            objects = self._image_formation.draw_objects(albedo, depth, camera, pose)
-        return _View(pose, camera, albedo, depth, objects)
+        albedo, depth = self._renderer.render(world_from_camera)
+        return _View(albedo, depth, camera, pose, self._image_formation.draw_objects(albedo, depth, camera, pose))
 
     def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
         """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels."""
-        pose, camera, albedo, depth, objects = view
-        motion = self._sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
-        floor = self._image_formation.radiance_without_snow(albedo, depth, camera, pose, objects)
-        light = self._through_lens(floor, depth, camera, pose, motion)
-        return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[camera])), light
+        light = self._at_raw_pixels(view, self._sensor, twist_body, setting)
+        return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[view.camera])), light
 
     def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
         """Returns the exposure metered on the light (H, W, 3) in the left camera at rest."""
         return sensor.meter(self._cameras.sample(light, depth, 0))
 
-    def _through_lens(
-        self, floor: Radiance, depth: Depth, camera: int, pose: StampedPose, motion: ExposureMotion | None
-    ) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels from the light of floor and water, which may be modified.
+    def _at_raw_pixels(self, view: _View, sensor: Sensor, twist_body: Array, setting: ExposureSetting) -> Radiance:
+        """Returns the radiance (h, w, 3) at the raw pixels of a moving camera.
 
-        Marine snow, which has other depths and velocities, is drawn with its own blur afterwards.
+        Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.
         """
-        light = self._psf.out_of_focus(floor, depth)
+        _, depth, camera, pose, _ = view
+        motion = sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
+        light = self._psf.out_of_focus(self._image_formation.radiance_without_snow(*view), depth)
         if motion is not None:
             motion = motion._replace(rolls_later=self._cameras.sampling is not None)
             light = integrate(light, depth, self._focal_px, motion)
