@@ -20,7 +20,7 @@ from scipy.ndimage import distance_transform_edt, minimum_filter
 from twin import terrains
 from twin.core.records import Array, Image, MapGrid
 from twin.errors import TwinError
-from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.imaging.scene.mesh_raster import DrawnMesh, Target, draw_meshes
 from twin.imaging.scene.object_view import Objects, draw_objects
 from twin.scenario.model import Scenario
 from twin.terrains.holes import known_nodes
@@ -159,17 +159,9 @@ def _colours(drawn: Objects, grid: MapGrid, row_m: float) -> tuple[Image, NDArra
         label = np.zeros(shape, np.uint16)
         target = Target(np.full(shape, np.inf, np.float32), colours[rows], normal, label, uv)
         view = view_from_above(square, rows.start)
-        draw_objects(drawn, target, axes, _borders(view, shape), view)
+        draw_objects(drawn, target, axes, view)
         seen[rows] = label > 0
     return colours, seen
-
-
-def _borders(view: Projection, shape: tuple[int, int]) -> Array:
-    """Returns the planes (4, 4) that bound a parallel view of (rows, cols) pixels: `limits` of `Objects.in_view`."""
-    corner = np.array([view.cx_px, view.cy_px])
-    west, north = (-0.5 - corner) / view.focal_px
-    east, south = (np.array(shape[::-1]) - 0.5 - corner) / view.focal_px
-    return np.array([[1, 0, 0, -west], [-1, 0, 0, east], [0, 1, 0, -north], [0, -1, 0, south]], np.float64)
 
 
 def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) -> Image:

@@ -11,8 +11,6 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.kernels import kernel
-
 Array = NDArray[np.float64]
 
 UNIT = 32767  # integer that represents 1 in a stored normal
@@ -49,7 +47,7 @@ class Facets:
     """Facets of a floor, for cameras in any pose."""
 
     def __init__(self, floor: Heights):
-        self._normals = _stored_normals(np.ascontiguousarray(floor.height_m, np.float32), floor.spacing_m)
+        self._normals = _stored_normals(floor.height_m.astype(np.float32).astype(np.float64), floor.spacing_m)
         self._corner_m, self._spacing_m = np.array([floor.west_m, floor.south_m]), floor.spacing_m
 
     def seen_from(self, world_from_camera: Array) -> FacetView:
@@ -64,25 +62,18 @@ class Facets:
         return FacetView(self._normals, origin.astype(np.int32), grid.astype(np.float32), camera_from_world)
 
 
-@kernel(error_model="numpy")
-def _stored_normals(height, spacing):
-    """Returns the stored normals (rows, cols, 2) int32 of the triangles of a height grid (rows + 1, cols + 1)."""
-    rows, cols = height.shape[0] - 1, height.shape[1] - 1
-    stored = np.empty((rows, cols, 2), np.int32)
-    for r in range(rows):
-        for c in range(cols):
-            south_west, north_east = np.float64(height[r, c]), np.float64(height[r + 1, c + 1])
-            south_east, north_west = height[r, c + 1], height[r + 1, c]
-            stored[r, c, 0] = _store(south_east - south_west, north_east - south_east, spacing)
-            stored[r, c, 1] = _store(north_east - north_west, north_west - south_west, spacing)
-    return stored
+def _stored_normals(height: Array, spacing: float) -> NDArray[np.int32]:
+    """Returns the stored normals (rows, cols, 2) of the triangles of a height grid (rows + 1, cols + 1)."""
+    south_west, south_east, north_west, north_east = height[:-1, :-1], height[:-1, 1:], height[1:, :-1], height[1:, 1:]
+    lower = _stored(south_east - south_west, north_east - south_east, spacing)
+    return np.stack([lower, _stored(north_east - north_west, north_west - south_west, spacing)], axis=-1)
 
 
-@kernel(error_model="numpy")
-def _store(rise_east, rise_north, spacing):
-    """Returns the stored normal (x, y, z) of a triangle, with x east and y north.
+def _stored(rise_east: Array, rise_north: Array, spacing: float) -> NDArray[np.int32]:
+    """Returns stored normals (x, y, z), with x east and y north.
 
-    Its upper 16 bits are `UNIT` x / (1 + z), its lower 16 bits `UNIT` y / (1 + z).
+    Their upper 16 bits are `UNIT` x / (1 + z), their lower 16 bits `UNIT` y / (1 + z).
     """
     per = -UNIT / (spacing + np.sqrt(rise_east * rise_east + rise_north * rise_north + spacing * spacing))
-    return np.int32((np.int64(np.round(rise_east * per)) << 16) | (np.int64(np.round(rise_north * per)) & 0xFFFF))
+    x, y = np.rint(rise_east * per).astype(np.int32), np.rint(rise_north * per).astype(np.int32)
+    return (x << 16) | (y & 0xFFFF)

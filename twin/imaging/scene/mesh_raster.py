@@ -38,6 +38,16 @@ class Projection(NamedTuple):
     perspective: bool  # whether columns and rows are those of a pinhole camera
 
 
+def view_planes(view: Projection, shape: tuple[int, int]) -> Array:
+    """Returns the planes (k, 4) that bound a view of (rows, cols) pixels: inward unit normal and offset [m]."""
+    centre = np.array([view.cx_px, view.cy_px])
+    low, high = (-0.5 - centre) / view.focal_px, (np.array(shape[::-1]) - 0.5 - centre) / view.focal_px
+    planes = np.array([[1.0, 0, 0, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, -1, 0, 0], [0, 0, 1, -view.near_m]])
+    planes[:4, 2 if view.perspective else 3] = -low[0], high[0], -low[1], high[1]
+    planes = planes if view.perspective else planes[:4]
+    return planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
+
+
 class ObjectView(NamedTuple):
     """Objects in an image."""
 
@@ -162,7 +172,7 @@ def _list_parts(parts, matrix, projection, window, closed, shown):
     centre, half, axis, cos_sin, behind = parts
     focal, cx, cy, near, perspective = projection
     left, right, top, bottom = window
-    inverse = _inverse(matrix)  # of zeros if the map mirrors, so that triangles that face away are not left out
+    inverse = _inverse(matrix)
     n = 0
     for p in range(shown.size):
         shown[n] = p
@@ -203,7 +213,7 @@ def _interval(row, centre, half):
 
 @kernel(error_model="numpy")
 def _inverse(matrix):
-    """Returns the inverse (3, 3) of the linear part of a map (3, 4); zeros if it mirrors."""
+    """Returns the inverse (3, 3) of the linear part of a map (3, 4); zeros if it mirrors: keeps all parts."""
     a, b, c = matrix[0, :3], matrix[1, :3], matrix[2, :3]
     inverse = np.zeros((3, 3))
     inverse[:, 0], inverse[:, 1], inverse[:, 2] = np.cross(b, c), np.cross(c, a), np.cross(a, b)

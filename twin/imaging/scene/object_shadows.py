@@ -35,27 +35,20 @@ class _LightView(NamedTuple):
 
     light_from_camera: Array  # (4, 4) transform from the axes of the camera to those of the view
     projection: Projection  # projection of the map
-    limits: Array  # (k, 4) planes of the view, see `Objects.in_view`
     shape: tuple[int, int]  # rows and columns of the map
 
 
 class ObjectShadows:
-    """Shadow casting by objects; the lamps are in the axes of the left and right camera, `to_sun` in those of the
-    world.
-    """
+    """Shadow casting by objects; lamps are in the axes of left and right camera, `to_sun` in those of the world."""
 
     def __init__(self, objects: Objects, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None):
         self._objects, self._focal_px = objects, rig.focal_px
         self._lamps, self._to_sun = lamp_positions_m, to_sun
 
     def darken(
-        self,
-        lit: NDArray[np.uint8],
-        depth: Depth,
-        view: ObjectView,
-        world_from_camera: Array,
+        self, lit: NDArray[np.uint8], depth: Depth, view: ObjectView, world_from_camera: Array,
         moment: tuple[int, float],
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away.
 
         Args:
@@ -77,7 +70,7 @@ class ObjectShadows:
                 continue
             nearest = np.full(light.shape, np.inf, np.float32)
             light_from_world = light.light_from_camera @ camera_from_world
-            casting = self._objects.in_view(light_from_world, light.limits, light.projection, time_s)
+            casting = self._objects.in_view(light_from_world, light.projection, light.shape, time_s)
             draw_meshes(casting, light.projection, Target(nearest))
             matrix = np.ascontiguousarray(light.light_from_camera[:3])
             scene = lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection
@@ -103,41 +96,25 @@ def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightVi
     if not len(ahead):
         return None
     tangents = np.clip(ahead[:, :2] / ahead[:, 2:], -WIDEST_TANGENT, WIDEST_TANGENT)
-    low, high = tangents.min(axis=0), tangents.max(axis=0)
-    focal_px = _scale(low, high, shape)
-    margin = MARGIN_PX / focal_px
-    low, high = low - margin, high + margin
-    planes = np.array(
-        [[1, 0, -low[0], 0], [-1, 0, high[0], 0], [0, 1, -low[1], 0], [0, -1, high[1], 0], [0, 0, 1, -NEAR_M]]
-    )
-    planes /= np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-    projection = Projection(focal_px, -low[0] * focal_px, -low[1] * focal_px, NEAR_M, True)
-    return _LightView(_looking(rotation, lamp_m), projection, planes, _size(low, high, focal_px))
+    return _view_of(tangents, shape, geometry.pose(rotation, lamp_m), NEAR_M, True)
 
 
 def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
     """Returns the parallel view from the sun."""
     rotation = _axes_along(-to_sun)
-    seen = points @ rotation
-    low, high = seen[:, :2].min(axis=0), seen[:, :2].max(axis=0)
-    focal_px = _scale(low, high, shape)
-    margin = MARGIN_PX / focal_px
-    low, high = low - margin, high + margin
-    planes = np.array([[1, 0, 0, -low[0]], [-1, 0, 0, high[0]], [0, 1, 0, -low[1]], [0, -1, 0, high[1]]])
-    projection = Projection(focal_px, -low[0] * focal_px, -low[1] * focal_px, -np.inf, False)
-    return _LightView(_looking(rotation, np.zeros(3)), projection, planes, _size(low, high, focal_px))
+    return _view_of((points @ rotation)[:, :2], shape, geometry.pose(rotation, np.zeros(3)), -np.inf, False)
 
 
-def _scale(low: Array, high: Array, shape: tuple[int, int]) -> float:
-    """Returns the focal length [px] or the scale [px/m] of a shadow map with about as many pixels as the image."""
-    area = np.maximum(high - low, 1e-3).prod()
-    return float(np.sqrt(shape[0] * shape[1] / area))
-
-
-def _size(low: Array, high: Array, focal_px: float) -> tuple[int, int]:
-    """Returns the number of rows and columns of a shadow map of the given extent."""
-    cols, rows = np.ceil((high - low) * focal_px).astype(int) + 1
-    return int(rows), int(cols)
+def _view_of(
+    places: Array, shape: tuple[int, int], camera_from_light: Array, near_m: float, perspective: bool
+) -> _LightView:
+    """Returns the view of places (n, 2) [tangents or m] with about as many pixels as an image of (rows, cols)."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    scale = float(np.sqrt(shape[0] * shape[1] / np.maximum(high - low, 1e-3).prod()))
+    low, high = low - MARGIN_PX / scale, high + MARGIN_PX / scale
+    cols, rows = np.ceil((high - low) * scale).astype(int) + 1
+    projection = Projection(scale, -low[0] * scale, -low[1] * scale, near_m, perspective)
+    return _LightView(geometry.inverse(camera_from_light), projection, (int(rows), int(cols)))
 
 
 def _axes_along(forward: Array) -> Array:
@@ -146,11 +123,6 @@ def _axes_along(forward: Array) -> Array:
     x = np.cross(np.eye(3)[np.abs(z).argmin()], z)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(z, x), z])
-
-
-def _looking(rotation: Array, position_m: Array) -> Array:
-    """Returns the transform (4, 4) from the axes of the camera to those of a view."""
-    return geometry.inverse(geometry.pose(rotation, position_m))
 
 
 @kernel(error_model="numpy")

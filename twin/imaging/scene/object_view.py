@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import Image, StereoRig
-from twin.imaging.scene.mesh_raster import NEAR_M, DrawnMesh, ObjectView, Projection, Target, draw_meshes
+from twin.imaging.scene.mesh_raster import NEAR_M, DrawnMesh, ObjectView, Projection, Target, draw_meshes, view_planes
 from twin.imaging.scene.mesh_texture import TexturedSurface, paint_textures
 from twin.imaging.scene.sway import largest_displacement_m, swayed
-from twin.terrains.objects.detail import Level
 from twin.terrains.objects.floor_mesh import FloorTiles
 from twin.terrains.objects.parts import UNKNOWN
 from twin.terrains.objects.placed_object import PlacedObject
@@ -44,22 +43,24 @@ class Objects:
         self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
         self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
 
-    def in_view(self, camera_from_world: Array, limits: Array, pixel: Projection, time_s: float) -> list[DrawnMesh]:
-        """Returns the meshes of the objects in view by depth of their centres; labels are 1 + the index in `placed`.
+    def in_view(
+        self, camera_from_world: Array, view: Projection, shape: tuple[int, int], time_s: float
+    ) -> list[DrawnMesh]:
+        """Returns the meshes of the objects in a view of (rows, cols) pixels, by depth of their centres.
 
-        Args:
-            camera_from_world: (4, 4) transform from world axes to those of the camera.
-            limits: (k, 4) planes of the view frustum in these axes: inward unit normal and offset [m].
+        Their labels are 1 + the index in `placed`. `camera_from_world` is (4, 4).
         """
+        limits = view_planes(view, shape)
         centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
         order = np.flatnonzero(visible)
         drawn = []
         for k in order[np.argsort(centres[order, 2])]:
             item = self.placed[k]
-            nearest_m = max(centres[k, 2] - self._radii_m[k], pixel.near_m)
-            pixel_m = (nearest_m if pixel.perspective else 1.0) / pixel.focal_px
-            mesh, _, parts = _level(item, LEVEL_PX * pixel_m)
+            nearest_m = max(centres[k, 2] - self._radii_m[k], view.near_m)
+            pixel_m = (nearest_m if view.perspective else 1.0) / view.focal_px
+            fine = [level for level in item.model.levels if level.cell_m * item.scale <= LEVEL_PX * pixel_m]
+            mesh, _, parts = fine[-1]
             if item.model.sways:
                 mesh, parts = swayed(mesh, item, self._current_mps, time_s), UNKNOWN
             transform, closed = camera_from_world @ item.world_from_object, item.model.closed
@@ -72,11 +73,11 @@ class Objects:
 
 
 def draw_objects(
-    objects: Objects, target: Target, camera_from_world: Array, limits: Array, projection: Projection,
-    time_s: float = 0.0,
-) -> None:  # fmt: skip
+    objects: Objects, target: Target, camera_from_world: Array, projection: Projection, time_s: float = 0.0
+) -> None:
     """Draws the objects in view into images, labelled by their numbers + 1, and the textures of a mesh floor."""
-    draw_meshes(objects.in_view(camera_from_world, limits, projection, time_s), projection, target)
+    height, width = target.depth.shape
+    draw_meshes(objects.in_view(camera_from_world, projection, (height, width), time_s), projection, target)
     if objects.surface is not None:
         paint_textures(target, projection, objects.surface)
 
@@ -87,28 +88,11 @@ class ObjectRenderer:
     def __init__(self, objects: Objects, rig: StereoRig):
         self._objects = objects
         self._projection = Projection(rig.focal_px, rig.cx_px, rig.cy_px, NEAR_M, True)
-        self._limits = frustum(rig)
 
     def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
         """Draws the objects into `albedo` (H, W, 3) uint8 and `depth` (H, W) [m] in place; returns their view."""
         view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
         uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)
         target = Target(depth, albedo, *view, uv)
-        draw_objects(self._objects, target, geometry.inverse(world_from_camera), self._limits, self._projection, time_s)
+        draw_objects(self._objects, target, geometry.inverse(world_from_camera), self._projection, time_s)
         return view
-
-
-def frustum(rig: StereoRig) -> Array:
-    """Returns the planes (5, 4) of the view of a camera in its axes: inward unit normal and offset [m]."""
-    left, right = (rig.cx_px + 0.5) / rig.focal_px, (rig.width_px - 0.5 - rig.cx_px) / rig.focal_px
-    top, bottom = (rig.cy_px + 0.5) / rig.focal_px, (rig.height_px - 0.5 - rig.cy_px) / rig.focal_px
-    planes = np.array(
-        [[1, 0, left, 0], [-1, 0, right, 0], [0, 1, top, 0], [0, -1, bottom, 0], [0, 0, 1, -NEAR_M]], np.float64
-    )
-    return planes / np.linalg.norm(planes[:, :3], axis=1, keepdims=True)
-
-
-def _level(item: PlacedObject, cell_m: float) -> Level:
-    """Returns the coarsest level of detail of an object with cells of at most `cell_m` in the world."""
-    fine_enough = [level for level in item.model.levels if level.cell_m * item.scale <= cell_m]
-    return fine_enough[-1]
