@@ -27,28 +27,18 @@ SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
 
 
 class StudyOptions(NamedTuple):
-    """Command-line options of `twin study` and `twin tune`.
+    """Options of `twin study` and `twin tune`."""
 
-    Args:
-        out: folder to write; None: runs/study-NAME or runs/tune-NAME.
-        jobs: number of parallel surveys; None: one per core.
-        scheduler: where the surveys run (`open_engine`).
-        resume: run only the surveys whose results are missing in the folder, and those that failed.
-        live: print a line for each finished survey.
-        verify: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune:
-            number of rendered surveys of a plan before it is recommended; None: `tune.verify` of the study file.
-        extrapolate: fly surrogate surveys outside the fitted range of the error model.
-        allow_plugins: fly plug-ins that study or scenario name as module:Class.
-    """
-
-    out: Path | None = None
-    jobs: int | None = None
-    scheduler: str | None = None
-    resume: bool = False
-    live: bool = False
+    out: Path | None = None  #: folder to write; None: runs/study-NAME or runs/tune-NAME
+    jobs: int | None = None  #: number of parallel surveys; None: one per core
+    scheduler: str | None = None  #: where the surveys run (`open_engine`)
+    resume: bool = False  #: run only the surveys whose results are missing in the folder, and those that failed
+    live: bool = False  #: print a line for each finished survey
+    #: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune: number of
+    #: rendered surveys of a plan before it is recommended; None: `tune.verify` of the study file
     verify: int | None = None
-    extrapolate: bool = False
-    allow_plugins: bool = False
+    extrapolate: bool = False  #: fly surrogate surveys outside the fitted range of the error model
+    allow_plugins: bool = False  #: fly plug-ins that study or scenario name as module:Class
 
 
 @contextmanager

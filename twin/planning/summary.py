@@ -44,25 +44,15 @@ _EXTRAPOLATED = 1.5
 
 @dataclass(frozen=True)
 class PlanSummary:
-    """Properties of a mission predicted by `twin plan`.
-
-    Args:
-        mission: the survey.
-        plane: properties of the plan; footprint, overlaps, disparity and depth error refer to the reference plane.
-        floor: properties of the planned images over the floor with its objects.
-        error: expected height error of the map.
-        cost: computing time, memory and disk space of the simulation.
-        require: value, limit and verdict of each required metric that can be predicted.
-        warnings: sentences on requirements expected to be missed, on insufficient overlap, and on limits of validity
-            of the predictions.
-    """
+    """Properties of a mission predicted by `twin plan`."""
 
     mission: Mission
-    plane: Forecast
-    floor: FloorForecast
-    error: ExpectedError
-    cost: ComputingCost
-    require: dict[str, dict[str, Any]]
+    plane: Forecast  #: footprint, overlaps, disparity and depth error refer to the reference plane
+    floor: FloorForecast  #: properties of the planned images over the floor with its objects
+    error: ExpectedError  #: expected height error of the map
+    cost: ComputingCost  #: computing time, memory and disk space of the simulation
+    require: dict[str, dict[str, Any]]  #: value, limit and verdict of each required metric that can be predicted
+    #: sentences on requirements expected to be missed, on insufficient overlap, and on limits of validity
     warnings: tuple[str, ...]
 
     @property
