@@ -125,7 +125,7 @@ MUTANTS = [
         ("twin/report/figures.py", "values = [row[f\"{key}_ga_rmse_m\"] or 0.0 for row in tracks]", "values = [row[\"after_ga_rmse_m\"] or 0.0 for row in tracks]", "report_figures"),
         ("twin/report/wording.py", "f\"{1e3 * math.radians(value_deg):.2g} mrad\"", "f\"{math.radians(value_deg):.2g} mrad\"", "report_comparison report_figures"),
         ("twin/report/wording.py", "if gain > 1 else f\"{ratio(1 / gain)} larger\"", "if gain > 1 else f\"{ratio(gain)} larger\"", "report_survey_page report_figures"),
-        ("twin/report/verdict.py", "'at least' if more_is_better(name) else 'at most'", "'at most' if more_is_better(name) else 'at least'", "report_verdict"),
+        ("twin/report/headline.py", "'at least' if more_is_better(name) else 'at most'", "'at most' if more_is_better(name) else 'at least'", "report_verdict"),
         # data sets, surrogate's fit, studies, app, reproduction
         ("twin/recordings/recorded_aiding.py", "return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane", "return geometry.so3_exp(-axis * np.arctan2(sine, up[2])) @ over_plane", "datasets_aiding"),
         ("twin/datasets/sensor_folders.py", "times_s, values = table[:, 0] * 1e-9,", "times_s, values = table[:, 0] * 1e-6,", "datasets_readings"),

@@ -12,9 +12,9 @@ from twin.app import console
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.judge.warnings import NEES_BOUNDS, metric_warnings, nees_bounds
 from twin.report import headline, wording
+from twin.report.headline import badge, first_lines
 from twin.report.run_folder import load_run
 from twin.report.survey_page import write_report
-from twin.report.verdict import badge, first_lines
 from twin.scenario.file import load_scenario
 from twin.scenario.idealisations import idealisations
 

@@ -114,8 +114,7 @@ def print_requirements(require: dict[str, dict[str, Any]], suffix: str, passed: 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
     """Prints the verdict on a survey or replay, its reasons and warnings, the key figures and the requirements."""
-    from twin.report.headline import key_figures, results
-    from twin.report.verdict import badge, first_lines
+    from twin.report.headline import badge, first_lines, key_figures, results
 
     seed = "" if metrics["seed"] is None else f", seed {metrics['seed']}"
     print(f"{metrics['name']}{seed}: {badge(metrics).text}")

@@ -11,9 +11,9 @@ from twin.core.user_files import resolved
 from twin.errors import TwinError
 from twin.report import wording
 from twin.report.comparison_figures import RUN_COLOURS, draw_comparison
+from twin.report.headline import badge, first_lines
 from twin.report.html import render_page
 from twin.report.run_folder import Run, load_run
-from twin.report.verdict import badge, first_lines
 
 #: Largest number of runs on one page; more curves cannot be told apart.
 MOST_RUNS = 8

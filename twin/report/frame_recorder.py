@@ -37,13 +37,8 @@ class FrameRecorder:
 
     `frames.csv` has index, time, exposure and sensor readings (without beacons and IMU) of every frame, and whether it
     has a stereo pair. `imu.csv` has the readings of the IMU in body axes, if there is one. `truth.npz` has the true
-    poses and velocities in double precision; the text files of trajectories are rounded. With "all", `left` and `right`
-    have the images of the frames as PNG files; the right camera takes images only at frames that are to become
-    keyframes. With "keyframes", the images are those that the estimators store in the folder `keyframes`.
-
-    Args:
-        folder: run folder.
-        record: which images are kept; with "none", nothing is written.
+    poses and velocities in double precision. With `record` = "all", `left` and `right` have the images as PNG files,
+    with "keyframes" they are those that the estimators store in `keyframes`; with "none", nothing is written.
 
     Raises:
         OSError: the folder cannot be written, or on exit one of the last images could not be written.
@@ -81,15 +76,11 @@ class FrameRecorder:
                 written.result()
 
     def add(self, frame: Frame, world_from_camera: Array, twist_body: Array) -> None:
-        """Adds a frame.
+        """Adds a frame; raises OSError if an earlier image could not be written, for example on a full disk.
 
         Args:
-            frame: the frame.
             world_from_camera: (4, 4) true pose of the left camera.
             twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
-
-        Raises:
-            OSError: an earlier image could not be written, for example because the disk is full.
         """
         if self._lines is None:
             return

@@ -1,14 +1,74 @@
-"""Headline and key figures of a survey or replay: texts with the values of metrics.json."""
+"""Top of a report: badge with the verdict, sentences on the limitations, headline and key figures."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
+from twin.judge.map_error import INFINITE_WITH_HOLES
+from twin.judge.require import more_is_better
 from twin.judge.warnings import nees_bounds
 from twin.report.html import render_text
-from twin.report.wording import DASH, REPLAY_ALIGNMENTS, length
+from twin.report.wording import DASH, REPLAY_ALIGNMENTS, length, percent, with_unit
 from twin.scenario.water_sources import WATER_SOURCES
+
+#: Level of a badge: green, amber or red. The name is also the badge's CSS class in page.css.
+Level = Literal["good", "warn", "bad"]
+_STATUSES = {"aborted": "The survey was aborted", "degraded": "The survey is degraded"}
+
+
+class Badge(NamedTuple):
+    """Verdict on a survey in a few words, with its severity level."""
+
+    text: str
+    level: Level
+
+
+def badge(metrics: Mapping[str, Any] | None) -> Badge:
+    """Returns the verdict on a survey from its metrics.json; None stands for an unfinished survey.
+
+    Red: unfinished, not complete, or a requirement is missed; otherwise amber with warnings, and green without.
+    """
+    if not metrics:
+        return Badge("unfinished", "bad")
+    missed = ["requirement missed"] if _missed(metrics) else []
+    warned = ["with warnings"] if metrics.get("warnings") or metrics.get("warning") else []
+    level: Level = "bad" if metrics["status"] != "complete" or missed else "warn" if warned else "good"
+    return Badge(", ".join([metrics["status"], *(missed or warned)]), level)
+
+
+def first_lines(metrics: Mapping[str, Any]) -> list[str]:
+    """Returns sentences on the limitations of a survey: reason of its status, missed requirements, warnings, idealisations."""
+    warnings = metrics.get("warnings") or list(filter(None, [metrics.get("warning")]))
+    return [*_status(metrics), *_missed(metrics), *warnings, *metrics.get("idealisations", ())]
+
+
+def _status(metrics: Mapping[str, Any]) -> list[str]:
+    """Returns a list with one sentence on the status of the survey and its reason; [] if complete without a reason."""
+    status, reason = metrics["status"], metrics["reason"]
+    if status == "complete":
+        return [f"{reason[:1].upper()}{reason[1:]}."] if reason else []
+    return [f"{_STATUSES.get(status, f'The survey is {status}')}: {reason or 'no reason is known'}."]
+
+
+def _missed(metrics: Mapping[str, Any]) -> list[str]:
+    """Returns a sentence for each requirement that was missed."""
+    return [
+        f"Requirement missed: {name} is {_value(name, row['value'], metrics)}, "
+        f"{'at least' if more_is_better(name) else 'at most'} {with_unit(name, row['limit'])} is required."
+        for name, row in (metrics.get("require") or {}).items()
+        if not row["passed"]
+    ]
+
+
+def _value(name: str, value: float | None, metrics: Mapping[str, Any]) -> str:
+    """Returns the value of a metric as text: "unknown" if it has none, "infinite" if holes make it infinite."""
+    if value is not None:
+        return with_unit(name, value)
+    known = metrics["map"].get("completeness_area")
+    if name in INFINITE_WITH_HOLES and known is not None:
+        return f"infinite (only {percent(known)} of the asked area has a height)"
+    return "unknown"
 
 
 class KeyFigure(NamedTuple):
@@ -22,7 +82,7 @@ class KeyFigure(NamedTuple):
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
     """Returns the summary of a survey or replay: status, conditions, final position error and map quality.
 
-    The limitations of these results are not included; `verdict.first_lines` returns them.
+    The limitations of these results are not included; `first_lines` returns them.
 
     Args:
         metrics: contents of metrics.json; None for an unfinished survey.

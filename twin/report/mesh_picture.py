@@ -35,13 +35,11 @@ WHITE = (1.0, 1.0, 1.0, 0.0)
 
 
 def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Image | None:
-    """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB; None if there is none.
-
-    There is none without a mesh, or if rendering fails.
+    """Returns an oblique view of the mesh from the south-south-east, (h, w, 3) RGB; None if it cannot be rendered.
 
     Args:
         mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).
-        map_from_world: (4, 4) pose of the world in the frame of the map, whose x, y and z are east, north and up of the
+        map_from_world: (4, 4) pose of the world in the frame of the map, whose axes are east, north and up of the
             picture; None: the identity.
     """
     if not mesh_file.is_file():
@@ -58,11 +56,7 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
 
 
 def render_mesh(mesh: Any) -> Image:
-    """Returns a picture of a coloured trimesh on a white background, lit from the north-west and cropped to the mesh.
-
-    Args:
-        mesh: trimesh.Trimesh in the axes of glTF (y up); its vertex colours are replaced by shaded ones.
-    """
+    """Returns a picture of a coloured trimesh in the axes of glTF (y up), lit from the north-west and cropped to it."""
     import pyglet
 
     pyglet.options["headless"] = True  # otherwise pyglet's window module, imported by pyrender, needs X libraries
@@ -83,24 +77,14 @@ def render_mesh(mesh: Any) -> Image:
 
 
 def in_map_frame(vertices: Array, map_from_world: Array) -> Array:
-    """Returns vertices (n, 3) of a mesh in the world in the frame of its map, both in the axes of glTF [m].
-
-    Args:
-        vertices: (n, 3) [m].
-        map_from_world: (4, 4) pose of the world in the frame of the map, both with z up.
-    """
+    """Returns vertices (n, 3) of a mesh in the world in the frame of its map, both in the axes of glTF [m]."""
     from twin.exchange.mesh import GLB_FROM_WORLD  # imports trimesh, which only this process needs
 
     return geometry.transform(map_from_world, vertices @ GLB_FROM_WORLD) @ GLB_FROM_WORLD.T
 
 
 def shaded_colours(colours: Image, normals: Array) -> Image:
-    """Returns vertex colours (n, 3) with Lambertian shading and enough ambient light to keep the mosaic's colours.
-
-    Args:
-        colours: (n, 3) RGB.
-        normals: (n, 3) unit normals in the axes of glTF.
-    """
+    """Returns vertex colours (n, 3) with Lambertian shading and enough ambient light to keep the mosaic's colours."""
     cosine = np.clip(normals @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
     return np.clip(colours * (0.7 + 0.7 * cosine[:, None]), 0, 255).astype(np.uint8)
 
@@ -112,9 +96,6 @@ def camera_pose(vertices: Array) -> Array:
     camera be at distance d from the centre of the vertices, and q a vertex relative to this centre in camera axes. The
     vertex is in view if |q_x| <= t (d - q_z), where t is the tangent of half the horizontal field of view, and if q_y
     satisfies the same condition for the vertical field of view. The distance is the smallest such d times `MARGIN`.
-
-    Args:
-        vertices: (n, 3) in the axes of glTF [m].
     """
     low, high = np.percentile(vertices, FRAMED_PERCENT, axis=0)
     framed = np.clip(vertices, low, high)

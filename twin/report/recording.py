@@ -14,13 +14,12 @@ import rerun.blueprint as rrb
 from twin.core import geometry
 from twin.core.records import Array, Estimate, Frame, Image, StereoRig
 from twin.report import recording_surfaces
-from twin.report.headline import headline, key_figures
+from twin.report.headline import badge, first_lines, headline, key_figures
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
-from twin.report.verdict import badge, first_lines
 from twin.scenario import file as scenario_file
 
 #: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
@@ -36,15 +35,16 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     """Writes run.rrd into a run folder and returns its path.
 
     Args:
-        folder: the run folder.
-        metrics: contents of metrics.json, given while that file does not exist yet; None: read from the file.
+        metrics: contents of metrics.json, given while that file does not exist yet.
 
     Raises:
         TwinError: `folder` is not a run folder, or one of its files is damaged.
     """
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
-    rig = replayed_rig(run.scenario) or _believed_rig(run.folder / SCENARIO_FILE)
+    rig = replayed_rig(run.scenario)
+    if rig is None:  # no plug-in is loaded for it
+        rig = scenario_file.load_scenario(run.folder / SCENARIO_FILE, allow_plugins=True).believed_rig()
     recording = rr.RecordingStream("twin", recording_id=run.folder.name)
     recording.save(file, default_blueprint=blueprint(_overview(run)))
     log_scene(recording, run)
@@ -57,17 +57,8 @@ def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path
     return file
 
 
-def _believed_rig(scenario: Path):
-    """Returns the believed rig of a scenario; no plug-in is loaded for it."""
-    return scenario_file.load_scenario(scenario, allow_plugins=True).believed_rig()
-
-
 def open_viewer(folder: Path) -> int:
-    """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing.
-
-    Raises:
-        TwinError: run.rrd is missing, and `folder` is not a run folder or one of its files is damaged.
-    """
+    """Opens a run in the Rerun viewer and returns the viewer's exit status. Writes run.rrd first if it is missing."""
     file = Path(folder) / "run.rrd"
     if not file.is_file():
         write_recording(Path(folder))
@@ -83,10 +74,12 @@ def blueprint(viewpoint: rrb.EyeControls3D | None = None) -> rrb.Blueprint:
     pictures = rrb.Tabs(
         rrb.Spatial2DView(origin="/mosaic", name="Mosaic"), rrb.TextDocumentView(origin="/summary", name="Summary")
     )
+    units = {"position": "m", "height": "m", "heading": "deg"}
     curves = rrb.Tabs(
-        rrb.TimeSeriesView(origin="/error/position", name="Position error [m]"),
-        rrb.TimeSeriesView(origin="/error/height", name="Height error [m]"),
-        rrb.TimeSeriesView(origin="/error/heading", name="Heading error [deg]"),
+        *[
+            rrb.TimeSeriesView(origin=f"/error/{name}", name=f"{name.capitalize()} error [{unit}]")
+            for name, unit in units.items()
+        ]
     )
     timing = rrb.TimeSeriesView(origin="/timing", name="Time per call [ms]")
     survey = rrb.Spatial3DView(origin="/world", name="Survey", eye_controls=viewpoint)
@@ -132,10 +125,7 @@ def log_scene(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_paths(recording: rr.RecordingStream, run: Run) -> None:
-    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time the part up to then.
-
-    Nodes have their final positions at all times.
-    """
+    """Logs the trajectories and the network at up to `N_SNAPSHOTS` times, each time the part up to then."""
     paths = {name: run.trajectories[name] for name in ("truth", *ESTIMATES) if name in run.trajectories}
     for name, path in paths.items():
         for end in np.unique(np.linspace(1, len(path), min(N_SNAPSHOTS, len(path))).astype(int)):
@@ -149,11 +139,7 @@ def log_paths(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """Logs the final elevation map in the colours of the orthomosaic.
-
-    Each part of the map appears at the first snapshot whose keyframes observe it; parts that no keyframe observes are
-    left out. Without an orthomosaic, the map is coloured by height.
-    """
+    """Logs the final elevation map; each part appears at the first snapshot whose keyframes observe it, if any."""
     if "dem" not in run.rasters or "final" not in run.trajectories or not len(run.keyframes.frames):
         return
     surface = recording_surfaces.map_surface(run.rasters["dem"], run.rasters.get("mosaic"))
@@ -237,15 +223,7 @@ def _log_errors(recording: rr.RecordingStream, run: Run, name: str) -> None:
 def log_curve(
     recording: rr.RecordingStream, entity: str, times: FrameTimes, values: Array, role: str | None = None
 ) -> None:
-    """Logs one curve on both timelines (frame number and time).
-
-    Args:
-        recording: recording to log to.
-        entity: entity path of the curve.
-        times: (n,) frame numbers and times of the values.
-        values: (n,) values of the curve.
-        role: key of its colour and label in `twin.report.style`; None: default colour, labelled by the entity's name.
-    """
+    """Logs one curve; `role` is the key of its colour and label, by default those of Rerun and the entity's name."""
     if len(values):
         style: dict[str, Any] = {"names": LABELS[role] if role else entity.split("/")[-1]}
         style |= {"colors": rgb(role)} if role else {}

@@ -32,10 +32,9 @@ def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
 
 
 def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
-    """Returns, for each stage, the frames of its calls and their durations [ms].
+    """Returns, for each stage, the frames of its calls (at most `N_SAMPLES`) and their durations [ms].
 
-    The stages are global alignment and, of the stages in `Keyframes.timing_ms`, those called once per frame or once per
-    keyframe. More than `N_SAMPLES` calls are subsampled evenly. The result is empty without an online trajectory.
+    The stages are global alignment and, of those in `Keyframes.timing_ms`, those called once per frame or keyframe.
     """
     path = run.trajectories.get("online")
     if path is None:
@@ -50,10 +49,7 @@ def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
 
 
 def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
-    """Returns {"ga": (frame numbers, durations [ms])} of the global alignments; {} if there is none.
-
-    An alignment is plotted at the frame of the last keyframe of its track.
-    """
+    """Returns {"ga": (frames, durations [ms])} of the global alignments, each at the last keyframe of its track."""
     keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
     timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]
     rows = [(frames[-1], ms) for frames, ms in timed if len(frames)]

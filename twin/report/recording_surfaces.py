@@ -38,10 +38,7 @@ def floor_surface(raster: Raster) -> Surface:
 
 
 def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
-    """Returns the estimated map as a surface in the colours of the orthomosaic.
-
-    Without an orthomosaic of the same area, it is coloured by height.
-    """
+    """Returns the estimated map in the colours of an orthomosaic of the same area, or else coloured by height."""
     if mosaic is not None and _covers_same_area(dem.grid, mosaic.grid):
         return _surface(dem, _colours_of_cells(mosaic, dem.grid))
     low, high = np.nanmin(dem.values, initial=np.inf), np.nanmax(dem.values, initial=-np.inf)
@@ -50,21 +47,15 @@ def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
 
 
 def in_world(surface: Surface, map_from_world: Array) -> Surface:
-    """Returns a surface of the map frame in the axes of the world.
-
-    Args:
-        surface: the surface in the axes of the map.
-        map_from_world: (4, 4) pose of the world in the map frame (`ElevationMap.map_from_world`).
-    """
+    """Returns a surface of the map frame in the axes of the world."""
     points = geometry.transform(geometry.inverse(map_from_world), surface.points)
     return surface._replace(points=points, normals=surface.normals @ map_from_world[:3, :3])
 
 
 def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
-    """Returns whether two grids have the same north-west corner and nearly the same size.
+    """Returns whether two grids have the same north-west corner and the same size but for a cell and a pixel.
 
-    Their widths and heights may differ by less than a cell plus a pixel: a reduced orthomosaic
-    (`geotiff.read_mosaic`) lacks the last rows and columns that do not fill a reduced pixel.
+    A reduced orthomosaic (`geotiff.read_mosaic`) lacks rows and columns that do not fill a reduced pixel.
     """
     corner = np.array([pixels.west_m - cells.west_m, pixels.north_m - cells.north_m])
     size = np.array([pixels.cols, pixels.rows]) * pixels.cell_m - np.array([cells.cols, cells.rows]) * cells.cell_m
@@ -73,10 +64,7 @@ def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
 
 
 def _colours_of_cells(mosaic: Raster, cells: MapGrid) -> Image:
-    """Returns the colours (rows, cols, 3) of an orthomosaic in the cells of a map of the same area.
-
-    Cells outside the orthomosaic have the colours of its last row or column.
-    """
+    """Returns the colours (rows, cols, 3) of an orthomosaic in the cells of a map, continued beyond its edges."""
     scale = mosaic.grid.cell_m / cells.cell_m
     size = max(round(mosaic.grid.cols * scale), 1), max(round(mosaic.grid.rows * scale), 1)
     colours = np.asarray(cv2.resize(mosaic.values, size, interpolation=cv2.INTER_AREA), np.uint8)
@@ -104,7 +92,6 @@ def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> ND
     Args:
         points: (n, 3) in the world [m].
         groups: poses world_from_camera (n_k, 4, 4) of the left camera in each group.
-        rig: calibration of the camera.
     """
     group = np.full(len(points), NOT_OBSERVED)
     remaining = np.flatnonzero(np.isfinite(points).all(axis=1))
@@ -117,24 +104,16 @@ def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> ND
 
 
 def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArray[np.bool_]:
-    """Returns whether each of the points (n, 3) projects into the image of a camera, (n,) bool.
-
-    The pixels are taken as square, and the principal point as the centre of the image.
-    """
+    """Returns whether each of the points (n, 3) projects into the image of a camera with square pixels, centred."""
     x, y, z = geometry.transform(geometry.inverse(world_from_camera), points).T
     tangent_x, tangent_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
     return (z > 0) & (np.abs(x) <= tangent_x * z) & (np.abs(y) <= tangent_y * z)
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles that are completely observed once a given camera group has been added, and their vertices.
+    """Returns the triangles that are completely observed once a camera group has been added, and their vertices.
 
-    These are the triangles for which the largest group number of a vertex is `number`.
-
-    Args:
-        surface: the whole surface.
-        group: (n,) number of the group that first observes each vertex, as `first_observed` returns it.
-        number: number of the given group.
+    `group` (n,) are the groups of the vertices (`first_observed`); the largest one of such a triangle is `number`.
     """
     triangles = surface.triangles[group[surface.triangles].max(axis=1, initial=-1) == number]
     used, renumbered = np.unique(triangles, return_inverse=True)

@@ -31,15 +31,7 @@ def describe_replay(
     settings: EstimatorSettings,
     estimator: str | None = None,
 ) -> RunDescription:
-    """Returns the description of a replayed run.
-
-    Args:
-        name: name of the run.
-        source: texts and numbers that describe the data set, for the table `replay`.
-        rig: rectified rig.
-        settings: settings of the estimators.
-        estimator: name of the estimator of another package; None: those of `twin.estimate`.
-    """
+    """Returns the description of a replayed run: texts and numbers on its `source`, rectified rig, and estimators."""
     tree = {
         "name": name,
         "replay": dict(source),

@@ -79,18 +79,12 @@ def conform(given: Any, template: Any, key: str = "", complete: bool = False) ->
     A template has one of these forms:
         a table: the value is a table, and the value of each of its keys has the structure given for that key or, if
             there is none, for the key "*"; without the key "*", other keys are accepted unchecked.
-        a list: the value is a list whose items have the structure of the template's only item; the items are not
-            checked if the template is empty.
+        a list: the value is a list whose items have the structure of the template's only item, if it has one.
         a string, a Boolean or a finite number: the value is of this type.
         `_OptionalText`: the value is a string or None.
-        None: the value is a finite number or None.
-        NaN: the value is a number, NaN or None.
-
-    Numbers may be up to `_LARGEST` in magnitude.
+        None: the value is a finite number or None; NaN: a number, NaN or None.
 
     Args:
-        given: the value.
-        template: the template.
         key: dotted key of the value, for the message.
         complete: whether to add missing keys to tables (not to those in lists), with None for numbers, Booleans and
             optional strings, and [] for lists; another missing string is an error.

@@ -40,13 +40,11 @@ _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are writ
 
 
 class PlannedTruth(NamedTuple):
-    """Truth, map grid and plan of a simulated survey."""
+    """Truth, cells of the maps, and planned initial pose world_from_camera (4, 4) of a simulated survey."""
 
-    truth: Truth  # true trajectory and floor, and the reference path
-    grid: MapGrid  # cells of the maps
-    #: (4, 4) planned initial pose world_from_camera; its rotation is used for the whole reference path unless the truth
-    #: has a planned heading per frame.
-    start: Array
+    truth: Truth
+    grid: MapGrid
+    start: Array  # its rotation holds for the whole reference path, unless the truth has a planned heading per frame
 
     def reference(self) -> Trajectory:
         """Returns the planned path as poses world_from_camera."""
@@ -62,21 +60,16 @@ class PlannedTruth(NamedTuple):
 class SurveyRecord:
     """Results of a survey, complete or aborted, as `RunFolder.finish` writes them."""
 
-    result: SurveyResult  # output of the estimators
-    elevation: ElevationMap | None  # elevation map; None if none was built
-    simulated: PlannedTruth | None  # truth and plan of a simulated survey; None for recorded data
-    n_frames_per_keyframe: int | None  # planned frames from one keyframe to the next; None without a plan
-    stopwatch: Stopwatch  # durations of the processing stages
+    result: SurveyResult
+    elevation: ElevationMap | None
+    simulated: PlannedTruth | None  # None for recorded data
+    n_frames_per_keyframe: int | None  # planned
+    stopwatch: Stopwatch
     metrics: dict[str, Any]  # contents of metrics.json
-    #: position of the scene in the CRS of the DEM; None: rasters are in scene coordinates.
-    georeference: Georeference | None = None
-    #: whether mosaic.tif has been written as an orthomosaic (`RunFolder.orthomosaic_file`); otherwise it is written
-    #: with the cells of the map.
-    has_orthomosaic: bool = False
-    #: recorded true poses of all frames, in the world of the estimates; None unless every frame has one.
-    recorded_truth: Trajectory | None = None
-    #: (rows, cols) true heights at the cells of the map, along its axis of height; None if they are not known.
-    recorded_heights_m: NDArray[np.float32] | None = None
+    georeference: Georeference | None = None  # None: rasters are in scene coordinates
+    has_orthomosaic: bool = False  # whether mosaic.tif exists; otherwise it is written with the cells of the map
+    recorded_truth: Trajectory | None = None  # of all frames, in the world of the estimates
+    recorded_heights_m: NDArray[np.float32] | None = None  # (rows, cols) along the axis of height of the map
 
 
 class RunFolder:
@@ -85,8 +78,7 @@ class RunFolder:
     Args:
         folder: path of the run folder, which is created if it does not exist.
         scenario: the resolved scenario of the run, or the description of a run without a scenario.
-        outputs: members of `OPTIONAL_OUTPUTS` to write at the end; writing them may take longer than a short survey.
-            None: the metrics are the only results that are written, without trajectories and maps.
+        outputs: members of `OPTIONAL_OUTPUTS` to write at the end; None: no results but the metrics.
 
     Raises:
         TwinError: the folder cannot be written.
@@ -124,17 +116,11 @@ class RunFolder:
             pass
 
     def finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
-        """Writes all results and returns the metrics as written.
+        """Writes all results, metrics.json last, and returns the metrics as written.
 
-        The metrics are written first under a temporary name and renamed to metrics.json last, because a folder without
-        metrics.json counts as unfinished. If another result cannot be written, e.g. because the disk is full, the
-        status becomes "aborted". An interrupt while the maps, the report or the recording are written ends this stage
-        only: its files are deleted, except a finished orthomosaic, and the status becomes "aborted" with a reason that
-        names the stage.
-
-        Args:
-            record: the results.
-            guard: limits an interrupt to a single stage, and records why the survey ended early, if it did.
+        If a result cannot be written, for example because the disk is full, the status becomes "aborted". An interrupt
+        while the maps, the report or the recording are written ends this stage only (`guard`): its files are deleted,
+        except a finished orthomosaic, and the status becomes "aborted" with a reason that names the stage.
 
         Raises:
             TwinError: metrics.json cannot be written.
@@ -177,11 +163,7 @@ class RunFolder:
     def orthomosaic_file(
         self, grid: MapGrid, georeference: Georeference | None
     ) -> AbstractContextManager[OrthomosaicFile | None]:
-        """Opens mosaic.tif to write the tiles of an orthomosaic.
-
-        Returns:
-            Context manager whose value is the open file, or None if no maps are written.
-        """
+        """Opens mosaic.tif for the tiles of an orthomosaic; the value of the context is None if no maps are written."""
         from twin.exchange.geotiff import OrthomosaicFile
 
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
@@ -193,20 +175,14 @@ class RunFolder:
         return TiledMapFolder(self.path / "tiles")
 
     def _attempt(self, guard: StageGuard, stage: str, write: Callable[[], None], kept: Collection[str] = ()) -> None:
-        """Writes the files of a stage; deletes them if an interrupt ends it, as the last file may be incomplete.
-
-        Args:
-            guard: records the interrupt.
-            stage: name of the stage, a key of `_FILES`.
-            write: writes the files.
-            kept: names of files that match the patterns of the stage, but were complete before it.
-        """
+        """Writes the files of a stage (`_FILES`); deletes all but the `kept` ones if an interrupt ends it."""
         n_skipped = len(guard.skipped)
         guard.attempt(stage, write)
         if len(guard.skipped) > n_skipped:
-            for file in (file for pattern in _FILES[stage] for file in self.path.glob(pattern)):
-                if file.name not in kept:
-                    file.unlink()
+            for pattern in _FILES[stage]:
+                for file in self.path.glob(pattern):
+                    if file.name not in kept:
+                        file.unlink()
 
     def _write(self, name: str, text: str) -> None:
         """Writes a text file of this folder."""
@@ -261,7 +237,7 @@ class RunFolder:
             mesh.write_glb(self.path / "mesh.glb", elevation)
 
     def _write_optional_output(self, name: str, metrics: dict[str, Any]) -> None:
-        """Writes the report or the recording; the libraries for each are imported only when needed."""
+        """Writes the report or the recording, whose libraries are imported only when needed."""
         if name == "report":
             from twin.report import survey_page
 

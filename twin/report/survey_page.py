@@ -15,14 +15,13 @@ from twin.core.user_files import read_text
 from twin.judge.processing_budget import stage_times
 from twin.report import wording
 from twin.report.figures import draw_all
-from twin.report.headline import closed_form_comparison, headline, key_figures
+from twin.report.headline import badge, closed_form_comparison, first_lines, headline, key_figures
 from twin.report.html import render_page
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_table import stage_rows
 from twin.report.style import COLOURS, ESTIMATES, LABELS
-from twin.report.verdict import badge, first_lines
 
 #: Longest side of an image in the report [px].
 IMAGE_PX = 1400
@@ -53,6 +52,7 @@ def render(run: Run) -> str:
 def context(run: Run) -> dict[str, Any]:
     """Returns the variables of the HTML template, survey_page.html.j2."""
     metrics = run.metrics or {}
+    has_links = "links" in metrics and not metrics.get("replay")
     return {
         "name": metrics.get("name") or run.scenario.get("name") or run.folder.name,
         "badge": badge(run.metrics),
@@ -62,26 +62,18 @@ def context(run: Run) -> dict[str, Any]:
         "key_figures": key_figures(metrics),
         "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
         "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],
-        "closed_form_comparison": _closed_form_comparison(metrics),
+        "closed_form_comparison": closed_form_comparison(metrics["links"]) if has_links else "",
         "stage_times": stage_times(metrics, run.scenario, run.keyframes.n_frames_per_keyframe) if metrics else [],
         "processing_stages": wording.PROCESSING_STAGES,
         "figures": draw_all(run),
         "mosaic": mosaic_image(run),
-        "surface": surface_image(run),
+        "surface": jpeg_uri(surface_picture(run.folder / "mesh.glb", run.keyframes.map_from_world)),
         "samples": sample_images(run),
         "alignment": wording.REPLAY_ALIGNMENTS[run.alignment or "first"],
         "scenario": read_text(run.folder / SCENARIO_FILE),
         "environment": {key: _text(value) for key, value in run.environment.items()},
         "colours": COLOURS,
     }
-
-
-def _closed_form_comparison(metrics: Mapping[str, Any]) -> str:
-    """Returns the comparison of the links with the closed form as text.
-
-    Returns "" without metrics, and for a replay, which has no link errors.
-    """
-    return "" if "links" not in metrics or metrics.get("replay") else closed_form_comparison(metrics["links"])
 
 
 def mosaic_image(run: Run) -> str | None:
@@ -92,33 +84,24 @@ def mosaic_image(run: Run) -> str | None:
     return jpeg_uri(np.where(mosaic.any(axis=2, keepdims=True), mosaic, np.uint8(255)))
 
 
-def surface_image(run: Run) -> str | None:
-    """Returns an oblique view of the mesh as a JPEG data URI; None if there is no mesh or rendering fails."""
-    picture = surface_picture(run.folder / "mesh.glb", run.keyframes.map_from_world)
-    return None if picture is None else jpeg_uri(picture)
+def sample_images(run: Run) -> list[tuple[int, str, str]]:
+    """Returns the frame number and the images of at most `N_SAMPLES` keyframes spread over the survey.
 
-
-def sample_images(run: Run) -> list[tuple[int, str, str | None]]:
-    """Returns (frame number, left image, right image) of at most `N_SAMPLES` keyframes spread over the survey.
-
-    The images are JPEG data URIs; the right one is None if it does not exist.
+    The left and right images are JPEG data URIs, "" if they do not exist.
     """
     frames = run.frames_with_image()
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(N_SAMPLES, len(frames))).round().astype(int))
-    return [(frames[k], *_stereo_pair(run, frames[k])) for k in chosen]
+    samples = []
+    for frame in (frames[k] for k in chosen):
+        left, right = (jpeg_uri(read_rgb(run.image_file(frame, side))) for side in ("left", "right"))
+        samples.append((frame, left, right))
+    return samples
 
 
-def _stereo_pair(run: Run, frame: int) -> tuple[str, str | None]:
-    """Returns the left and the right image of a keyframe as JPEG data URIs.
-
-    A missing left image is "", and a missing right image is None.
-    """
-    left, right = (read_rgb(run.image_file(frame, side)) for side in ("left", "right"))
-    return (jpeg_uri(left) if left is not None else ""), (jpeg_uri(right) if right is not None else None)
-
-
-def jpeg_uri(image: NDArray[np.uint8]) -> str:
-    """Returns an RGB image as a JPEG data URI, reduced so that no side is longer than `IMAGE_PX`."""
+def jpeg_uri(image: NDArray[np.uint8] | None) -> str:
+    """Returns an RGB image as a JPEG data URI, reduced so that no side is longer than `IMAGE_PX`; "" for None."""
+    if image is None:
+        return ""
     return "data:image/jpeg;base64," + base64.b64encode(jpeg_bytes(image, IMAGE_PX)).decode()
 
 
