@@ -38,7 +38,7 @@ def badge(metrics: Mapping[str, Any] | None) -> Badge:
 
 
 def first_lines(metrics: Mapping[str, Any]) -> list[str]:
-    """Returns sentences on the limitations of a survey: reason of its status, missed requirements, warnings, idealisations."""
+    """Returns sentences on the limitations: reason of the status, missed requirements, warnings, idealisations."""
     warnings = metrics.get("warnings") or list(filter(None, [metrics.get("warning")]))
     return [*_status(metrics), *_missed(metrics), *warnings, *metrics.get("idealisations", ())]
 
