@@ -19,14 +19,9 @@ class ThrustAllocation(NamedTuple):
     thrust_table_n: Array  # (k,) steady thrust at the commands of `command_table` [N]
 
     def commands(self, wrench: Array) -> tuple[Array, float]:
-        """Computes thruster commands for a wrench.
+        """Returns the commands (n,) in [-1, 1] for a wrench (6,) [moment, force] in the body [N m, N], and its factor.
 
-        A wrench that would saturate a thruster is scaled down; its direction is kept.
-
-        Args:
-            wrench: (6,) [moment, force] in the body [N m, N].
-        Returns:
-            Commands (n,) in [-1, 1], and the factor in (0, 1] by which the wrench was scaled.
+        A wrench that would saturate a thruster is scaled down by a factor in (0, 1]; its direction is kept.
         """
         return allocate_wrench(self, wrench)
 
@@ -50,8 +45,7 @@ def pseudo_inverse_allocation(
 
     Args:
         configuration: thrust configuration matrix B (6, n): wrench [moment, force] in the body per newton of thrust.
-        thrust_of_command: returns the steady thrust [N] at commands in [-1, 1]; it must increase with the command
-            around 0.
+        thrust_of_command: returns the steady thrust [N] at commands in [-1, 1], increasing around 0.
         weights: diagonal of W (n,); a thruster with a greater weight is used less. None: equal weights.
     """
     weighted = configuration / (np.ones(configuration.shape[1]) if weights is None else weights)

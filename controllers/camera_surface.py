@@ -59,8 +59,7 @@ def surface_above_floor(
     standard deviation of one node distance then rounds the edges.
 
     Args:
-        height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
-        spacing_m: distance between the nodes of `height_m`.
+        height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south, at nodes `spacing_m` apart.
         corner_m: position (x, y) of node (0, 0).
         footprint_m: extent of an image on the floor along x and y.
         max_slope: greatest slope (rise over run) of the surface along x, y and the diagonals.
@@ -84,8 +83,7 @@ def surface_above_floor(
 def _limit_slope(height_m, step_y_m, step_x_m, max_slope):
     """Returns heights raised as little as possible, so that the slope to each of 8 neighbours is at most `max_slope`.
 
-    Two sweeps in opposite directions propagate the limit over the whole grid (chamfer distance transform, Borgefors
-    1986).
+    Two sweeps in opposite directions propagate the limit (chamfer distance transform, Borgefors 1986).
     """
     result = height_m.copy()
     rows, cols = result.shape

@@ -21,15 +21,13 @@ class Forecast(NamedTuple):
     n_frames_per_keyframe: int  # N, frames from one keyframe to the next
     keyframes_per_swath: int  # M, number of keyframes on a leg of mean length or on a loop
     n_tracks: int  # L, number of planned tracks
-    #: n_keyframes, n_frames: number of keyframes and of frames of the survey, without station keeping.
+    #: Numbers of keyframes and frames, duration, and horizontal length of the path, without station keeping.
     n_keyframes: int
     n_frames: int
-    #: duration_s, path_m: duration of the survey and horizontal length of its path, without station keeping.
     duration_s: float
     path_m: float
     speed_mps: float  # cruise speed along the swaths
-    #: width (across the heading) and height (along the heading) of the image on the floor.
-    footprint_m: tuple[float, float]
+    footprint_m: tuple[float, float]  # width (across the heading) and height of the image on the floor
     keyframe_spacing_m: float  # distance between consecutive keyframes
     swath_spacing_m: float  # greatest distance between neighbouring swaths
     overlap_along: float  # overlap of consecutive keyframes, as a fraction of `SurveyPlan.side_along_m`
@@ -42,10 +40,6 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
     """Computes the forecast of a plan (Negahdaripour & Madjidi 2003, section III-A).
 
     With the disparity d = f b / Z, the standard deviation of depth is sigma_Z = Z^2 / (f b) sigma_d.
-
-    Args:
-        baseline_m: stereo baseline b [m].
-        disparity_sigma_px: standard deviation sigma_d of the disparity [px].
     """
     tracks = range(1, plan.n_tracks + 1)
     keyframes = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])
@@ -73,8 +67,7 @@ class Clearance(NamedTuple):
     """Clearance of a planned path above the floor."""
 
     least_m: float  # least height of the camera above the highest floor near it; infinite if no floor was found
-    #: x_m, y_m: where the clearance is least: the floor point for a level path, the camera for a path that follows the
-    #: floor.
+    #: Where the clearance is least: floor point of a level path, or camera of a path that follows the floor.
     x_m: float
     y_m: float
     inside: bool  # whether every point (x, y) of the path lies within the extent of the terrain
@@ -84,10 +77,8 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
     """Returns the clearance of a level path above the highest floor within the image footprints and between the swaths.
 
     Args:
-        height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain. The terrain must
-            be a rectangle: the path is taken to lie inside if all its waypoints do.
-        sample_m: sampling distance of the heights. It is increased if there would be more than
-            `MAX_CLEARANCE_SAMPLES` samples: at 2 cm, for areas above 8000 m2.
+        height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain, a rectangle.
+        sample_m: least sampling distance of the heights; larger beyond `MAX_CLEARANCE_SAMPLES` samples.
     """
     outline = plan.outline()[:, :2]
     path = np.column_stack(plan.area.to_legs(*outline.T))

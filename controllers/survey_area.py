@@ -39,11 +39,7 @@ class SurveyArea:
         return self.centre_m[0] + (c * u - s * v), self.centre_m[1] + (s * u + c * v)
 
     def at_fractions(self, fractions: Array) -> Array:
-        """Returns the scene points (..., 2) [m] at fractions of the area's extent along and across the legs.
-
-        Args:
-            fractions: (..., 2) fractions, -0.5 to 0.5; 0 is the middle.
-        """
+        """Returns the scene points (..., 2) [m] at fractions (..., 2) of the extent, -0.5 to 0.5; 0 is the middle."""
         u, v = np.moveaxis(fractions * self.size_m, -1, 0)
         return np.stack(self.to_scene(u, v), axis=-1)
 
@@ -74,10 +70,7 @@ class SurveyArea:
         return np.column_stack(self.to_scene(u, v))
 
     def extent_between(self, low_m: float, high_m: float) -> tuple[float, float]:
-        """Returns the least and the greatest u [m] of the part of a rectangle or polygon with `low_m` <= v <= `high_m`.
-
-        u is the coordinate along the legs, v the one to the left of them.
-        """
+        """Returns the least and greatest u [m] of the part of a rectangle or polygon with `low_m` <= v <= `high_m`."""
         reach_m = 2 * self.size_m[0]
         west_m, _, east_m, _ = self._polygon().intersection(shapely.box(-reach_m, low_m, reach_m, high_m)).bounds
         return west_m, east_m
@@ -95,11 +88,11 @@ class SurveyArea:
 
 
 def polygon_area(corners_m: ArrayLike, heading: float) -> SurveyArea:
-    """Returns the area of a polygon.
+    """Returns the area of a polygon, with legs along the heading [rad, counter-clockwise from east].
 
     Args:
         corners_m: (n, 2) corners x, y in the scene, in either sense of rotation; the first may be repeated at the end.
-        heading: direction of the legs [rad, counter-clockwise from east].
+
     Raises:
         TwinError: the polygon has fewer than three or more than MAX_CORNERS corners, a coordinate is not finite, two
             edges intersect, or the extent along or across the legs is less than MIN_SIZE_M.

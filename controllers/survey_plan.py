@@ -28,11 +28,9 @@ class SurveyRequest(NamedTuple):
     """Requirements of a survey."""
 
     area_m: tuple[float, float]  # extent along and across the legs
-    #: height of the left camera above the reference plane z = 0 or, with `surface`, above the smoothed floor.
-    altitude_m: float
+    altitude_m: float  # of the left camera above the reference plane or, with `surface`, the smoothed floor
     speed_mps: float  # cruise speed
-    #: required overlap of consecutive keyframes, as a fraction of the image width (see `frames_per_keyframe`).
-    overlap_along: float
+    overlap_along: float  # of consecutive keyframes, as a fraction of the image width (`frames_per_keyframe`)
     overlap_across: float  # required sidelap of neighbouring swaths, as a fraction of `SurveyPlan.side_across_m`
     tracks: int  # number of tracks to fly, starting with the first; 0: all tracks that fill the area
     #: image_width_px, image_height_px, focal_px, frame_rate_hz: parameters of the left camera.
@@ -41,17 +39,12 @@ class SurveyRequest(NamedTuple):
     focal_px: float
     frame_rate_hz: float
     acceleration_mps2: float = 0.2  # greatest acceleration of the camera
-    #: area to cover, of extent `area_m`; None: a rectangle or disc at the origin, with legs along x.
-    area: SurveyArea | None = None
-    #: "reverse": every second leg is flown backwards; "bow_first": the vehicle turns by 180 degrees at the end of each
-    #: leg except the last.
+    area: SurveyArea | None = None  # of extent `area_m`; None: a rectangle or disc at the origin, with legs along x
     turns: Literal["reverse", "bow_first"] = "reverse"
-    #: along_scale, across_scale: factors on the spacing of keyframes and of swaths that follows from the footprint on
-    #: the reference plane; below 1 if the floor is nearer to the cameras than the plane.
+    #: Factors on the spacing of keyframes and of swaths on the reference plane; below 1 if the floor is nearer.
     along_scale: float = 1.0
     across_scale: float = 1.0
-    #: planned height z of the camera as a function of x and y; None: `altitude_m` everywhere.
-    surface: CameraSurface | None = None
+    surface: CameraSurface | None = None  # planned height z of the camera; None: `altitude_m` everywhere
 
     @property
     def footprint_m(self) -> tuple[float, float]:
@@ -64,27 +57,22 @@ class SurveyRequest(NamedTuple):
 class SurveyPlan:
     """Planned path and heading of the left camera. The vehicle keeps station after each track."""
 
-    #: segments of each track; tracks are numbered from 1, and every segment starts and ends at rest.
-    paths: tuple[tuple[Segment, ...], ...]
+    paths: tuple[tuple[Segment, ...], ...]  # of each track; every segment starts and ends at rest
     area: SurveyArea  # area to cover; the legs, and the bow on the first leg, point along its heading
-    #: height of the camera above the reference plane z = 0 or, with `surface`, above the smoothed floor.
-    altitude_m: float
+    altitude_m: float  # above the reference plane z = 0 or, with `surface`, above the smoothed floor
     speed_mps: float  # cruise speed along the swaths
     frame_rate_hz: float  # frames per second
     n_frames_per_keyframe: int  # N, frames from one keyframe to the next
     swath_length_m: float  # length of a swath: the mean over all legs that fill the area, or that of a loop
     swath_spacing_m: float  # greatest distance between neighbouring swaths
     n_tracks_to_fill: int  # number of tracks that fill the area, of which the first `n_tracks` are planned
-    #: width (across the heading) and height (along the heading) of the image on the reference plane.
-    footprint_m: tuple[float, float]
-    #: side of the footprint along which consecutive keyframes are displaced; the shorter one for loops.
+    footprint_m: tuple[float, float]  # of the image on the reference plane: width (across the heading) and height
+    #: Sides of the footprint along which keyframes and neighbouring swaths are displaced; the shorter one for loops.
     side_along_m: float
-    #: side of the footprint along which neighbouring swaths are displaced; the shorter one for loops.
     side_across_m: float
     focal_px: float  # focal length of the cameras
     acceleration_mps2: float  # greatest acceleration of the camera
-    #: planned height z of the camera, which replaces z of the paths; None: `altitude_m` everywhere.
-    surface: CameraSurface | None = None
+    surface: CameraSurface | None = None  # replaces z of the paths
 
     @property
     def area_m(self) -> tuple[float, float]:
@@ -94,12 +82,8 @@ class SurveyPlan:
     def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point of the scene lies in the asked area, which the planned tracks have to cover.
 
-        If the planned tracks fill the area, the asked area is the whole area. Otherwise it is the part of the area up
-        to half of `swath_spacing_m` beyond the last planned leg of a lawnmower, or within half of `swath_spacing_m`
-        of a planned loop.
-
-        Args:
-            x_m, y_m: coordinates of the points, arrays of any shape that broadcast.
+        This is the whole area if the planned tracks fill it; otherwise the part of it up to half of `swath_spacing_m`
+        beyond the last planned leg of a lawnmower, or within half of `swath_spacing_m` of a planned loop.
         """
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         inside = self.area.contains(x_m, y_m)
@@ -152,8 +136,7 @@ class SurveyPlan:
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
         """Returns the times (n,) of the frames of a track since its start [s], and whether each is a keyframe.
 
-        Every N-th frame and the last one are keyframes. While the vehicle turns, there are more keyframes if it would
-        otherwise turn by more than TURN_PER_KEYFRAME between them.
+        These are every N-th frame and the last one, and more while the vehicle turns (`TURN_PER_KEYFRAME`).
         """
         frames = np.arange(round(self.track_duration_s(track) * self.frame_rate_hz) + 1)
         times_s, n = frames / self.frame_rate_hz, self.n_frames_per_keyframe
@@ -171,10 +154,7 @@ class SurveyPlan:
         return np.array([isinstance(segment, Turn) for segment in path])[current]
 
     def reference(self, track: int, time_s: float) -> Reference:
-        """Returns the reference of the left camera at a time since the start of a track [s].
-
-        The velocity is 0 before the start and after the end of the track.
-        """
+        """Returns the reference of the left camera at a time since the start of a track [s]; at rest outside it."""
         return self.references(track, np.array([time_s])).row(0)
 
     def references(self, track: int, times_s: Array) -> Reference:
@@ -196,11 +176,8 @@ class SurveyPlan:
 def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
     """Returns the number of frames per keyframe N (Negahdaripour & Madjidi 2003, section III-A).
 
-    N = round((1 - overlap_along) ImgSize Altitude FrameRate / (FocalLength Speed)), with the distance between
-    keyframes multiplied by `along_scale` of the request; ImgSize is the image width, as in the paper.
-
-    Raises:
-        TwinError: N would be 0 at this speed.
+    N = round((1 - overlap_along) ImgSize Altitude FrameRate / (FocalLength Speed)), multiplied by `along_scale`;
+    ImgSize is the image width. Raises TwinError if N would be 0 at this speed.
     """
     advance_m = (1 - request.overlap_along) * request.footprint_m[0] * request.along_scale
     n = round(advance_m * request.frame_rate_hz / speed_mps)
@@ -215,14 +192,10 @@ def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
 
 
 def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
-    """Returns the number of tracks to fly.
+    """Returns the number of tracks to fly, of `n_filling` that fill the area.
 
-    Args:
-        request: the requirements; `tracks` = 0 means all tracks.
-        n_filling: number of tracks that fill the area.
     Raises:
-        TwinError: the requested number of tracks is negative or greater than the number that fills the area, or more
-            than `MAX_TRACKS` tracks are to be flown, or more than `MAX_FILLING` fill the area.
+        TwinError: more tracks are requested than fill the area, or a number exceeds `MAX_TRACKS` or `MAX_FILLING`.
     """
     n_flown = request.tracks or n_filling
     if n_flown > MAX_TRACKS or n_filling > MAX_FILLING:

@@ -65,13 +65,7 @@ def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
 
 
 def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
-    """Returns the velocity command (3,) [m/s]: reference velocity plus w (reference position - position).
-
-    Args:
-        position: (3,) estimated position [m].
-        reference: reference of the point whose position is given.
-        natural_frequency_radps: natural frequency w of the closed loop.
-    """
+    """Returns the velocity command (3,) [m/s]: reference velocity plus w (reference position - estimated position)."""
     return reference.velocity + natural_frequency_radps * (reference.position - position)
 
 
@@ -88,26 +82,17 @@ class ControllerState(NamedTuple):
 
 
 class PoseController:
-    """PID controller of position and level attitude, with feed-forward of drag and acceleration.
-
-    Args:
-        hull: hull model.
-        allocation: thrust allocation.
-        natural_frequency_radps: natural frequency of the closed loop in position.
-        period_s: time between commands.
-    """
+    """PID controller of position and level attitude, with feed-forward of drag and acceleration."""
 
     def __init__(self, hull: HullModel, allocation: ThrustAllocation, natural_frequency_radps: float, period_s: float):
         gains = pole_placement_gains(natural_frequency_radps)
         self.state = ControllerState(hull, allocation, gains, period_s, np.zeros(6))
 
     def command(self, world_from_body: Array, twist_body: Array, reference: Reference) -> Array:
-        """Computes the thruster commands (n,) in [-1, 1] for one period.
+        """Returns the thruster commands (n,) in [-1, 1] for one period.
 
-        Args:
-            world_from_body: (4, 4) estimated pose.
-            twist_body: (6,) estimated [angular, linear] velocity in the body [rad/s, m/s].
-            reference: reference of the body in the world.
+        Pose (4, 4) and [angular, linear] velocity (6,) in the body [rad/s, m/s] are estimated; the reference is that
+        of the body in the world.
         """
         return control_thrusters(
             self.state, world_from_body, twist_body, reference.position, reference.velocity,

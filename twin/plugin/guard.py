@@ -26,14 +26,9 @@ class GuardedPlugin:
     """Plug-in whose calls and results are checked. An object of the plug-in's class is created at the first call.
 
     Args:
-        key: key of the scenario that names the plug-in, for example "control.plugin".
-        group: group of entry points.
-        name: "module:Class", or the name of an entry point.
+        key, group, name: the class, as `loading.load` finds it; it raises TwinError if it cannot.
         methods: methods that the plug-in must have.
         arguments: arguments with which the class is called.
-
-    Raises:
-        TwinError: the class cannot be loaded.
     """
 
     def __init__(self, key: str, group: str, name: str, methods: Sequence[str], *arguments: Any):
@@ -43,7 +38,7 @@ class GuardedPlugin:
         self._plugin: Any = None
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """Returns the result of a method, which gets copies of the arguments and so cannot change them.
+        """Returns the result of a method, which gets copies of the arguments.
 
         Raises:
             PluginFailed: the class or the method raised an exception, or a method is missing.
@@ -56,10 +51,7 @@ class GuardedPlugin:
         return self._attempt(method, getattr(self._plugin, method), arguments)
 
     def numbers(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
-        """Returns the result of a method, converted to an array of floats and checked.
-
-        Args:
-            method: name of the method, for the message.
+        """Returns the result of a method as an array of floats.
 
         Raises:
             PluginFailed: the value is not an array of this shape, or a number is not finite.
@@ -79,8 +71,8 @@ class GuardedPlugin:
         """Returns the result of a method, checked to be rigid poses; `shape` is (4, 4) or (n, 4, 4).
 
         Raises:
-            PluginFailed: the value is not valid for `numbers`, a rotation is not orthonormal with determinant 1, a
-                last row is not (0, 0, 0, 1), or the absolute value of a coordinate is larger than 1e6 m.
+            PluginFailed: these are not numbers of this shape, a rotation is not orthonormal with determinant 1, a last
+                row is not (0, 0, 0, 1), or a coordinate is beyond `_MOST_POSITION_M`.
         """
         array = self.numbers(method, value, shape)
         rotation = array[..., :3, :3]
@@ -95,11 +87,7 @@ class GuardedPlugin:
         return array
 
     def covariance(self, method: str, value: Any) -> Array:
-        """Returns the result of a method, checked to be a covariance (6, 6).
-
-        Raises:
-            PluginFailed: the value is not valid for `numbers`, or not symmetric and positive semidefinite.
-        """
+        """Returns the result of a method; raises PluginFailed unless it is a covariance (6, 6)."""
         array = self.numbers(method, value, (6, 6))
         scale = np.abs(array).max()
         if np.abs(array - array.T).max() > 1e-9 * scale or np.linalg.eigvalsh(array)[0] < -1e-9 * scale:
@@ -107,7 +95,7 @@ class GuardedPlugin:
         return array
 
     def refuse(self, method: str, returned: str, expected: str) -> NoReturn:
-        """Raises PluginFailed; the message describes the method, the value that it returned, and the expected one."""
+        """Raises PluginFailed for a value that a method returned."""
         raise PluginFailed(f"{self.label}: {method} returned {returned} (expected: {expected})")
 
     def _attempt(self, what: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
@@ -126,11 +114,6 @@ def check_loadable(key: str, group: str, name: str | None) -> None:
 
 def terrain_heights(name: str, x_m: Array, y_m: Array, seed: int) -> Array:
     """Returns the heights (rows, cols) [m] of a floor from a terrain plug-in (`TerrainGenerator.heights`).
-
-    Args:
-        name: "module:Class", or the name of an entry point.
-        x_m: (cols,) x of the grid nodes, ascending [m].
-        y_m: (rows,) y of the grid nodes, ascending [m].
 
     Raises:
         TwinError: the plug-in cannot be loaded, raised an exception, or returned an unusable value.

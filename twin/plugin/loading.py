@@ -25,9 +25,7 @@ class Registered(NamedTuple):
 
 
 def registered(group: str) -> list[Registered]:
-    """Returns the plug-ins that the installed packages register in a group of entry points.
-
-    Every plug-in of the group is imported, which runs code of its package.
+    """Imports and returns the plug-ins that the installed packages register in a group of entry points.
 
     Raises:
         TwinError: a plug-in cannot be imported; the message names the group, the entry point and the cause.
@@ -62,14 +60,7 @@ def load(key: str, group: str, name: str) -> Callable[..., Any]:
 
 
 def attempt(key: str, name: str, function: Callable[[], T]) -> T:
-    """Returns the result of a function that runs code of a plug-in.
-
-    Args:
-        key: key of the scenario or group of entry points that refers to the plug-in.
-
-    Raises:
-        TwinError: the function raised an exception; the message names the plug-in and the exception.
-    """
+    """Returns the result of a function that runs code of a plug-in; raises TwinError if it raises any exception."""
     try:
         return function()
     except (Exception, SystemExit) as error:  # a plug-in may raise any exception

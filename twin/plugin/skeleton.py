@@ -39,9 +39,7 @@ def plugin_kind(text: str) -> Kind:
 
 
 def package_name(folder: Path) -> str:
-    """Returns the name of the package in a folder.
-
-    It is the name of the folder in lower case, with "_" in place of each run of ".", "-" and white space.
+    """Returns the name of the package in a folder: its name in lower case, with "_" for ".", "-" and white space.
 
     Raises:
         TwinError: the name is not valid for a Python package, or a module of this name can already be imported.
@@ -62,8 +60,7 @@ def write(kind: Kind, folder: Path) -> list[Path]:
         folder: new or empty folder; its name becomes the name of the package and of the entry point.
 
     Raises:
-        TwinError: the name of the folder does not give a valid name of a package (`package_name`), or a module of
-            this name can already be imported.
+        TwinError: see `package_name`.
         OSError: a file cannot be written.
     """
     package = package_name(folder)

@@ -411,7 +411,7 @@ class WaterConfig(Section):
     @field_validator("jerlov")
     @classmethod
     def _require_type_of_source(cls, jerlov: str, info: ValidationInfo) -> str:
-        """Returns the type unchanged. Raises PydanticCustomError if the table `source` does not contain it."""
+        """Requires a type that the table `source` contains."""
         source = info.data.get("source")
         if source is None or jerlov in (allowed := ("clear", *WATER_SOURCES[source].types)):
             return jerlov
@@ -579,10 +579,7 @@ class PlanConfig(Section):
     @field_validator("polygon", mode="before")
     @classmethod
     def _require_corners(cls, value: Any) -> Any:
-        """Returns the value unchanged. Raises PydanticCustomError unless it is None, a string or a list of corners.
-
-        A corner is a pair of finite numbers. Pydantic alone would raise several errors for one wrong value.
-        """
+        """Requires None, a string or a list of pairs of finite numbers; pydantic would list several errors."""
         if isinstance(value, list | tuple):
             corners = all(isinstance(corner, list | tuple) and len(corner) == 2 for corner in value)
             numbers = corners and all(type(c) in (int, float) and math.isfinite(c) for pair in value for c in pair)
@@ -694,38 +691,25 @@ class MapConfig(Section):
 
 
 class Source(BaseModel):
-    """File, line numbers and overrides from which the keys of a scenario come, for error messages.
-
-    Args:
-        path: file of the scenario.
-        lines: line number of each dotted key of that file.
-        base: source of the file that this file extends; None if it extends none.
-        overrides: overrides from the command line, each `key=value`.
-        allow_plugins: whether keys may name a plug-in as module:Class, which runs code of any module.
-    """
+    """File, line numbers and overrides from which the keys of a scenario come, for error messages."""
 
     path: Path
-    allow_plugins: bool = False
-    lines: dict[str, int] = {}
-    base: Source | None = None
-    overrides: tuple[str, ...] = ()
+    allow_plugins: bool = False  # whether keys may name a plug-in as module:Class, which runs code of any module
+    lines: dict[str, int] = {}  # of each dotted key of the file
+    base: Source | None = None  # of the file that this file extends
+    overrides: tuple[str, ...] = ()  # from the command line, each `key=value`
 
     def describe(self, error: TwinError) -> str:
         """Returns the error as `FILE:LINE: key: problem (allowed: ...)` or, for an override, as `--set: ...`.
 
-        FILE and LINE locate the key or, if no file contains the key, the innermost section around it that a file
-        contains; without such a section, FILE is `path` and LINE is 1. The second form applies if an override sets the
-        key or a section around it. It also applies if the error refers to a section that `path` does not contain, and
-        an override sets a key of this section.
+        FILE and LINE locate the key, or else the innermost section around it that a file contains, or else line 1. The
+        second form applies if an override sets the key or a section around it, or a key of a section that `path` lacks.
         """
-        overridden = [override.split("=", 1)[0].strip().replace('"', "") for override in self.overrides]
-        in_overridden_section = error.field not in self.lines and any(
-            k.startswith(f"{error.field}.") for k in overridden
-        )
-        within_override = any(error.field.startswith(f"{k}.") for k in overridden)
-        if error.field in overridden or in_overridden_section or within_override:
-            return f"--set: {error}"
         key = error.field
+        for override in self.overrides:
+            name = override.split("=", 1)[0].strip().replace('"', "")
+            if f"{key}.".startswith(f"{name}.") or (key not in self.lines and name.startswith(f"{key}.")):
+                return f"--set: {error}"
         while "." in key and not any(key in file.lines for file in self._files()):
             key = key.rpartition(".")[0]
         file = next((file for file in self._files() if key in file.lines), self)
@@ -793,10 +777,9 @@ class Scenario(Section):
 
     @property
     def texel_m(self) -> float:
-        """Returns the size of a texture pixel [m]: `terrain.texture_px_m`, or by default COARSEST_TEXEL_M for a photo.
+        """Returns the size of a texture pixel [m]: `terrain.texture_px_m`, or a default.
 
-        The default without a photo is the size of an image pixel on the reference plane, limited to the range from
-        `FINEST_TEXEL_M` to `COARSEST_TEXEL_M`.
+        The default is that of an image pixel on the reference plane within limits; for a photo, the upper limit.
         """
         if self.terrain.texture_px_m is not None:
             return self.terrain.texture_px_m
