@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 from twin.core.user_files import resolved
 from twin.errors import TwinError
+from twin.judge.require import numbers_of
 from twin.report import wording
 from twin.report.comparison_figures import RUN_COLOURS, draw_comparison
 from twin.report.headline import badge, first_lines
@@ -103,8 +104,9 @@ def names_of(runs: Sequence[Run]) -> list[str]:
 def table(runs: Sequence[Run]) -> list[Row]:
     """Returns the rows of all quantities that at least one run has."""
     rows: list[Row] = []
+    numbers = [numbers_of(run.metrics or {}) for run in runs]
     for quantity in QUANTITIES:
-        first, *others = [_value(run.metrics or {}, quantity.name) for run in runs]
+        first, *others = [one.get(quantity.name) for one in numbers]
         if any(value is not None for value in (first, *others)):
             start = Cell(first, quantity.text(first))
             rows.append(Row(quantity, [start, *(_compared(quantity, value, first) for value in others)]))
@@ -170,14 +172,6 @@ def render(runs: Sequence[Run]) -> str:
         "figures": draw_comparison(runs, names),
     }
     return render_page("twin.report", "comparison.html.j2", variables)
-
-
-def _value(metrics: Mapping[str, Any], name: str) -> float | None:
-    """Returns the metric with a dotted name; None if the run has no such number."""
-    value: Any = metrics
-    for key in name.split("."):
-        value = value.get(key) if isinstance(value, Mapping) else None
-    return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
 
 def _compared(quantity: ComparedQuantity, value: float | None, first: float | None) -> Cell:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from twin.core.optional_packages import optional
 from twin.core.records import Trajectory
 from twin.errors import TwinError
+from twin.judge.require import numbers_of
 
 if TYPE_CHECKING:
     import pandas
@@ -21,9 +22,9 @@ if TYPE_CHECKING:
     from twin.report.run_folder import Raster, Run
 
 _KEY_FIGURES = (
-    ("final position error (RMSE)", "trajectory", "final", "ate_rmse_m"),
-    ("map error (LE90)", "map", "le90_m"),
-    ("map error of the asked area (LE90)", "map", "le90_area_m"),
+    ("final position error (RMSE)", "trajectory.final.ate_rmse_m"),
+    ("map error (LE90)", "map.le90_m"),
+    ("map error of the asked area (LE90)", "map.le90_area_m"),
 )
 
 
@@ -97,16 +98,11 @@ class RunResult:
 
     def _repr_html_(self) -> str:
         """Returns name, status, key figures, warnings and the link to the report, for notebooks."""
-        rows = "".join(f"<tr><td>{name}</td><td>{_in_mm(self.metrics, path)}</td></tr>" for name, *path in _KEY_FIGURES)
+        values = [(name, numbers_of(self.metrics).get(metric)) for name, metric in _KEY_FIGURES]
+        texts = [(name, "unknown" if value is None else f"{1000 * value:.2f} mm") for name, value in values]
+        rows = "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in texts)
         warnings = "".join(f"<li>{escape(text)}</li>" for text in self.metrics.get("warnings", ()))
         report = (self.folder / "report.html").absolute()
         link = f'<a href="{report.as_uri()}">report</a>' if report.exists() else ""
         title = f"{escape(self.metrics['name'])}, seed {self.metrics['seed']}: {self.status}"
         return f"<b>{title}</b> {link}<table>{rows}</table><ul>{warnings}</ul>"
-
-
-def _in_mm(metrics: dict[str, Any], path: list[str]) -> str:
-    value: Any = metrics
-    for key in path:
-        value = value.get(key) if isinstance(value, dict) else None
-    return "unknown" if value is None else f"{1000 * value:.2f} mm"
