@@ -166,7 +166,7 @@ def test_an_imu_does_not_change_the_flight_and_its_readings_reach_the_frames():
         mission = prepare(Scenario.model_validate(RIGID | section))
         with RenderedWorld(mission, Stopwatch()) as world:
             sequence = mission.planned_frames(1)
-            world.start_sequence(sequence, 1)
+            world.start_sequence(sequence)
             found = []
             for k in range(3):
                 found.append((world.observe(sequence[k]), world.vehicle.world_from_body))
@@ -283,7 +283,7 @@ def recorded(tmp_path_factory):
     mission = prepare(scenario)
     with RenderedWorld(mission, Stopwatch()) as world, FrameRecorder(folder, "all") as recorder:
         sequence = mission.planned_frames(1)
-        world.start_sequence(sequence, 1)
+        world.start_sequence(sequence)
         for k in range(3):
             recorder.add(world.observe(sequence[k]), world.world_from_camera, world.vehicle.twist_body)
             world.act(np.array([1.0, 0.1, 0.0, 0.2]))

@@ -208,7 +208,7 @@ def test_beacons_are_detected_where_the_true_cameras_image_them(name):
     for sets in ((), ERRORS[name]):
         made = world(*beacons, *sets)
         first = made.mission.planned_frames(1)
-        made.start_sequence(first, 1)
+        made.start_sequence(first)
         detected = made.observe(first[0]).readings.beacons
         assert detected is not None and [beacon.beacon for beacon in detected] == [0, 1]
         pixels.append(np.array([beacon.pixel for beacon in detected]))

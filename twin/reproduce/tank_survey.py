@@ -149,7 +149,8 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
             first = first or frame
             repeated = k in path.repeats
             navigator.update(replace(frame, left=first.left, right=first.right) if repeated else frame)
-        world.start_sequence(FrameSequence(reference, np.ones(n, np.bool_), False, np.arange(n) / rig.frame_rate_hz), 1)
+        times_s = np.arange(n) / rig.frame_rate_hz
+        world.start_sequence(FrameSequence(reference, np.ones(n, np.bool_), False, times_s, 1))
         result, elevation = finished_map(navigator, mission.grid, guard)
         return TankSurvey(mission, path, result, elevation, world.truth(), guard.cause)
 

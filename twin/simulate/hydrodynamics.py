@@ -6,10 +6,9 @@ M_RB is the inertia of the rigid body, M_A that of the added mass; C_RB and C_A 
 matrices of the two, D is the drag matrix, and -g is the wrench of weight and buoyancy. The twist nu is the [angular,
 linear] velocity of the centre of gravity in body axes, w its angular part, and nu' its rate of change; tau is the
 thruster wrench [moment, force]. R is the rotation world_from_body, R' its transpose, and v_c the velocity of a steady
-current in the world; R'v_c and w x R'v_c stand for twists with a zero angular part. The fourth term is due to the rate
-of change of R'v_c when the body rotates; without it, the dynamics would not be Galilean invariant. The equation is
-solved for nu' with the total inertia M_RB + M_A. Computing the added-mass force from the acceleration of the previous
-step instead would be unstable where added mass exceeds mass.
+current in the world. The fourth term is due to the rate of change of R'v_c when the body rotates; without it, the
+dynamics would not be Galilean invariant. The equation is solved for nu' with the total inertia: added-mass forces from
+the acceleration of the previous step would be unstable where added mass exceeds mass.
 """
 
 from __future__ import annotations

@@ -42,10 +42,9 @@ def imu_rate_hz(settings: ImuConfig, motion_rate_hz: float) -> float:
 class InertialSensor:
     """Inertial measurement unit at the origin of the body.
 
-    The true values are known at each step of the simulated motion and interpolated linearly at the times of the
-    readings, k / rate with k = 0, 1, 2, ... The noise model is that of Kalibr: at a rate f, white noise of density s
-    has the standard deviation s sqrt(f), and the bias changes from reading to reading by steps with the standard
-    deviation w / sqrt(f), with w the density of its random walk.
+    The true values of the simulated motion are interpolated linearly at the times of the readings, k / rate with k = 0,
+    1, 2, ... Noise model of Kalibr: at a rate f, white noise of density s has the standard deviation s sqrt(f), and the
+    bias changes from reading to reading by steps of w / sqrt(f), with w the density of its random walk.
 
     Args:
         motion_rate_hz: rate of the values given to `add`.

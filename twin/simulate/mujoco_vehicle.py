@@ -40,18 +40,18 @@ class MujocoVehicle:
     def __init__(self, model: MjModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
         self._model, self._data = model, mujoco.MjData(model)
         self._hull, self._current = trimmed_hull(vehicle), np.array(current_mps, dtype=float)
-        self._body = self._model.body("vehicle").id
-        joint = int(self._model.body_jntadr[self._body])
-        first_q, first_v = int(self._model.jnt_qposadr[joint]), int(self._model.jnt_dofadr[joint])
-        self._velocity = self._data.qvel[first_v : first_v + 6]  # a view into MjData
+        self._body = model.body("vehicle").id
+        joint = int(model.body_jntadr[self._body])
+        first_q, first_v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         self._dofs = slice(first_v, first_v + 6)
+        self._velocity = self._data.qvel[self._dofs]  # a view into MjData
         self._acceleration = np.zeros(6)
         self._kick = 0.5  # the first step advances the velocity by half a timestep, see the class docstring
-        self._thrusters = lagged_thrusters(BLUEROV2_HEAVY, self._model.opt.timestep)
-        self._history: deque[tuple[float, Array, Array]] = deque(maxlen=3)
+        self._thrusters = lagged_thrusters(BLUEROV2_HEAVY, model.opt.timestep)
+        self._history: deque[str] = deque(maxlen=3)
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
-        mujoco.mj_step1(self._model, self._data)
+        mujoco.mj_step1(model, self._data)
         self.after_timestep: Callable[[Array], None] | None = None
         self.touched: Callable[[Array], str] = lambda _: ""
 
@@ -99,7 +99,7 @@ class MujocoVehicle:
                 self.after_timestep(self.inertial)
             if obstacle := self.touched(self.world_from_body):
                 raise contact_error(obstacle, self.time_s, self.world_from_body)
-        self._history.append(self._snapshot())
+        self._history.append(self._described_state())
 
     def _advance(self, wrench: Array) -> None:
         """Simulates one timestep under the wrench (6,) of the thrusters."""
@@ -121,14 +121,11 @@ class MujocoVehicle:
         speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
         if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:
             return
-        states = "; ".join(_describe(*state) for state in [*self._history, self._snapshot()])
+        states = "; ".join([*self._history, self._described_state()])
         raise SurveyAborted(f"the physics diverged at {self.time_s:.3f} s; last states: {states}")
 
-    def _snapshot(self) -> tuple[float, Array, Array]:
-        """Returns time [s], position (3,) [m] and, of half a timestep earlier, `qvel` (6,) [m/s, rad/s]."""
-        return self.time_s, self._data.xpos[self._body].copy(), self._velocity.copy()
-
-
-def _describe(time_s: float, position_m: Array, velocity: Array) -> str:
-    linear, angular = np.round(velocity, 4).reshape(2, 3).tolist()
-    return f"{time_s:.3f} s: at {np.round(position_m, 4).tolist()} m, {linear} m/s, {angular} rad/s"
+    def _described_state(self) -> str:
+        """Returns time, position and, of half a timestep earlier, velocity of the free joint as text."""
+        linear, angular = np.round(self._velocity, 4).reshape(2, 3).tolist()
+        position_m = np.round(self._data.xpos[self._body], 4).tolist()
+        return f"{self.time_s:.3f} s: at {position_m} m, {linear} m/s, {angular} rad/s"

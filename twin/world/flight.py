@@ -20,7 +20,6 @@ class Flight:
         fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
 
     Attributes:
-        track: number of the track of the current frame, from 1.
         aligns: whether the network is aligned before the current frame is estimated: it is the first one of the second
             half of the station keeping after a track.
         n_skipped: number of frames that `fast_forward` simulated in the last step.
@@ -28,9 +27,13 @@ class Flight:
 
     def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
         self.mission, self.world = mission, world
-        self._fast_forward = fast_forward
-        self._parts = self._planned_parts()
-        self.track, self.aligns, self.n_skipped = 1, False, 0
+        self._fast_forward, self._parts = fast_forward, self._planned_parts()
+        self.aligns, self.n_skipped = False, 0
+
+    @property
+    def track(self) -> int:
+        """Returns the number of the track of the current frame, from 1."""
+        return self._sequence.track
 
     @property
     def reference(self) -> Reference:
@@ -69,7 +72,7 @@ class Flight:
             self.n_skipped = self._k - k
         else:
             self.world.end_sequence(k)
-            self._enter(self.mission.next_frames(self.track, sequence.path_times_s[k - 1], pace), self.track)
+            self._enter(self.mission.next_frames(sequence.track, sequence.path_times_s[k - 1], pace))
         self.aligns = False
         while self._k == len(self._sequence):
             part = next(self._parts, None)
@@ -78,17 +81,16 @@ class Flight:
             self._enter(*part)
         return self._observe(keyframe)
 
-    def _planned_parts(self) -> Iterator[tuple[FrameSequence, int, bool]]:
-        """Yields the planned sequences, each with its track and the value of `aligns` at its first frame."""
+    def _planned_parts(self) -> Iterator[tuple[FrameSequence, bool]]:
+        """Yields the planned sequences, each with the value of `aligns` at its first frame."""
         for track in self.mission.tracks:
-            yield self.mission.planned_frames(track), track, False
-            yield self.mission.station_keeping_frames(track), track, False
-            yield self.mission.station_keeping_frames(track), track, True
+            yield self.mission.planned_frames(track), False
+            yield self.mission.station_keeping_frames(track), False
+            yield self.mission.station_keeping_frames(track), True
 
-    def _enter(self, sequence: FrameSequence, track: int, aligns: bool = False) -> None:
-        self._sequence, self._k = sequence, 0
-        self.track, self.aligns = track, aligns
-        self.world.start_sequence(sequence, track)
+    def _enter(self, sequence: FrameSequence, aligns: bool = False) -> None:
+        self._sequence, self._k, self.aligns = sequence, 0, aligns
+        self.world.start_sequence(sequence)
 
     def _observe(self, keyframe: bool | None = None) -> Frame:
         planned = self._sequence[self._k]

@@ -72,11 +72,7 @@ def planned_surface(mission: Mission) -> Terrain:
 
 
 def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedOverlap:
-    """Returns the median overlaps forecast for the planned path, to compare with those of the flown survey.
-
-    Args:
-        most_pairs: largest number of pairs that are evaluated along, and across, the swaths, chosen at equal intervals.
-    """
+    """Returns the median overlaps forecast for the planned path, from at most `most_pairs` along and across swaths."""
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
     pairs, field = (thinned(p, most_pairs) for p in planned_pairs(keyframes)), floor_of(planned_surface(mission))
     return PlannedOverlap(*(spread(overlaps(field, p, mission.rig)).median for p in pairs))
@@ -131,10 +127,7 @@ def _row_statistic(statistic, values: Array) -> Array:
 
 
 def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
-    """Returns the share of the asked area on the terrain that both cameras see in at least one planned keyframe.
-
-    It is 0 if no cell of the terrain lies in the asked area.
-    """
+    """Returns the share of the asked area on the terrain that both cameras see; 0 without asked cells."""
     small, grid = mission.rig.binned(max(1, mission.rig.width_px // _COVERAGE_COLUMNS)), _grid_of_terrain(mission)
     coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
     shape = small.height_px, small.width_px
@@ -147,10 +140,7 @@ def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
 
 
 def _grid_of_terrain(mission: Mission) -> MapGrid:
-    """Returns a grid over the terrain from its north-west corner, without cells that lie only partly on the terrain.
-
-    The cells are as large as those of the map, or larger if there would be more than _COVERAGE_CELLS along a side.
-    """
+    """Returns a grid over the terrain with cells as in the map, or at most _COVERAGE_CELLS along a side."""
     t = mission.terrain
     cell_m = max(mission.grid.cell_m, max(t.size_m) / _COVERAGE_CELLS)
     cols, rows = (max(1, int(side / cell_m)) for side in t.size_m)

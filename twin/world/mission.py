@@ -58,6 +58,7 @@ class FrameSequence:
     keyframe: NDArray[np.bool_]  #: (n,) whether each frame is a keyframe
     holding: bool  #: whether the vehicle keeps station
     path_times_s: Array  #: (n,) time of each frame on the planned path, since the start of the track
+    track: int  #: number of the track, from 1
     rate: float = 1.0  #: derivative of the path time with respect to time; below 1 if the vehicle is slowed
 
     def __len__(self) -> int:
@@ -121,30 +122,24 @@ class Mission:
     def planned_frames(self, track: int) -> FrameSequence:
         """Returns the planned frames of a track, without the station keeping after it."""
         times_s, keyframes = self.plan.frames_of_track(track)
-        return FrameSequence(self.plan.references(track, times_s), keyframes, False, times_s)
+        return FrameSequence(self.plan.references(track, times_s), keyframes, False, times_s, track)
 
     def station_keeping_frames(self, track: int) -> FrameSequence:
-        """Returns the planned frames of one half of the station keeping after a track.
-
-        Both halves have the same frames; the global alignment runs between them.
-        """
-        times_s = np.full(self._n_holding, self.plan.track_duration_s(track))
-        return FrameSequence(self.plan.references(track, times_s), np.zeros(len(times_s), np.bool_), True, times_s)
+        """Returns the planned frames of each half of the station keeping after a track; between them, GA runs."""
+        n = self._n_holding
+        times_s = np.full(n, self.plan.track_duration_s(track))
+        return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), True, times_s, track)
 
     def next_frames(self, track: int, path_time_s: float, pace: Pace) -> FrameSequence:
-        """Returns the next frames of a track at a pace: one frame, or all that remain at full pace.
+        """Returns the frames of a track after a path time at a pace: the next one, or all that remain at full pace.
 
-        Every planned keyframe is flown, at the first frame at or after its path time. There are no frames if the last
-        one of the track has been flown.
-
-        Args:
-            path_time_s: path time of the last frame flown [s].
+        Every planned keyframe is flown, at the first frame at or after its path time.
         """
         planned_s, planned_keyframes = self.plan.frames_of_track(track)
         times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.frame_rate_hz)
         reference = pace.scaled(self.plan.references(track, times_s))
         passed = np.searchsorted(planned_s[planned_keyframes], np.append(path_time_s, times_s) + SAME_TIME_S, "right")
-        return FrameSequence(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, pace.rate)
+        return FrameSequence(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, track, pace.rate)
 
     @property
     def _n_holding(self) -> int:
@@ -158,7 +153,7 @@ class Mission:
 
 
 class _Errors:
-    """Errors of a scenario, described with the place in its file that caused them."""
+    """Errors of a scenario, each with the place that caused it."""
 
     def __init__(self, source: Source):
         self.source, self.lines = source, list[str]()
@@ -176,8 +171,7 @@ def prepare(scenario: Scenario) -> Mission:
     """Returns the mission of a scenario: loads its floor and objects, plans the survey, and checks all of them.
 
     Raises:
-        ScenarioError: the survey cannot be flown; the error lists every reason with file and line, or with the `--set`
-            that caused it.
+        ScenarioError: the survey cannot be flown; the error lists every reason.
     """
     errors = _Errors(scenario.source)
     faults = list(floor_contradictions(scenario.terrain))
@@ -220,7 +214,6 @@ def _check_equipment(scenario: Scenario, errors: _Errors) -> tuple[TrueCameras |
 
 
 def _illumination(scenario: Scenario) -> Illumination:
-    """Returns the optical properties of the water and the daylight; checks that something lights the floor."""
     illumination = illumination_of(scenario)
     light_sources_in_camera(scenario.believed_rig(), scenario.lamps, illumination.daylight, 0)
     return illumination
@@ -268,10 +261,7 @@ def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid
 
 
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
-    """Returns half the extent of a footprint on the reference plane along x and y [m].
-
-    It is the maximum over the headings on the path; with turns on the spot, half the diagonal of the footprint.
-    """
+    """Returns half the greatest extent of a footprint on the reference plane along x and y [m]."""
     across_m, along_m = plan.footprint_m
     if plan.turns_on_the_spot:
         diagonal_m = float(np.hypot(along_m, across_m))

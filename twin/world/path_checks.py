@@ -52,8 +52,7 @@ def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> 
 def _clearance(plan: SurveyPlan, terrain: Terrain) -> Clearance:
     """Returns the least clearance of the planned path: height of the camera above the highest floor in its footprint.
 
-    For a path at constant height, the floor between the swaths is checked too, see `forecast.least_clearance`. For a
-    path that follows the floor, the position in the result is that of the camera, not of the highest floor point.
+    For a path that follows the floor, the position in the result is that of the camera.
     """
     if plan.surface is None:
         return least_clearance(plan, terrain.height_at)
@@ -120,7 +119,6 @@ def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain
     """Raises TwinError if a lamp is below the floor at a point of the path, with any heading of the bow on the legs.
 
     Args:
-        number: number of the lamp in the scenario.
         position_m, camera_m: (3,) positions of the lamp and of the left camera in the body.
     """
     corners = plan.outline()

@@ -114,10 +114,8 @@ def steer(state, world_from_camera, camera_velocity, position, velocity, acceler
     """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`.
 
     Args:
-        world_from_camera: (4, 4) estimated pose of the left camera.
-        camera_velocity: (6,) estimated twist of the left camera in camera axes [rad/s, m/s].
-        position, velocity, acceleration: (3,) reference of the left camera in the world [m, m/s, m/s2].
-        yaw: reference yaw [rad].
+        world_from_camera, camera_velocity: estimated pose and twist, as in `Estimate`.
+        position, velocity, acceleration, yaw: the `Reference` of the left camera.
     """
     change = state.body_from_camera_twist @ camera_velocity - state.twist
     geometry.copy_into(state.twist, state.twist + state.smoothing * change)

@@ -36,12 +36,9 @@ def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> 
 
 
 def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float], plan: SurveyPlan) -> None:
-    """Checks that the thrusters hold station in the current, and reach the planned velocities against it.
+    """Raises TwinError if a thruster saturates: to hold station in the current, or at the planned velocities in it.
 
     A kinematic vehicle, and a path at constant height without current, are not checked.
-
-    Raises:
-        TwinError: a thruster saturates; the message gives the greatest allowed current or cruise speed.
     """
     current = np.array(current_mps)
     if vehicle.dynamics == "kinematic" or not (current.any() or plan.surface is not None):

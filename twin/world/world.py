@@ -61,7 +61,7 @@ class World(ABC):
     def __init__(self, mission: Mission, stopwatch: StageTimer, vehicle: AnyVehicle, sensors: NavigationSensors):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         self._true_poses = GrowingArray(4, 4)
-        self._sequences: list[tuple[FrameSequence, int]] = []  # each with the number of its track
+        self._sequences: list[FrameSequence] = []
 
     def __enter__(self) -> Self:
         return self
@@ -78,11 +78,7 @@ class World(ABC):
         """Returns the images of the cameras at the current pose."""
 
     def extra_pair(self) -> tuple[Image, Image]:
-        """Returns a left and a right image (H, W, 3) at the current pose, without an effect on later frames.
-
-        Raises:
-            TwinError: the world has no images.
-        """
+        """Returns a left and a right image (H, W, 3) at the current pose, without an effect on later frames."""
         raise TwinError("imaging.fidelity", "the surrogate has no images", '"rendered"')
 
     @abstractmethod
@@ -94,14 +90,13 @@ class World(ABC):
         """Returns the true pose (4, 4) of the left camera."""
         return left_camera(self.vehicle, self.mission.rig)
 
-    def start_sequence(self, sequence: FrameSequence, track: int) -> None:
+    def start_sequence(self, sequence: FrameSequence) -> None:
         """Starts the next planned frames of a track, after all frames of the last sequence (or `end_sequence`)."""
-        self._sequences.append((sequence, track))
+        self._sequences.append(sequence)
 
     def end_sequence(self, n: int) -> None:
         """Ends the current sequence after its first n frames."""
-        sequence, track = self._sequences[-1]
-        self._sequences[-1] = sequence.first(n), track
+        self._sequences[-1] = self._sequences[-1].first(n)
 
     def observe(self, step: Step) -> Frame:
         """Returns the frame at the current pose and records its ground truth."""
@@ -140,18 +135,17 @@ class World(ABC):
             colours[in_hole(*np.meshgrid(*grid.centres()))] = np.nan
             return colours
 
-        frames = [(part.reference, len(part), part.holding, track) for part, track in self._sequences]
-        references, lengths, holding, tracks = zip(*frames, strict=True) if frames else ((),) * 4
-        lengths = np.array(lengths, np.int64)
+        parts = self._sequences
+        lengths = np.array([len(part) for part in parts], np.int64)
         return Truth(
             trajectory=Trajectory(np.arange(n) / self.mission.rig.frame_rate_hz, self._true_poses.array),
-            reference=np.concatenate([np.empty((0, 3)), *(part.position for part in references)])[:n],
-            holding=np.repeat(np.array(holding, np.bool_), lengths)[:n],
-            track=np.repeat(np.array(tracks, np.int64), lengths)[:n],
+            reference=np.concatenate([np.empty((0, 3)), *(part.reference.position for part in parts)])[:n],
+            holding=np.repeat(np.array([part.holding for part in parts], np.bool_), lengths)[:n],
+            track=np.repeat(np.array([part.track for part in parts], np.int64), lengths)[:n],
             height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
             seen=self.seen() & ~unknown,
             asked=self.mission.asked(*cells),
-            reference_yaw=np.concatenate([np.empty(0), *(np.asarray(part.yaw) for part in references)])[:n],
+            reference_yaw=np.concatenate([np.empty(0), *(np.asarray(part.reference.yaw) for part in parts)])[:n],
             albedo=albedo,
             in_area=self.mission.asked,
             objects=surface.objects,
