@@ -1,5 +1,6 @@
 """Recorded frames are kept without loss, read back from the run folder, and their truth is that of the images."""
 
+import importlib
 import json
 import shutil
 from dataclasses import replace
@@ -17,6 +18,7 @@ from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exports.command import ExportOptions, export, run_contents
+from twin.exports.formats import FORMATS
 from twin.exports.true_layers import floor_normals, optical_flow
 from twin.report.frame_recorder import IMU_COLUMNS, FrameRecorder, remove_keyframe_images
 from twin.scenario.file import dump_toml
@@ -527,3 +529,9 @@ def test_an_image_of_another_size_has_no_true_layers(recorded, tmp_path):
     cv2.imwrite(str(image), cv2.imread(str(image))[:50, :60])
     with pytest.raises(TwinError, match=r"left/000000.png: is 60 x 50 px .allowed: 96 x 72 px"):
         export(tmp_path / "run", ["truth"], tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_the_writer_of_every_format_is_found(name):
+    module, function = FORMATS[name].writer.split(":")
+    assert callable(getattr(importlib.import_module(f"twin.{module}"), function))

@@ -17,10 +17,7 @@ from twin.datasets.calibration_values import numbers_of, refuse_unknown
 from twin.datasets.text_files import read_yaml
 from twin.errors import TwinError
 
-_FILE_KEYS = (
-    "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model", "distortion_coefficients",
-    "rectification_matrix", "projection_matrix",
-)  # fmt: skip
+_SIZE_KEYS = "image_width", "image_height"  # in a file
 _NUMBERS = {  # fields of a message, their keys in a file and their numbers of values
     "k": ("camera_matrix", (9,)),
     "d": ("distortion_coefficients", None),
@@ -110,9 +107,10 @@ def read_pair(_: Mapping[str, Any], file: Path) -> StereoCalibration:
 def _read_message(file: Path) -> SimpleNamespace:
     """Returns the contents of a file camera_info with the names of the message."""
     tree = read_yaml(file)
-    refuse_unknown((key for key in tree if key not in _FILE_KEYS), file)
+    known = {*_SIZE_KEYS, "camera_name", "distortion_model", *(key for key, _ in _NUMBERS.values())}
+    refuse_unknown((key for key in tree if key not in known), file)
     numbers = {name: numbers_of(tree.get(key), file, key, shape).ravel() for name, (key, shape) in _NUMBERS.items()}
-    width, height = numbers_of([tree.get(key) for key in _FILE_KEYS[:2]], file, "the image size", (2,)).astype(int)
+    width, height = numbers_of([tree.get(key) for key in _SIZE_KEYS], file, "the image size", (2,)).astype(int)
     return SimpleNamespace(
         **numbers, width=width, height=height, distortion_model=tree.get("distortion_model"),
         roi=SimpleNamespace(width=0, height=0), binning_x=0, binning_y=0,
