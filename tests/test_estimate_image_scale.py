@@ -9,7 +9,7 @@ import pytest
 from twin.core.records import Frame, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.estimate.stereo_vision import StereoVision
-from twin.estimate.vision import image_scale, matching, stereo
+from twin.estimate.vision import matching, stereo
 
 RIG = StereoRig(320, 240, 343.0, 0.3, 30.0, np.eye(4))
 DISPARITY_PX = 24
@@ -29,18 +29,18 @@ def stereo_pair(texel_px: float, contrast: float, noise: float = 2.0) -> tuple[n
 @pytest.mark.parametrize(("texel_px", "contrast", "expected"), [(2.0, 12.0, (1,)), (12.0, 4.0, (2, 4))])
 def test_pixels_are_binned_where_the_texture_is_coarser_than_the_noise(texel_px, contrast, expected):
     left, right = stereo_pair(texel_px, contrast)
-    assert image_scale.choose_binning(left, right, RIG, EstimatorSettings()) in expected
+    assert stereo.choose_binning(left, right, RIG, EstimatorSettings()) in expected
 
 
 def test_an_image_without_texture_is_not_binned():
     flat = np.full((240, 320, 3), 90, np.uint8)
-    assert image_scale.choose_binning(flat, flat, RIG, EstimatorSettings()) == 1
+    assert stereo.choose_binning(flat, flat, RIG, EstimatorSettings()) == 1
 
 
 def test_an_image_is_not_binned_if_its_size_is_not_a_multiple():
     left, right = stereo_pair(12.0, 4.0)
     odd = StereoRig(319, 239, 343.0, 0.3, 30.0, np.eye(4))
-    assert image_scale.choose_binning(left[:239, :319], right[:239, :319], odd, EstimatorSettings()) == 1
+    assert stereo.choose_binning(left[:239, :319], right[:239, :319], odd, EstimatorSettings()) == 1
 
 
 @pytest.mark.parametrize("by", [1, 2, 4])

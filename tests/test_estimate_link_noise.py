@@ -6,11 +6,10 @@ import seafloor_scene as scene
 
 from twin.core import geometry
 from twin.core.records import Readings
-from twin.estimate.vision import matching, pixel_locking, stereo, two_view_motion
+from twin.estimate.vision import matching, patches, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.observation_equations import PairMeasurements, transfer
+from twin.estimate.vision.observation_equations import PairMeasurements, PixelLocking, transfer
 from twin.estimate.vision.pair_matching import PairMatcher
-from twin.estimate.vision.pixel_locking import PixelLocking
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import PairMotionSettings
 
@@ -43,7 +42,7 @@ def locking_of(a, b):
     for points, template in ((a, False), (b, True)):
         left = points[:, :2] * RIG.focal_px + [RIG.cx_px, RIG.cy_px]
         right = left - np.column_stack([points[:, 2] * RIG.focal_px, np.zeros(len(points))])
-        left, right = (pixel_locking.shifts(p, np.tile(np.eye(2), (len(p), 1, 1)), PATCH_PX) for p in (left, right))
+        left, right = (patches.locking_shifts(p, np.tile(np.eye(2), (len(p), 1, 1)), PATCH_PX) for p in (left, right))
         derivatives.append(stereo.fused_shift(left * (not template), right, covs(len(points)), RIG))
     return PixelLocking(*derivatives)
 
@@ -103,10 +102,10 @@ def test_pixel_locking_has_a_period_of_one_pixel_and_vanishes_where_the_phase_va
     pixels = np.array([[10.0, 20.5], [10.25, 20.75], [11.25, 3.75]])
     same = np.tile(np.eye(2), (3, 1, 1))
     expected = np.array([[0.0, 0.0], [-1.0, 1.0], [-1.0, 1.0]])
-    np.testing.assert_allclose(pixel_locking.shifts(pixels, same, PATCH_PX), expected, atol=1e-12)
+    np.testing.assert_allclose(patches.locking_shifts(pixels, same, PATCH_PX), expected, atol=1e-12)
     across = same + np.array([[0.0, 1 / PATCH_PX], [0.0, 0.0]])  # columns shift by one pixel from first to last row
-    np.testing.assert_allclose(pixel_locking.shifts(pixels, across, PATCH_PX)[:, 0], 0, atol=1e-12)
-    np.testing.assert_allclose(pixel_locking.shifts(pixels, across, PATCH_PX)[:, 1], expected[:, 1], atol=1e-12)
+    np.testing.assert_allclose(patches.locking_shifts(pixels, across, PATCH_PX)[:, 0], 0, atol=1e-12)
+    np.testing.assert_allclose(patches.locking_shifts(pixels, across, PATCH_PX)[:, 1], expected[:, 1], atol=1e-12)
 
 
 def test_pixel_locking_is_estimated_along_and_the_covariance_stays_consistent():

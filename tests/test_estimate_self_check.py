@@ -14,7 +14,7 @@ from twin.estimate.disparity_offset import combine, mean_views
 from twin.estimate.self_check import check_survey
 from twin.estimate.vision import matching
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
-from twin.estimate.vision.repetition import repetition
+from twin.estimate.vision.image_quality import repetition
 from twin.estimate.vision.stereo import StereoPoints
 
 RIG = StereoRig(320, 240, 277.0, 0.15)

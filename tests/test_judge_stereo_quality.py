@@ -8,7 +8,8 @@ import pytest
 from judge_synthetic import survey, write_folder
 
 from twin.core.records import StereoObservation
-from twin.estimate.vision.matching import contrast, gray, saturated_fraction
+from twin.estimate.vision.image_quality import contrast, saturated_fraction
+from twin.estimate.vision.matching import gray
 from twin.judge.survey_quality import stereo_quality
 from twin.report.figures import stereo_quality_curves
 from twin.report.run_folder import load_run

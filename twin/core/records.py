@@ -248,7 +248,7 @@ class StereoObservation(NamedTuple):
 
     row: int  #: row of the pair's frame in the trajectories
     n_points: int  #: number of matched points; with the surrogate, the number predicted by its error model
-    contrast: float | None  #: local RMS contrast of the left image (`matching.contrast`); None without an image
+    contrast: float | None  #: local RMS contrast of the left image (`image_quality.contrast`); None without an image
     #: fraction of the pixel values of the left image at full scale; None without an image.
     saturated: float | None = None
     #: median row difference of the matched points, right minus left [px]; None if not measured.

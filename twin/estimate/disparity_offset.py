@@ -23,15 +23,13 @@ MAX_LINK_SIGMA_PX = 0.3
 def combine(
     offsets: Sequence[DisparityOffset], n_nodes: int, n_views: float, focal_px: float
 ) -> DisparityOffset | None:
-    """Returns the weighted mean of the offsets estimated from the links, and its standard deviation.
+    """Returns the weighted mean of the offsets of the links, with their standard deviations of independent links.
 
-    None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`).
-
-    The variance is multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes
-    that share the errors of relief, with c = `link_selection.RECURRENCE`, and by the mean chi-square (if above 1).
+    None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`). The variance is
+    multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes that share the
+    errors of relief, with c = `link_selection.RECURRENCE`, and by the mean chi-square (if above 1).
 
     Args:
-        offsets: offset from each link, with a standard deviation that assumes independent links.
         n_nodes: number of nodes that can have links to earlier nodes.
         n_views: m, the mean number of nodes that see a point of the floor (`mean_views`).
     """
@@ -51,12 +49,8 @@ def combine(
 def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> float:
     """Returns the mean number of nodes that see a floor point in the image of a node, this node included.
 
-    It is the mean over the nodes of the sum of a node's overlaps with all nodes. The overlap of two images is that of
-    their rectangles on a plane parallel to the first image, at its median depth; rotations are neglected.
-
-    Args:
-        world_from_camera: (n, 4, 4) poses of the nodes.
-        depth_m: (n,) median depth of the floor in the image of each node [m].
+    It is the mean sum of a node's overlaps with all nodes, of poses (n, 4, 4) and median depths (n,). The overlap of
+    two images is that of their rectangles on a plane parallel to the first one at its depth; rotations are neglected.
     """
     images_per_unit = np.array([rig.fx_px / rig.width_px, rig.fy_px / rig.height_px])
     views = []

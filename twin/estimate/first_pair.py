@@ -1,17 +1,22 @@
-"""Inspection of one stereo pair before a survey is estimated: matches, disparity, order of the cameras, floor plane."""
+"""Inspection of recorded stereo images before a survey is estimated: matches, order of the cameras, floor, light."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Frame, Image, StereoRig
 from twin.core.settings import EstimatorSettings
+from twin.estimate.mapping.map_builder import KeyframeImages, gray_levels
+from twin.estimate.mapping.mean_illumination import MeanIllumination
 from twin.estimate.vision import disparity, matching, stereo
 from twin.estimate.vision.disparity import Disparity
+from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
 from twin.estimate.vision.stereo import StereoPoints
 
 _MIN_POINTS = 30  # smallest number of matched points from which anything is concluded
@@ -64,29 +69,26 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
     order.
     """
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
-    left, right = square_images(frame, rig)
+    left, right = _square_images(frame, rig)
     dense, points = _matched(left, right, square, chosen)
     exchanged = _matched(right, left, square, chosen)[1]
     swapped = len(exchanged.xyz) >= max(_MIN_POINTS, _SWAPPED_SHARE * len(points.xyz))
     return PairInspection(left, right, square, dense, points, swapped)
 
 
-def square_images(frame: Frame, rig: StereoRig) -> tuple[Image, Image]:
-    """Returns the left and right image of a frame, resampled to square pixels (`rig.with_square_pixels()`)."""
+def _square_images(frame: Frame, rig: StereoRig) -> KeyframeImages:
+    """Returns the images of a frame, resampled to square pixels (`rig.with_square_pixels()`)."""
     assert frame.right is not None
     scale = rig.fx_px / rig.fy_px
-    left, right = (one if scale == 1 else matching.scaled_rows(one, scale) for one in (frame.left, frame.right))
-    return left, right
+    return KeyframeImages(matching.scaled_rows(frame.left, scale), matching.scaled_rows(frame.right, scale))
 
 
 def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> tuple[Disparity, StereoPoints]:
-    """Returns the dense disparity and the matched points of a stereo pair, over the widest range of disparities."""
     grays = matching.gray(left, 1), matching.gray(right, 1)
     widest_px = disparity.SearchRange(rig).max_disparity_px
     bytes_left, bytes_right = (np.round(gray).astype(np.uint8) for gray in grays)
     dense = disparity.dense_disparity(bytes_left, bytes_right, widest_px)
-    points = stereo.match_stereo_points(*grays, dense.disparity_px, rig, settings.points, settings.patch_px)
-    return dense, points
+    return dense, stereo.match_stereo_points(*grays, dense.disparity_px, rig, settings.points, settings.patch_px)
 
 
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
@@ -99,16 +101,15 @@ def floor_plane(points: StereoPoints) -> FloorPlane | None:
     xyz = points.xyz
     if len(xyz) < _MIN_POINTS:
         return None
-    depth_m = float(np.median(xyz[:, 2]))
-    normal, distance_m, scatter_m = _fitted_plane(xyz)
-    if scatter_m <= _ROUGHEST * depth_m and -normal[2] >= np.cos(_MAX_TILT_RAD):
-        return FloorPlane(normal, distance_m, scatter_m, fitted=True)
-    axis = np.array([0.0, 0.0, -1.0])
-    return FloorPlane(axis, depth_m, 1.4826 * float(np.median(np.abs(xyz[:, 2] - depth_m))), fitted=False)
+    depth_m, fitted = float(np.median(xyz[:, 2])), _fitted_plane(xyz)
+    if fitted.scatter_m <= _ROUGHEST * depth_m and -fitted.normal[2] >= np.cos(_MAX_TILT_RAD):
+        return fitted
+    scatter_m = 1.4826 * float(np.median(np.abs(xyz[:, 2] - depth_m)))
+    return FloorPlane(np.array([0.0, 0.0, -1.0]), depth_m, scatter_m, fitted=False)
 
 
-def _fitted_plane(xyz: Array) -> tuple[Array, float, float]:
-    """Returns the plane fitted to points (n, 3) [m]: unit normal (3,) to the camera, distance and scatter [m]."""
+def _fitted_plane(xyz: Array) -> FloorPlane:
+    """Returns the plane fitted to points (n, 3) [m]."""
     rng, best = np.random.default_rng(_SEED), (np.inf, np.array([0.0, 0.0, -1.0]), 0.0)
     for _ in range(_TRIALS):
         a, b, c = xyz[rng.choice(len(xyz), 3, replace=False)]
@@ -123,4 +124,47 @@ def _fitted_plane(xyz: Array) -> tuple[Array, float, float]:
     centre = xyz[near].mean(axis=0)
     normal = np.linalg.svd(xyz[near] - centre, full_matrices=False)[2][2]
     normal = normal if centre @ normal < 0 else -normal
-    return normal, float(-centre @ normal), 1.4826 * float(np.median(np.abs((xyz - centre) @ normal)))
+    scatter_m = 1.4826 * float(np.median(np.abs((xyz - centre) @ normal)))
+    return FloorPlane(normal, float(-centre @ normal), scatter_m, fitted=True)
+
+
+class LightInspection(NamedTuple):
+    """Light of a stereo camera, from n stereo pairs, and a pair whose light was made uniform.
+
+    Lamps, vignetting and backscatter belong to the cameras and stay in the mean of many pairs; the floor averages out.
+    """
+
+    n_pairs: int  #: number of pairs n
+    #: mean_left, mean_right: (H, W) mean grey levels of the pairs.
+    mean_left: NDArray[np.float32]
+    mean_right: NDArray[np.float32]
+    even_left: Image  #: (H, W, 3) left image with the gain that the colours of the map get
+    subtracted: bool  #: whether the estimators subtract a light pattern before dense matching (`light_pattern`)
+    #: dense disparity of the left image as the map uses it: without the light pattern if it is subtracted.
+    disparity: Disparity
+
+
+def inspect_light(pair: PairInspection, frames: Iterable[Frame], rig: StereoRig) -> LightInspection:
+    """Returns the light of the cameras, and what the estimators make of it in one pair.
+
+    Args:
+        pair: the pair to show.
+        frames: frames with both images in chronological order, best spread over the whole recording; at least one.
+        rig: believed calibration of the frames.
+    """
+    illumination, fits = MeanIllumination(pair.rig), []
+    mean = np.zeros((2, pair.rig.height_px, pair.rig.width_px), np.float32)
+    for frame in frames:
+        images = _square_images(frame, rig)
+        grays = gray_levels(images)
+        mean += np.array(grays)
+        fits.append(pattern_fit(grays))
+        illumination.add(images.left)
+    pattern = light_pattern(fits, mean.shape[1:])
+    dense = pair.disparity
+    if pattern is not None:
+        left, right = gray_levels(KeyframeImages(pair.left, pair.right))
+        widest_px = disparity.SearchRange(pair.rig).max_disparity_px
+        dense = disparity.dense_disparity(left - pattern.left, right - pattern.right, widest_px)
+    even = np.clip(np.round(pair.left * illumination.gain()), 0, 255).astype(np.uint8)
+    return LightInspection(len(fits), mean[0] / len(fits), mean[1] / len(fits), even, pattern is not None, dense)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,15 +27,15 @@ from twin.core.records import (
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
-from twin.estimate.vision import disparity, epipolar_calibration, image_scale, matching, stereo, wide_search
+from twin.estimate.vision import disparity, epipolar_calibration, matching, stereo, wide_search
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
+from twin.estimate.vision.image_quality import contrast, repetition, saturated_fraction
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.light_pattern import LightPattern, light_pattern, pattern_fit
+from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration, viewing_plane
 from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
 from twin.estimate.vision.repeated_images import LEFT_REPEATS, RepeatedImages
-from twin.estimate.vision.repetition import repetition
 from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 
@@ -43,17 +43,8 @@ _MIN_POINTS = 12  # smallest number of matched points for a keyframe
 _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern is estimated
 
 
-class _MatchedPair(NamedTuple):
-    """Result of the matching of one stereo pair."""
-
-    right_image: Image  #: (H, W, 3) right image at full size, without the known rectification errors
-    right: matching.Gray  #: grey levels of the right image at the image scale
-    dense_px: NDArray[np.float32]  #: (H, W) disparity by semi-global matching [px], NaN where unknown
-    points: StereoPoints  #: matched points
-
-
 class StereoVision:
-    """Visual measurements from images. Their binning is chosen from the texture at the first keyframe (`image_scale`).
+    """Visual measurements from images, binned as `stereo.choose_binning` tells at the first keyframe.
 
     Use as a context manager, or call `close`.
 
@@ -88,6 +79,16 @@ class StereoVision:
         self._depth_of_keyframe: dict[int, NDArray[np.float16]] = {}
         self._points: StereoPoints | None = None
 
+    def _configure(self, binning: int) -> None:
+        self.binning, self.rig = binning, self.full_rig.binned(binning)
+        self.spool = ImageSpool(self._folder, binning)
+        self._pattern_fits: dict[int, Array] = {}  # by frame index
+        self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
+        self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
+        self.search_range = disparity.SearchRange(self.rig)
+        self._gray = self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
+        self._image = self._gray.astype(np.uint8)
+
     def __enter__(self) -> Self:
         return self
 
@@ -99,17 +100,6 @@ class StereoVision:
         self.spool.close()
         self.matcher.close()
 
-    def _configure(self, binning: int) -> None:
-        self.binning, self.rig = binning, self.full_rig.binned(binning)
-        self.spool = ImageSpool(self._folder, binning)
-        self._pattern_fits: dict[int, Array] = {}  # by frame index
-        self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
-        self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
-        self.search_range = disparity.SearchRange(self.rig)
-        self._gray = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
-        self._image = np.zeros((self.rig.height_px, self.rig.width_px), np.uint8)
-        self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
-
     @cached_property
     def mosaic(self) -> Mosaic:
         """Returns the mosaic; it is created at the first access, which requires a keyframe."""
@@ -117,94 +107,77 @@ class StereoVision:
         cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
 
-    def _square(self, image: Image) -> Image:
-        return image if self._row_scale == 1 else matching.scaled_rows(image, self._row_scale)
-
-    def _interval_s(self, time_s: float) -> float | None:
-        """Returns the time since the last frame [s]; None at the first frame, or if the time has not increased."""
-        last, self._last_s = self._last_s, time_s
-        return time_s - last if time_s > last else None
-
-    def _on_plane(self, world_from_camera: Array) -> Array:
-        """Returns the pose (4, 4) of a camera in the axes of the mosaic, which are chosen at the first call."""
-        if self._plane_from_world is None:
-            self._plane_from_world = viewing_plane(world_from_camera)
-        return self._plane_from_world @ world_from_camera
-
-    def _choose_scale(self, left: Image, right: Image) -> None:
-        """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
-        binning = image_scale.choose_binning(left, right, self.full_rig, self.settings)
-        if binning != self.binning:
-            self.close()
-            self._configure(binning)
-            self._set_image(left)
-            self.f2f.step(self._image)
+    def track_frame(self, frame: Frame) -> tuple[Motion, str]:
+        check_image_sizes(frame, self._size_px)
+        with self.stopwatch("f2f"):
+            self._set_image(matching.scaled_rows(frame.left, self._row_scale))
+            last_s, self._last_s = self._last_s, frame.time_s
+            interval_s = frame.time_s - last_s if frame.time_s > last_s else None
+            frozen = self.repeats.status(frame, self.f2f.filter.velocity, interval_s or 1 / self.rig.frame_rate_hz)
+            motion, status = self.f2f.step(self._image, interval_s, frozen if frozen == LEFT_REPEATS else "")
+            return motion, status if frozen == "ok" else frozen
 
     def _set_image(self, left: Image) -> None:
         """Makes an image (H, W, 3) the current left image: computes its grey levels and its normalised image."""
         self._gray = matching.gray(left, self.binning)
         self._image = matching.normalise(self._gray)
 
-    def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        check_image_sizes(frame, self._size_px)
-        with self.stopwatch("f2f"):
-            self._set_image(self._square(frame.left))
-            interval_s = self._interval_s(frame.time_s)
-            frozen = self.repeats.status(frame, self.f2f.filter.velocity, interval_s or 1 / self.rig.frame_rate_hz)
-            motion, status = self.f2f.step(self._image, interval_s, frozen if frozen == LEFT_REPEATS else "")
-            return motion, status if frozen == "ok" else frozen
-
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         assert frame.right is not None
-        left_image, right_image = self._square(frame.left), self._square(frame.right)
+        left, right = (matching.scaled_rows(image, self._row_scale) for image in (frame.left, frame.right))
         with self.stopwatch("stereo"):
             if self._points is None:
-                self._choose_scale(left_image, right_image)
-            pair = self._match_pair(right_image)
-            if len(pair.points.xyz) >= _MIN_POINTS:
-                self.calibration.add(pair.points, self.rig, self.settings.patch_px)
+                self._choose_scale(left, right)
+            corrected, gray, dense_px, points = self._match_pair(right)
+            if len(points.xyz) >= _MIN_POINTS:
+                self.calibration.add(points, self.rig, self.settings.patch_px)
                 if self.calibration.update(self.full_rig):
-                    pair = self._match_pair(right_image)
-            self.stereo_observations.append(self._observation(row, frame.left, pair.points))
-        if len(pair.points.xyz) < _MIN_POINTS:
+                    corrected, gray, dense_px, points = self._match_pair(right)
+            self.stereo_observations.append(self._observation(row, frame.left, points))
+        if len(points.xyz) < _MIN_POINTS:
             return None
-        self._points, self._depth_m = pair.points, _depth(pair.dense_px, self.rig)
-        self.spool.put(row, left_image, pair.right_image, (self._gray, pair.right))
-        self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left_image, pair.right_image)))
-        return pair.points
+        far_enough_px = np.where(dense_px > 1.0, dense_px, np.nan)
+        depth_m = self.rig.focal_px * self.rig.baseline_m / far_enough_px
+        self._points, self._depth_m = points, depth_m.astype(np.float32)
+        self.spool.put(row, left, corrected, (self._gray, gray))
+        self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left, corrected)))
+        return points
 
-    def _match_pair(self, right_image: Image) -> _MatchedPair:
-        """Matches the current left image with a right image, from which known rectification errors are removed."""
-        right_image = self.calibration.rectify(right_image, self.full_rig)
-        right = matching.gray(right_image, self.binning)
-        dense_px = disparity.search(self._image, matching.normalise(right), self.search_range.max_disparity_px)
+    def _choose_scale(self, left: Image, right: Image) -> None:
+        """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
+        binning = stereo.choose_binning(left, right, self.full_rig, self.settings)
+        if binning != self.binning:
+            self.close()
+            self._configure(binning)
+            self._set_image(left)
+            self.f2f.step(self._image)
+
+    def _match_pair(self, right: Image) -> tuple[Image, matching.Gray, NDArray[np.float32], StereoPoints]:
+        """Matches the current left image with a right image, from which known rectification errors are removed.
+
+        Returns:
+            Corrected right image, its grey levels at the image scale, disparity by semi-global matching, and points.
+        """
+        right = self.calibration.rectify(right, self.full_rig)
+        gray, s = matching.gray(right, self.binning), self.settings
+        dense_px = disparity.search(self._image, matching.normalise(gray), self.search_range.max_disparity_px)
         self.search_range.update(dense_px)
-        points = stereo.match_stereo_points(
-            self._gray, right, dense_px, self.rig, self.settings.points, self.settings.patch_px
-        )
-        return _MatchedPair(right_image, right, dense_px, points)
+        points = stereo.match_stereo_points(self._gray, gray, dense_px, self.rig, s.points, s.patch_px)
+        return right, gray, dense_px, points
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
         """Returns the matched points, the image quality and the row differences of a stereo pair.
 
         Row differences are in pixels of the full image with square pixels; `left` (H, W, 3) is not resampled.
         """
-        contrast, saturated = matching.contrast(self._gray), matching.saturated_fraction(left)
+        seen = contrast(self._gray), saturated_fraction(left)
         repeated = repetition(self._image, self.settings.patch_px)
         if not len(points.xyz):
-            return StereoObservation(row, 0, contrast, saturated, repetition=repeated)
-        offset_px = float(np.median(points.row_difference_px))
+            return StereoObservation(row, 0, *seen, repetition=repeated)
         sigma_px = float(np.median(epipolar_calibration.row_sigma(points))) * self.rig.focal_px / points.noise_ratio
-        return StereoObservation(
-            row,
-            len(points.xyz),
-            contrast,
-            saturated,
-            row_offset_px=self.binning * offset_px,
-            row_spread_px=self.binning * epipolar_calibration.spread(points),
-            row_sigma_px=self.binning * sigma_px,
-            repetition=repeated,
-        )
+        rows_px = float(np.median(points.row_difference_px)), epipolar_calibration.spread(points), sigma_px
+        scaled = (self.binning * value for value in rows_px)
+        return StereoObservation(row, len(points.xyz), *seen, *scaled, repetition=repeated)
 
     def tracking_cov(self) -> Array | None:
         return None if self.f2f.reference is None else self.f2f.cov_since_keyframe
@@ -217,6 +190,12 @@ class StereoVision:
         assert self._points is not None
         half_m = half_window_m(self._points, self.rig)
         return self.mosaic.register(self._image, self._depth_m, self._on_plane(world_from_camera), half_m, self.rig)
+
+    def _on_plane(self, world_from_camera: Array) -> Array:
+        """Returns the pose (4, 4) of a camera in the axes of the mosaic, which are chosen at the first call."""
+        if self._plane_from_world is None:
+            self._plane_from_world = viewing_plane(world_from_camera)
+        return self._plane_from_world @ world_from_camera
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
         self.mosaic.add(number, self._image, self._depth_m, self._on_plane(world_from_camera), self.rig)
@@ -248,9 +227,7 @@ class StereoVision:
         """
         if node.points is None or not len(node.points.xyz):
             return None
-        predicted_cov = node.motion_cov(other)
-        predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
-        anywhere = self.settings.wide_search
+        predicted_cov, anywhere = node.motion_cov(other), self.settings.wide_search
         if not (anywhere or wide_search.may_exceed(SEARCH_PX, node.points, predicted_cov, self.rig)):
             return None
         with self.stopwatch("flow"):
@@ -262,6 +239,7 @@ class StereoVision:
             matched = self.matcher.match(node, [moved])[0]
         with self.stopwatch("network"):
             motion = None if matched is None else self.matcher.motion(node, moved, matched)
+        predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         if motion is None or anywhere or wide_search.agrees(motion.a_from_b, motion.cov, predicted, predicted_cov):
             return motion
         return None
@@ -275,30 +253,18 @@ class StereoVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        return build_map(
-            (self._pair(int(row)) for row in result.keyframe_rows),
-            KeyframePath(result.final.world_from_camera[result.keyframe_rows], result.node_cov, step_cov),
-            self.rig,
-            grid,
-            progress,
-            pattern=self._light_pattern(result.keyframe_rows),
-        )
-
-    def _light_pattern(self, rows: NDArray[np.int64]) -> LightPattern | None:
-        """Returns the light pattern (`light_pattern`) of the keyframes at these frame indices, or of `_PATTERN_PAIRS`
-        of them.
-        """
+        rows = result.keyframe_rows
+        images = (self._binned(*self.spool.pair(int(row))) for row in rows)
+        path = KeyframePath(result.final.world_from_camera[rows], result.node_cov, step_cov)
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
-        return light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
-
-    def left_image(self, row: int) -> Image | None:
-        return self.spool.left(row)
-
-    def _pair(self, row: int) -> KeyframeImages:
-        return self._binned(*self.spool.pair(row))
+        pattern = light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
+        return build_map(images, path, self.rig, grid, progress, pattern=pattern)
 
     def _binned(self, left: Image, right: Image) -> KeyframeImages:
         return KeyframeImages(matching.binned(left, self.binning), matching.binned(right, self.binning))
+
+    def left_image(self, row: int) -> Image | None:
+        return self.spool.left(row)
 
 
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
@@ -310,21 +276,8 @@ def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 
 
-def _depth(disparity_px: NDArray[np.float32], rig: StereoRig) -> NDArray[np.float32]:
-    """Returns the depth (H, W) [m] of a disparity (H, W) [px]; NaN where this is unknown or not above one pixel."""
-    usable = np.where(disparity_px > 1.0, disparity_px, np.nan)
-    return (rig.focal_px * rig.baseline_m / usable).astype(np.float32)
-
-
 def check_image_sizes(frame: Frame, size_px: tuple[int, int]) -> None:
-    """Checks the sizes of the images of a frame.
-
-    Args:
-        size_px: width and height that the calibration states [px].
-
-    Raises:
-        ValueError: an image has another size.
-    """
+    """Raises ValueError if an image of a frame has not the width and height that the calibration states [px]."""
     for side, image in (("left", frame.left), ("right", frame.right)):
         if image is not None and image.shape[1::-1] != size_px:
             found, expected = (" x ".join(str(n) for n in size) for size in (image.shape[1::-1], size_px))

@@ -21,31 +21,22 @@ class Vision(Protocol):
     """Source of visual measurements. Poses are (4, 4) world_from_camera of the left camera.
 
     The methods raise OSError if images or the mosaic could not be read from disk or written to it.
-
-    Attributes:
-        stereo_observations: image quality and number of matched points of every stereo pair so far.
-        runs_in_background: whether `measure_motions` takes long enough to justify a separate thread.
     """
 
-    runs_in_background: bool
-    stereo_observations: list[StereoObservation]
+    runs_in_background: bool  #: whether `measure_motions` takes long enough to justify a separate thread
+    stereo_observations: list[StereoObservation]  #: image quality and number of points of every stereo pair so far
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
         """Returns the frame-to-frame motion (F2F) since the last frame, and "ok" or the reason why tracking failed.
 
-        Raises:
-            ValueError: an image is not of the size that the calibration states; the frame is ignored.
+        Raises ValueError if an image is not of the size that the calibration states; the frame is ignored.
         """
         ...
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
-        """Matches a stereo pair.
+        """Returns the matched points of a stereo pair; None if there are too few for a keyframe.
 
-        Args:
-            row: index of the frame in the trajectories.
-
-        Returns:
-            The matched points, or None if there are too few for a keyframe.
+        `row` is the index of the frame in the trajectories.
         """
         ...
 
@@ -62,11 +53,7 @@ class Vision(Protocol):
         ...
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
-        """Returns the correction of the latest keyframe's pose by F2M, or None if the registration fails.
-
-        Args:
-            world_from_camera: (4, 4) predicted pose of the keyframe.
-        """
+        """Returns the correction by F2M of the latest keyframe's predicted pose; None if the registration fails."""
         ...
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
@@ -98,15 +85,11 @@ class Vision(Protocol):
         """Builds the elevation map along the final trajectory.
 
         Args:
-            result: result of the survey, with the final trajectory.
             step_cov: (n_keyframes, 6, 6) covariance of the pose of each keyframe relative to the previous keyframe.
             progress: called with the number of keyframes processed so far.
         """
         ...
 
     def left_image(self, row: int) -> Image | None:
-        """Returns the left image (H, W, 3) of the keyframe at frame index `row`, with square pixels.
-
-        None if the implementation has no images.
-        """
+        """Returns the left image (H, W, 3) of the keyframe at frame index `row`, with square pixels; None without."""
         ...

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from twin.estimate.light_inspection import LightInspection, inspect_light
+from twin.estimate.first_pair import LightInspection, inspect_light
 from twin.recordings.replay import OpenedDataset
 from twin.report.wording import length, percent, plain
 

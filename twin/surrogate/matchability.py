@@ -25,7 +25,7 @@ from twin import terrains
 from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
 from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
-from twin.estimate.vision.image_scale import BINNINGS
+from twin.estimate.vision.stereo import BINNINGS
 from twin.imaging.camera.photo_sensor import Sensor, sensor_of
 from twin.imaging.camera.sensor import ExposureSetting
 from twin.imaging.image_formation import ImageFormation, StampedPose

@@ -54,17 +54,14 @@ class FrameToFrame:
 
     Every frame is matched with a reference image: the last keyframe, or a later frame once too few of the points are
     tracked. Structure is estimated together with motion (`two_view_motion.pair_motion`); the motion between two frames
-    follows from their poses relative to the reference. The alternative is to match each frame with the previous one and
-    to take depth as exact, as in eq. (2) of Negahdaripour & Madjidi (2003). With the alternative, matching errors
-    accumulate over the 15 frames between two keyframes: the bias of pitch was 1.25 mrad over fine texture (this method:
-    0.1 +- 0.1 mrad) and 4 mrad over coarse texture, where depth is noisy (this method: 0.5 +- 0.7 mrad). The standard
-    deviation of the rotation was 0.6 mrad (this method: 0.35 mrad).
+    follows from their poses relative to the reference. If each frame were matched with the previous one and depth taken
+    as exact, as in eq. (2) of Negahdaripour & Madjidi (2003), matching errors would accumulate: the bias of pitch was
+    1.25 mrad over fine texture (this method: 0.1 +- 0.1 mrad) and 4 mrad over coarse texture (0.5 +- 0.7 mrad).
 
     A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
     acceleration of a vehicle is limited, whereas a pose from few and noisy pixels may have any error. A step fails if
-    too few points are tracked, if too few of them are inliers, if their residuals are too large, or if the measured
-    pose contradicts the prediction. The predicted motion is then returned, with a large covariance and the reason for
-    the failure.
+    too few points are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is
+    then returned, with a large covariance.
 
     Args:
         patch_px: side of the tracking window [px].
@@ -84,11 +81,7 @@ class FrameToFrame:
         self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 
     def restart(self, image: matching.Image, points: StereoPoints) -> None:
-        """Makes a new keyframe the reference, with the strongest of its points.
-
-        Args:
-            image: (height, width) normalised left image of the keyframe.
-        """
+        """Makes a new keyframe, with its normalised left image, the reference, with the strongest of its points."""
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
         self._reference_cov = np.zeros((6, 6))
@@ -97,17 +90,15 @@ class FrameToFrame:
     def step(
         self, image: matching.Image, interval_s: float | None = None, unusable: str = ""
     ) -> tuple[two_view_motion.Motion, str]:
-        """Estimates the motion from the last frame to this one.
+        """Returns the motion from the last frame to this normalised image, and "ok" or the reason for a failure.
+
+        At the first frame, these are the identity and "ok". As covariance of a measured motion, that of the pose of
+        this frame in the reference camera is returned. The errors of successive motions partly cancel, so the sum of
+        these covariances is an upper bound.
 
         Args:
-            image: (height, width) normalised frame.
             interval_s: time since the last frame [s]; by default that of the frame rate.
             unusable: reason why the frame must not be matched; "" if it may be.
-
-        Returns:
-            The motion, and "ok" or the reason for a failure; at the first frame, the identity and "ok". As covariance
-            of a measured motion, that of the pose of this frame in the reference camera is returned. The errors of
-            successive motions partly cancel, so the sum of these covariances is an upper bound.
         """
         if not self.started:
             self.started = True
@@ -143,10 +134,9 @@ class FrameToFrame:
     def cov_since_keyframe(self) -> Array:
         """Returns the covariance (6, 6) of the last frame's pose relative to the last keyframe, in the frame's axes.
 
-        All frames are matched with the same points of a reference image, whose errors are therefore common to all
-        measured poses. The filter assumes that the errors of successive poses are independent, so its covariance is too
-        small. It is replaced by the covariance of the last measured pose, plus the growth of the filter's covariance
-        since that measurement, plus the covariance of the pose of the reference image.
+        All frames are matched with the same points of a reference image, whose errors are common to all measured poses,
+        whereas the filter assumes independent errors. Its covariance is replaced by that of the last measured pose,
+        plus its growth since that measurement, plus the covariance of the pose of the reference image.
         """
         return geometry.transport_covariance(self._reference_cov, self.filter.pose) + self._common_cov + self.filter.cov
 
@@ -158,8 +148,7 @@ class FrameToFrame:
         """Returns the number of pyramid levels above the full image that the error of the predicted positions requires.
 
         The tracker finds points within half its window, and each level doubles this. The error follows from the
-        filter's variances of rotation about x and y and of translation across the optical axis, at the median of
-        `depth_m` (n,).
+        filter's variances of rotation about x and y and of translation across the axis, at the median depth.
         """
         variance = np.diag(self.filter.cov)
         across = variance[3:5] / float(np.median(depth_m)) ** 2
@@ -218,11 +207,7 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
 def constant_velocity_motion(
     motion: Array, status: str = "too few points matched"
 ) -> tuple[two_view_motion.Motion, str]:
-    """Returns a motion predicted at constant velocity as a `Motion` with a large covariance, and `status` unchanged.
-
-    Args:
-        motion: (4, 4) predicted motion.
-    """
+    """Returns a motion (4, 4) predicted at constant velocity, with a large covariance, and `status` unchanged."""
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])
     return two_view_motion.Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), status

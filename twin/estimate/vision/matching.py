@@ -21,7 +21,6 @@ Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
 _GRAY_PER_SIGMA = 36.0
-_FULL_SCALE = 255  # grey level of a saturated pixel
 _BANDS = np.full((1, 3), 1 / 3, np.float32)
 _SMOOTH_PX = 0.5  # removes aliased detail, which biases matches towards whole pixels
 _FLAT_GRAY = 2.0  # standard deviation of sensor noise [grey levels]; keeps uniform areas from being amplified
@@ -42,35 +41,19 @@ def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
 
 
 def normalise(levels: Gray) -> Image:
-    """Returns grey levels with normalised local mean and contrast, so that the pattern of the lamps is not tracked.
+    """Returns grey levels (height, width) uint8 with normalised local mean and contrast, without the lamps' pattern.
 
-    Returns:
-        (height, width) uint8, with a local mean of about 128 and a local standard deviation of about 36 grey levels,
-        less where the texture is weak. The values depend on the window around a pixel, which is completed by reflection
-        at the image border. They therefore do not permit matching to a hundredth of a pixel.
+    The local mean is about 128, the local standard deviation about 36 grey levels, less where the texture is weak. The
+    values depend on the window around a pixel, completed by reflection at the image border. They therefore do not
+    permit matching to a hundredth of a pixel.
     """
-    mean, square = _local_moments(levels)
+    mean, square = local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
     _normalise(levels.ravel(), mean.ravel(), square.ravel(), normalised.ravel())
     return normalised
 
 
-def saturated_fraction(image: Image) -> float:
-    """Returns the fraction of the pixel values of an image (H, W, 3) that are at full scale, 0 to 1."""
-    return float(np.count_nonzero(image == _FULL_SCALE)) / image.size
-
-
-def contrast(levels: Gray) -> float:
-    """Returns the local RMS contrast of an image: standard deviation / mean, median over the image.
-
-    The image must not be normalised. The contrast includes image noise, which dominates it in dark or turbid images.
-    """
-    mean, square = (moment[::4, ::4] for moment in _local_moments(levels))
-    sigma = np.sqrt(np.maximum(square - mean**2, 0))
-    return float(np.median(sigma / np.maximum(mean, 1.0)))
-
-
-def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
+def local_moments(levels: Gray) -> tuple[Gray, Gray]:
     """Returns the mean and the mean square (H, W) around each pixel, in a square window 1/8 as wide as the image."""
     size = (levels.shape[1] // 8 | 1,) * 2
     mean = cv2.boxFilter(levels, -1, size, borderType=cv2.BORDER_REFLECT)
@@ -79,10 +62,7 @@ def _local_moments(levels: Gray) -> tuple[Gray, Gray]:
 
 
 def binned(image: Pixels, by: int) -> Pixels:
-    """Returns an image (height, width, ...) with squares of `by` x `by` pixels averaged to one pixel.
-
-    `by` must divide the height and the width.
-    """
+    """Returns an image (height, width, ...) with squares of `by` x `by` pixels averaged; `by` divides both sides."""
     if by == 1:
         return image
     smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)
@@ -91,6 +71,8 @@ def binned(image: Pixels, by: int) -> Pixels:
 
 def scaled_rows(image: Image, scale: float) -> Image:
     """Returns an image (H, W, ...) resampled to int(H scale) rows; input row v becomes row (v + 0.5) scale - 0.5."""
+    if scale == 1:
+        return image
     rows, columns = int(image.shape[0] * scale), image.shape[1]
     matrix = np.array([[1, 0, 0], [0, scale, 0.5 * scale - 0.5]])
     return np.asarray(cv2.warpAffine(image, matrix, (columns, rows), borderMode=cv2.BORDER_REPLICATE), np.uint8)
@@ -98,7 +80,6 @@ def scaled_rows(image: Image, scale: float) -> Image:
 
 @kernel(fastmath=True)
 def _normalise(gray, mean, square, normalised):
-    """Compiled kernel of `normalise`: writes `normalised` (n,) uint8 from grey levels and their local moments (n,)."""
     low, high, middle = np.float32(0), np.float32(255), np.float32(128.5)
     for k in range(gray.size):
         sigma = np.sqrt(max(square[k] - mean[k] * mean[k], low)) + np.float32(_FLAT_GRAY)
@@ -133,12 +114,7 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
 def track(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1
 ) -> tuple[Points, Mask]:
-    """Tracks points from one image to another by Lucas-Kanade, with a forward-backward check.
-
-    Args:
-        source, target: normalised images of the same shape.
-        points: (n, 2) positions in the source [px].
-        guess: (n, 2) expected positions in the target [px].
+    """Tracks points (n, 2) [px] from one normalised image to another by Lucas-Kanade, with a forward-backward check.
 
     Returns:
         (n, 2) positions in the target [px], and a mask (n,) that is true where tracking back to the source ends less
@@ -157,16 +133,9 @@ def _lucas_kanade(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
 ) -> tuple[Points, Mask]:
     """Returns the positions (n, 2) in the target [px], and a mask (n,) of the points that were tracked."""
-    tracked, status, _ = cv2.calcOpticalFlowPyrLK(
-        source,
-        target,
-        points,
-        guess.copy(),
-        winSize=(patch_px, patch_px),
-        maxLevel=levels,
-        criteria=_CRITERIA,
-        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-    )
+    options = {"winSize": (patch_px, patch_px), "maxLevel": levels, "criteria": _CRITERIA}
+    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
+    tracked, status, _ = cv2.calcOpticalFlowPyrLK(source, target, points, guess.copy(), flags=flags, **options)
     return np.asarray(tracked, np.float32), np.asarray(status).ravel() > 0
 
 

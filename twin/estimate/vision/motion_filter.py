@@ -21,8 +21,9 @@ class MotionFilter:
     poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. Errors of the pose
     are motions [rotation, translation] (rad, m) in the axes of the camera: pose = true pose @ exp(error).
 
-    Attributes:     pose: (4, 4) pose of the last frame in the reference camera.     velocity: (6,) twist of the camera
-    in its own axes [rad/s, m/s].
+    Attributes:
+        pose: (4, 4) pose of the last frame in the reference camera.
+        velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
     """
 
     def __init__(self):
@@ -42,10 +43,7 @@ class MotionFilter:
         self._cov[:6], self._cov[:, :6] = 0.0, 0.0
 
     def predict(self, interval_s: float) -> None:
-        """Predicts the pose of the next frame, which is `interval_s` later [s].
-
-        The velocity is kept; after `braking.BLIND_S` without a measurement, it decays (`braking_factor`).
-        """
+        """Predicts the pose of the next frame; after a time without measurements the velocity decays (`braking_factor`)."""
         self.velocity = braking_factor(self._blind_s, interval_s) * self.velocity
         self._blind_s += interval_s
         motion = geometry.exp(self.velocity * interval_s)
@@ -56,11 +54,7 @@ class MotionFilter:
         self._cov = transition @ self._cov @ transition.T + _acceleration_cov(interval_s)
 
     def correct(self, measured: Array, cov: Array) -> bool:
-        """Fuses a measured pose (4, 4) with its covariance (6, 6).
-
-        Returns:
-            Whether the measurement was used; False if it contradicts the prediction.
-        """
+        """Fuses a measured pose (4, 4) with its covariance (6, 6); returns whether it agrees with the prediction."""
         innovation = geometry.log(geometry.inverse(self.pose) @ measured)
         gain = np.linalg.solve(self._cov[:6, :6] + cov, self._cov[:6]).T
         if innovation @ np.linalg.solve(self._cov[:6, :6] + cov, innovation) > _GATE:

@@ -27,6 +27,13 @@ class PairMeasurements(NamedTuple):
     cov_b: Array  #: (n, 3, 3) covariance of each point in `b`
 
 
+class PixelLocking(NamedTuple):
+    """Derivatives of the measurements of n points in two pairs with respect to the amplitude of pixel locking."""
+
+    a: Array  #: (n, 3) derivative of the normalised (x, y, disparity) in the earlier pair a [1/px]
+    b: Array  #: (n, 3) the same in the later pair b
+
+
 class LinearisedObservations(NamedTuple):
     """Observation equations of n points in two stereo pairs, linearised at a motion and a structure."""
 

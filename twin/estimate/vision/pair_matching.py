@@ -13,10 +13,9 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
-from twin.estimate.vision import matching, observation_equations, patches, pixel_locking, stereo, two_view_motion
+from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.observation_equations import PairMeasurements
-from twin.estimate.vision.pixel_locking import PixelLocking
+from twin.estimate.vision.observation_equations import PairMeasurements, PixelLocking
 from twin.estimate.vision.stereo import Keyframe
 
 _LEVELS = 2  # pyramid levels above the full image
@@ -94,8 +93,8 @@ class PairMatcher:
         left_px, right_px, node_points = in_left.points[ok], in_right.points[ok], points.subset(ok)
         cov *= stereo.row_noise_ratio(left_px, right_px, cov) ** 2
         measured, measured_cov = stereo.fuse(left_px, right_px, cov, rig)
-        left_shift = pixel_locking.shifts(left_px, left_warp[ok], self.patch_px)
-        right_shift = pixel_locking.shifts(right_px, right_warp[ok], self.patch_px)
+        left_shift = patches.locking_shifts(left_px, left_warp[ok], self.patch_px)
+        right_shift = patches.locking_shifts(right_px, right_warp[ok], self.patch_px)
         locking = stereo.fused_shift(left_shift, right_shift, measured_cov, rig)
         return MatchedPair(
             PairMeasurements(measured, node_points.measured, measured_cov, node_points.cov),
@@ -111,7 +110,7 @@ class PairMatcher:
         left_px, shift_px = self._project(points.measured)
         warp = np.tile(np.eye(2), (len(left_px), 1, 1))
         warp[:, 0] -= points.disparity_slope
-        right_shift = pixel_locking.shifts(left_px - shift_px, warp, self.patch_px)
+        right_shift = patches.locking_shifts(left_px - shift_px, warp, self.patch_px)
         return stereo.fused_shift(np.zeros_like(right_shift), right_shift, points.cov, self.rig)
 
     def _in_view(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:

@@ -138,6 +138,22 @@ def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floati
     return _slope(disparity_px, np.round(points).astype(np.int64), patch_px // 2)
 
 
+def locking_shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:
+    """Returns the shifts (n, 2) [px] of matched positions due to pixel locking with an amplitude of 1 px.
+
+    A match at column u and row v [px] is shifted by -A sin(2 pi u) and -A sin(2 pi v) (Schreier, Braasch & Sutton 2000,
+    Opt. Eng. 39). On a smooth floor this does not average out. Where a patch of side s is warped, its pixels' biases
+    partly cancel: A along an image axis is multiplied by sinc(s d1) sinc(s d2), with (d1, d2) the row for this axis of
+    "warp minus identity", and sinc t = sin(pi t) / (pi t).
+
+    Args:
+        pixels: (n, 2) matched positions in the target image [px].
+        warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
+    """
+    varying = np.sinc(patch_px * (warp - np.eye(2)))
+    return -np.sin(2 * np.pi * pixels) * varying[:, :, 0] * varying[:, :, 1]
+
+
 @kernel
 def _slope(disparity, points, half):
     out = np.zeros((len(points), 2))

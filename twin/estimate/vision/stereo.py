@@ -11,9 +11,12 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Displacement, Exposure, Readings, StereoRig
-from twin.estimate.vision import epipolar, matching, patches
+from twin.core.records import Displacement, Exposure, Image, Readings, StereoRig
+from twin.core.settings import EstimatorSettings
+from twin.estimate.vision import disparity, epipolar, matching, patches
 
+BINNINGS = (1, 2, 4)  #: numbers of pixels that may be averaged along each side
+_MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners, see `choose_binning`
 _EPIPOLAR_PX = 1.0
 _BORDER_PX = 4  # margin: two pixels for interpolation, two for matching errors, which are smaller than that
 _MIN_SIGMA_PX = 0.005  # interpolation error, a lower bound of the matching error
@@ -83,8 +86,7 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
     which also corrects the columns if the errors of column and row are correlated.
 
     Args:
-        left, right: (n, 2) positions in the left and in the right image [px].
-        cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
+        left, right, cov: (n, 2) positions in the images [px], and their covariance (n, 2, 2), the same in both [px^2].
 
     Returns:
         (n, 3) normalised (x, y, disparity) and (n, 3, 3) covariance.
@@ -100,14 +102,10 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
 
 
 def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> Array:
-    """Returns the shifts (n, 3) of the results (x, y, disparity) of `fuse` that shifts of its input positions cause.
+    """Returns the shifts (n, 3) of the results of `fuse` that shifts (n, 2) of its input positions [px] cause.
 
     The constraint of equal rows moves each of the two rows by half their difference. It also corrects the columns by
-    regression on the rows; the regression coefficient is the ratio of two elements of the fused covariance.
-
-    Args:
-        left, right: (n, 2) shifts of the positions in the left and in the right image [px].
-        fused_cov: (n, 3, 3) covariance returned by `fuse`.
+    regression on the rows; the regression coefficient follows from the covariance (n, 3, 3) that `fuse` returned.
     """
     slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
     x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half
@@ -120,10 +118,7 @@ def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
     Row differences of a stereo pair, minus their median (calibration errors), measure the matching noise. The ratio is
     1.4826 times the median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors
     of 1.17 / sqrt(n).
-
-    Args:
-        left, right: (n, 2) positions of the patches in the left and in the right image [px].
-        cov: (n, 2, 2) covariance of each position, the same in both images [px^2].
+    Positions (n, 2) and their covariance are those of `fuse`.
     """
     n = len(left)
     if n < _MIN_ROW_DIFFERENCES:
@@ -135,11 +130,7 @@ def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
 
 
 def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the matches with a row difference below 1 px and a disparity above 0.5 px.
-
-    Args:
-        left, right: (n, 2) positions in the left and in the right image [px].
-    """
+    """Returns a mask (n,) of the matches (n, 2) with a row difference below 1 px and a disparity above 0.5 px."""
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
@@ -159,13 +150,7 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
 def corners_with_disparity(
     left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and their disparities (n,) [px].
-
-    Args:
-        left: (H, W) grey levels.
-        dense_px: (H, W) disparity [px], NaN where unknown.
-        patch_px: side of the patches, which lie inside the image [px].
-    """
+    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and their disparities (n,) [px]."""
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])
@@ -186,7 +171,6 @@ def match_stereo_points(
         left, right: (height, width) grey levels (`matching.gray`).
         dense_px: (height, width) initial disparity, NaN where unknown [px].
         rig: calibration at the scale of the images, with square pixels.
-        patch_px: side of the matched patches (odd).
     """
     pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
     slope = patches.disparity_slope(_refined(dense_px, left, right), pixels, patch_px)
@@ -204,6 +188,31 @@ def match_stereo_points(
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
     rows = match.points[ok, 1] - pixels[ok, 1]
     return StereoPoints(pixels[ok], slope[ok], mean_px[ok].astype(np.float64), measured, cov, xyz, rows, noise_ratio)
+
+
+def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
+    """Returns the smallest binning [px] at which over two thirds of the corners are matched, else that with the most.
+
+    Over coarse texture many corners are noise: over texels of 12 pixels, 35 to 60 % are matched at full size, 88 to
+    96 % with binning by 2 or 4; over fine texture 95 to 99 % without. Larger patches alone do not help. Only binnings
+    that divide the width and the height of the images (height, width, 3) are tried.
+    """
+    best, best_fraction = 1, 0.0
+    for binning in BINNINGS:
+        if rig.width_px % binning or rig.height_px % binning:
+            break
+        scaled, n, patch_px = rig.binned(binning), settings.points, settings.patch_px
+        left_gray, right_gray = matching.gray(left, binning), matching.gray(right, binning)
+        widest_px = disparity.SearchRange(scaled).max_disparity_px
+        dense_px = disparity.search(matching.normalise(left_gray), matching.normalise(right_gray), widest_px)
+        pixels, _ = corners_with_disparity(left_gray, dense_px, n, patch_px)
+        points = match_stereo_points(left_gray, right_gray, dense_px, scaled, n, patch_px)
+        fraction = len(points.xyz) / max(len(pixels), 1)
+        if fraction > _MIN_MATCHED:
+            return binning
+        if fraction > best_fraction:
+            best, best_fraction = binning, fraction
+    return best
 
 
 def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching.Gray) -> NDArray[np.float32]:

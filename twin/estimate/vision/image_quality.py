@@ -1,4 +1,4 @@
-"""Ambiguity of matches in repetitive texture, measured by the autocorrelation of the image."""
+"""Quality of an image for matching: contrast, saturation, and ambiguity of repetitive texture."""
 
 from __future__ import annotations
 
@@ -8,9 +8,25 @@ import cv2
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.estimate.vision.matching import Image
+from twin.estimate.vision.matching import Gray, Image, local_moments
 
+_FULL_SCALE = 255  # grey level of a saturated pixel
 _SMALLEST_WEIGHT = 0.2  # shifts with a smaller overlap of the tapers, relative to zero shift, are ignored
+
+
+def saturated_fraction(image: Image) -> float:
+    """Returns the fraction of the pixel values of an image (H, W, 3) that are at full scale, 0 to 1."""
+    return float(np.count_nonzero(image == _FULL_SCALE)) / image.size
+
+
+def contrast(levels: Gray) -> float:
+    """Returns the local RMS contrast of an image: standard deviation / mean, median over the image.
+
+    The image must not be normalised. The contrast includes image noise, which dominates it in dark or turbid images.
+    """
+    mean, square = (moment[::4, ::4] for moment in local_moments(levels))
+    sigma = np.sqrt(np.maximum(square - mean**2, 0))
+    return float(np.median(sigma / np.maximum(mean, 1.0)))
 
 
 def repetition(image: Image, patch_px: int) -> float:
@@ -19,9 +35,7 @@ def repetition(image: Image, patch_px: int) -> float:
     Natural texture stays below 0.4. Repetitive texture (tiles, dots, a chequerboard) comes close to 1: a patch then has
     several equally good matches.
 
-    Args:
-        image: (height, width) normalised image (`matching.normalise`).
-        patch_px: side of the matched patches [px]; smaller shifts belong to the main peak.
+    The image (height, width) is normalised (`matching.normalise`); shifts below `patch_px` belong to the main peak.
     """
     taper, weight = _taper(*image.shape)
     correlation = _autocorrelation((image.astype(np.float64) - image.mean()) * taper)
@@ -42,10 +56,9 @@ def _taper(height: int, width: int) -> tuple[Array, Array]:
 
 
 def _autocorrelation(values: Array) -> Array:
-    """Returns the autocorrelation of zero-padded values (height, width), indexed by the shifts in row and in column.
+    """Returns the autocorrelation of zero-padded values (height, width), in the order of a Fourier transform.
 
-    Row shifts are from 0 up to half the height; negative column shifts follow the positive ones, as in a discrete
-    Fourier transform.
+    Row shifts are from 0 up to half the height.
     """
     shape = [cv2.getOptimalDFTSize(2 * side) for side in values.shape]
     spectrum = np.abs(np.fft.rfft2(values, shape)) ** 2
