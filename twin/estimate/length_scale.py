@@ -35,9 +35,7 @@ def length_scales(
 ) -> tuple[LengthScale | None, LengthScale | None]:
     """Returns the scales of the lengths from the images across and along the optical axis; None where not observed.
 
-    Args:
-        nodes: the nodes with their readings.
-        links: measured motions between these nodes; those between consecutive nodes are used.
+    The links are the measured motions between the nodes; those between consecutive nodes are used.
     """
     number = np.array([node.number for node in nodes])
     at_i, at_j = np.searchsorted(number, links.i), np.searchsorted(number, links.j)
@@ -125,10 +123,6 @@ def _fit(measured: Array, lengths: Array, nuisance: Array, variance: Array) -> _
     The covariance is that of the noise, multiplied by the chi-square per degree of freedom if that exceeds 1. Errors of
     `lengths` reduce the factors by at most the ratio of the variance of the residuals to that of the lengths, which is
     added as a standard deviation. A weak prior (1 +- 1) makes factors finite that the readings do not determine.
-
-    Args:
-        measured, variance: (m,) measured lengths and their variances.
-        lengths, nuisance: (m, 2), (m, n).
     """
     freedom = len(measured) - nuisance.shape[-1] - 2
     if freedom < 1:

@@ -48,19 +48,15 @@ class PoseLog:
 def interpolate_between_keyframes(
     steps: Array, variances: Array, rows: NDArray[np.int64], keyframe_poses: Array
 ) -> Array:
-    """Interpolates the poses of keyframes to all frames along the dead-reckoned steps from frame to frame.
+    """Returns the poses (n, 4, 4) of all frames from those of the keyframes (m, 4, 4) and the steps between frames.
 
     Between two keyframes, the misclosure of the steps is distributed over them by least squares, weighted by their
-    variances: a step that failed takes nearly all of it.
+    variances: a step that failed takes nearly all of it. Frames before the first and after the last keyframe follow the
+    steps without correction.
 
     Args:
         steps, variances: those of `PoseLog`; the first step is not used.
         rows: (m,) indices of the frames that are keyframes, ascending; m > 0.
-        keyframe_poses: (m, 4, 4) aligned poses of these keyframes.
-
-    Returns:
-        (n, 4, 4) poses of all frames, equal to `keyframe_poses` at the keyframes. Frames before the first and after the
-        last keyframe follow the steps without correction.
     """
     motions, variances = _motions(steps), np.maximum(variances, _LEAST_VARIANCE)
     between = zip(rows, rows[1:], keyframe_poses, keyframe_poses[1:], strict=False)

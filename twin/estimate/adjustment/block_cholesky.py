@@ -40,10 +40,7 @@ class CholeskyFactor(NamedTuple):
         return x[s.permutation]
 
     def sample(self, normals: Array) -> Array:
-        """Returns vectors (n, 6) whose covariance is the inverse matrix, from standard normal numbers (n, 6).
-
-        The vectors are L^-T z, with the numbers z in elimination order.
-        """
+        """Returns vectors L^-T z (n, 6), whose covariance is the inverse matrix, from normal numbers z (n, 6)."""
         s = self.symbolic
         x = normals.reshape(-1).copy()
         _solve_transposed_in_place(s, self.panels, x)
@@ -60,9 +57,10 @@ class CholeskyFactor(NamedTuple):
         right[s.permutation[node]] = np.eye(_D)
         panel: int | None = int(s.panel_of[s.permutation[node]])
         while panel is not None:
-            inverse_triangle, below = self._panel(panel)
-            y = inverse_triangle @ right[s.panel_start[panel] : s.panel_start[panel + 1]].reshape(-1, _D)
-            right[s.rows_below(panel)] -= (below @ y).reshape(-1, _D, _D)
+            matrix = _panel_matrix(s, self.panels, panel)
+            own = matrix.shape[1]
+            y = matrix[:own] @ right[s.panel_start[panel] : s.panel_start[panel + 1]].reshape(-1, _D)
+            right[s.rows_below(panel)] -= (matrix[own:] @ y).reshape(-1, _D, _D)
             block += y.T @ y
             panel = s.parent(panel)
         return block
@@ -73,12 +71,6 @@ class CholeskyFactor(NamedTuple):
         blocks = np.empty((len(s.permutation), _D, _D))
         _invert(s, self.panels, blocks)
         return blocks[s.permutation]
-
-    def _panel(self, panel: int) -> tuple[Array, Array]:
-        """Returns views of the two parts of a panel: L1^-1, and L2 below it; see the docstring of the module."""
-        matrix = _panel_matrix(self.symbolic, self.panels, panel)
-        own = matrix.shape[1]
-        return matrix[:own], matrix[own:]
 
 
 class BlockMatrix(NamedTuple):
@@ -101,16 +93,10 @@ class BlockMatrix(NamedTuple):
         _add(self.symbolic, first, blocks, self.panels)
 
     def factorise(self, diagonal: Array) -> CholeskyFactor:
-        """Returns the Cholesky factor, which overwrites the matrix.
+        """Returns the Cholesky factor of the matrix with these diagonal blocks (n, 6, 6); it overwrites the matrix.
 
-        Matrix and factor share the array `panels`. The matrix has to be cleared and filled before it is used again,
-        and the factor is then lost.
-
-        Args:
-            diagonal: (n, 6, 6) diagonal blocks, which replace those of the matrix.
-
-        Raises:
-            LinAlgError: the matrix is not numerically positive definite.
+        Before the matrix is used again, it has to be cleared and filled, and the factor is then lost. Raises
+        LinAlgError if the matrix is not numerically positive definite.
         """
         s, original = self.symbolic, np.empty((len(diagonal), _D))
         original[s.permutation] = np.diagonal(diagonal, axis1=1, axis2=2)
@@ -130,7 +116,6 @@ def _set_diagonal(s, diagonal, panels):
 
 @kernel
 def _add(s, start, blocks, panels):
-    """Compiled kernel of `BlockMatrix.add`: adds `blocks` (k, 6, 6) to the off-diagonal blocks from index `start`."""
     for k in range(len(blocks)):
         row, column = s.off_diagonal[start + k]
         p = s.panel_of[column]
@@ -150,9 +135,7 @@ def _panel_matrix(s, panels, p):
 
 @kernel
 def _factorise(s, original, panels):
-    """Factorises the matrix in place; False if it is not positive definite. `original` (6 n,): diagonal before
-    elimination.
-    """
+    """Factorises the matrix in place; False if it is not positive definite. `original` (6 n,) is its diagonal."""
     for p in range(len(s.panel_start) - 1):
         n, panel = _D * (s.panel_start[p + 1] - s.panel_start[p]), _panel_matrix(s, panels, p)
         inverse = np.zeros((n, n))
@@ -175,7 +158,7 @@ def _factorise(s, original, panels):
 def _invert_root(matrix, original, inverse):
     """Fills `inverse` (n, n) with that of the lower Cholesky factor of a dense matrix; False if not positive definite.
 
-    A pivot that is tiny relative to `original` (n,), the diagonal before elimination, counts as zero.
+    A pivot that is tiny relative to `original` (n,) counts as zero.
     """
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):

@@ -35,8 +35,7 @@ class SymbolicFactor(NamedTuple):
     row_start: Indices
     rows: Indices
     #: (s + 1,) index of the first element of each panel in one long array, and the length of this array. A panel is a
-    #: row-major matrix; its block rows are the panel's own positions and those below it, its block columns are its own
-    #: positions.
+    #: row-major matrix, its block rows are its own positions and those below, its block columns its own positions.
     offset: Indices
     panel_of: Indices  #: (n,) number of the panel that holds each position
     off_diagonal: Indices  #: (m, 2) row and column position of each off-diagonal block, row > column
@@ -51,18 +50,16 @@ class SymbolicFactor(NamedTuple):
     def parent(self, panel: int) -> int | None:
         """Returns the parent of a panel in the elimination tree, None for a root.
 
-        The parent is the panel that holds the first position below this panel. All other positions below this panel are
-        in the parent or below it.
+        It holds the first position below this panel; all other positions below are in the parent or below it.
         """
         below = self.rows_below(panel)
         return int(self.panel_of[below[0]]) if len(below) else None
 
 
 def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
-    """Returns the symbolic factor of a matrix of n x n blocks.
+    """Returns the symbolic factor of a matrix of n x n blocks with the off-diagonal blocks (i, j), i not equal to j.
 
-    Args:
-        i, j: (m,) nodes of the off-diagonal blocks (i, j), i not equal to j; a pair may occur more than once.
+    A pair of the nodes i, j (m,) may occur more than once.
     """
     permutation = _minimum_degree(n, i, j)
     panels = _supernodes(n, np.minimum(permutation[i], permutation[j]), np.maximum(permutation[i], permutation[j]))
@@ -98,8 +95,7 @@ def _minimum_degree(n: int, i: Indices, j: Indices) -> Indices:
 def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], Indices]]:
     """Returns, for each supernode in elimination order, its nodes and the nodes of the nonzero rows below it.
 
-    Args:
-        early, late: (m,) the two nodes of each off-diagonal block, numbered in elimination order, early < late.
+    The nodes early < late (m,) of each off-diagonal block are numbered in elimination order.
     """
     order = np.argsort(early, kind="stable")
     start, below = _fill_in(n, np.searchsorted(early[order], np.arange(n + 1)), late[order])
@@ -121,11 +117,9 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
 
 @kernel
 def _fill_in(n, start, later):
-    """Returns the rows below the diagonal of each column k of the factor: below[at[k] : at[k + 1]] (Davis 2006, chapter
-    4).
+    """Returns the rows below the diagonal of each column k: below[at[k] : at[k + 1]] (Davis 2006, chapter 4).
 
-    They are the later neighbours later[start[k] : start[k + 1]] of node k, and the rows of its children in the
-    elimination tree.
+    They are the later neighbours later[start[k] : start[k + 1]] of node k, and the rows of its children in the tree.
     """
     at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
     last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists

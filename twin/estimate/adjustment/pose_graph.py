@@ -42,7 +42,7 @@ class UnaryFactors(NamedTuple):
 
 
 class BinaryFactors(NamedTuple):
-    """Factors of one kind that each constrain the relative pose of two nodes."""
+    """Factors of one kind that each constrain the relative pose of two nodes, and perhaps the shared parameter."""
 
     #: i, j: (m,) indices of the two poses of each factor.
     i: Indices
@@ -50,9 +50,9 @@ class BinaryFactors(NamedTuple):
     information: Array  #: (m, d, d) information matrices
     #: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
     residuals: Callable[[Array, float], Array]
-    #: function of i_from_j, the shared parameter and the residuals that returns two Jacobians: with respect to the
-    #: increment of pose j (m, d, 6), and with respect to the shared parameter (m, d), None if the factors do not depend
-    #: on it. It is called for a part of the factors at a time.
+    #: function of i_from_j, the shared parameter and the residuals that returns the Jacobians with respect to the
+    #: increment of pose j (m, d, 6) and to the shared parameter (m, d), None if there is no dependence; called for a
+    #: part of the factors at a time.
     jacobians: Callable[[Array, float, Array], tuple[Array, Array | None]]
     huber: float | None = None  #: residual [standard deviations] above which the loss is linear; None: least squares
 
@@ -86,13 +86,11 @@ class _Evaluation(NamedTuple):
 
 
 class _NormalEquations(NamedTuple):
-    """Normal equations, without the off-diagonal blocks of the poses, which are stored in a `BlockMatrix`."""
+    """Normal equations in the Gauss-Newton approximation; a `BlockMatrix` holds their off-diagonal blocks."""
 
     diagonal: Array  #: (n, 6, 6) diagonal blocks
     gradient: Array  #: (n, 6) gradient of F with respect to the poses
-    #: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter. All second derivatives
-    #: are in the Gauss-Newton approximation.
-    border: Array
+    border: Array  #: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter
     corner: float  #: second derivative of F with respect to the shared parameter; 0 if there is no such parameter
     shared_gradient: float  #: derivative of F with respect to the shared parameter
 
@@ -142,10 +140,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
     """Returns the solution reached from `start` by Gauss-Newton with Levenberg-Marquardt damping.
 
     It is a local minimum of the cost unless `max_iterations` steps, accepted or rejected, are reached; one is always
-    made.
-
-    Raises:
-        LinAlgError: the factors do not constrain every pose.
+    made. Raises LinAlgError if the factors do not constrain every pose.
     """
     empty = np.empty(0, np.int64)
     i, j = np.concatenate([empty, *(f.i for f in graph.binary)]), np.concatenate([empty, *(f.j for f in graph.binary)])
@@ -181,16 +176,9 @@ class _Step(NamedTuple):
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
-    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites `matrix`.
-
-    Raises:
-        LinAlgError: the factors do not constrain every pose.
-    """
-    diagonal = equations.diagonal
-    if damping:
-        axes = np.arange(6)
-        diagonal = diagonal.copy()
-        diagonal[:, axes, axes] *= 1 + damping
+    """Solves the bordered normal equations by the Schur complement of the pose block. Overwrites `matrix`."""
+    axes, diagonal = np.arange(6), equations.diagonal.copy()
+    diagonal[:, axes, axes] *= 1 + damping
     try:
         cholesky = matrix.factorise(diagonal)
     except np.linalg.LinAlgError:
@@ -240,9 +228,9 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
     matrix.clear()
     for factors, residuals in zip(graph.unary, current.unary, strict=True):
         by_pose = factors.jacobians(current.state.poses[factors.pose_index], residuals)
-        weighted = transposed(by_pose) @ factors.information
+        weighted = by_pose.transpose(0, 2, 1) @ factors.information
         diagonal += _sum_by_index(n, factors.pose_index, weighted @ by_pose)
-        gradient += _sum_by_index(n, factors.pose_index, matvec(weighted, residuals))
+        gradient += _sum_by_index(n, factors.pose_index, _matvec(weighted, residuals))
     for factors, evaluated in zip(graph.binary, current.binary, strict=True):
         for first in range(0, len(factors.i), _BATCH):
             batch = slice(first, first + _BATCH)
@@ -255,7 +243,7 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
             matrix.add(n_added, off_diagonal)
             n_added += len(i)
             if by_shared is not None:
-                weighted = weights[:, None] * matvec(information, by_shared)
+                weighted = weights[:, None] * _matvec(information, by_shared)
                 _add_border(i, j, by_j, weighted, i_from_j, border)
                 corner += float(np.sum(weighted * by_shared))
                 shared_gradient += float(np.sum(weighted * residuals))
@@ -266,16 +254,14 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
 def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
     """Adds the contributions of binary factors to the diagonal blocks and gradients of both poses.
 
-    The Jacobian J_i with respect to the increment of pose i is computed from that of pose j: J_i = -J_j Ad(j_from_i).
+    The Jacobian with respect to the increment of pose i is J_i = -J_j Ad(j_from_i).
 
     Args:
-        first, second: (m,) indices i and j of the poses.
+        first, second, i_from_j: (m,), (m,), (m, 4, 4) indices i and j of the poses, and camera j in camera i.
         by_j: (m, d, 6) Jacobians with respect to the increment of pose j.
         information, weights, residuals: (m, d, d) information matrices, (m,) robust weights and (m, d) residuals.
-        i_from_j: (m, 4, 4) poses of camera j in camera i.
-        diagonal: (n, 6, 6) diagonal blocks, changed in place.
+        diagonal, gradient: (n, 6, 6), (n, 6) changed in place.
         off_diagonal: (m, 6, 6), filled with the blocks (i, j).
-        gradient: (n, 6) gradient, changed in place.
     """
     n = residuals.shape[1]
     half, matrix, slope, to_i = np.empty((6, n)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
@@ -307,9 +293,7 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
 
 @kernel
 def _add_border(first, second, by_j, weighted, i_from_j, border):
-    """Adds the mixed derivatives of poses and shared parameter to `border`; `weighted` (m, d): weighted shared
-    Jacobian.
-    """
+    """Adds the mixed derivatives of poses and shared parameter to `border`, from weighted shared Jacobians (m, d)."""
     for m in range(len(first)):
         slope = np.zeros(6)
         for k in range(weighted.shape[1]):
@@ -322,11 +306,7 @@ def _add_border(first, second, by_j, weighted, i_from_j, border):
 
 
 def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float | None = None) -> BinaryFactors:
-    """Returns binary factors of measured motions.
-
-    Args:
-        huber: residual [standard deviations] above which the loss is linear; None: least squares.
-    """
+    """Returns binary factors of measured motions, with the loss of `BinaryFactors.huber`."""
     columns = Links.from_sequence(links)
     measured, information = (np.ascontiguousarray(column) for column in (columns.i_from_j, columns.information))
     i, j = (np.array([index_of[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
@@ -340,17 +320,13 @@ def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float
 
 
 def prior_factors(pose_index: Sequence[int], poses: Array, covs: Array) -> UnaryFactors:
-    """Returns unary factors of poses with known mean and covariance.
+    """Returns unary factors of the poses `pose_index` (m,) with known means (m, 4, 4) and covariances (m, 6, 6)."""
 
-    Args:
-        pose_index: (m,) indices of the poses.
-        poses: (m, 4, 4) mean poses.
-        covs: (m, 6, 6) covariances [rotation, translation] (rad, m) in the poses' own axes.
-    """
-    return UnaryFactors(
-        np.asarray(pose_index, np.int64), symmetric_inverses(covs), lambda estimated: pose_residuals(poses, estimated),
-        lambda _, residuals: pose_residual_jacobians(residuals),
-    )  # fmt: skip
+    def residuals(estimated: Array) -> Array:
+        return pose_residuals(poses, estimated)
+
+    index, information = np.asarray(pose_index, np.int64), symmetric_inverses(covs)
+    return UnaryFactors(index, information, residuals, lambda _, residuals: pose_residual_jacobians(residuals))
 
 
 @kernel
@@ -364,11 +340,7 @@ def pose_residuals(measured, estimated):
 
 @kernel
 def pose_residual_jacobians(residuals):
-    """Returns the Jacobians (m, 6, 6) of `pose_residuals` with respect to increments of the estimated poses.
-
-    Args:
-        residuals: (m, 6) residuals at these poses.
-    """
+    """Returns the Jacobians (m, 6, 6) of `pose_residuals` (m, 6) with respect to increments of the estimated poses."""
     jacobians = np.empty((len(residuals), 6, 6))
     for k in range(len(residuals)):
         geometry.copy_into(jacobians[k], geometry.log_derivative(residuals[k]))
@@ -391,19 +363,13 @@ def _relative_poses(poses, i, j):
     return relative
 
 
-def transposed(matrices: Array) -> Array:
-    """Returns the transposes (m, b, a) of matrices (m, a, b) (a view)."""
-    return matrices.transpose(0, 2, 1)
-
-
-def matvec(matrices: Array, vectors: Array) -> Array:
-    """Returns the products (m, a) of matrices (m, a, b) and vectors (m, b)."""
+def _matvec(matrices: Array, vectors: Array) -> Array:
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def _squared_norms(residuals: Array, information: Array) -> Array:
     """Returns the squared Mahalanobis norms (m,) of residuals (m, d), given information matrices (m, d, d)."""
-    return np.sum(residuals * matvec(information, residuals), axis=1)
+    return np.sum(residuals * _matvec(information, residuals), axis=1)
 
 
 def _sum_by_index(n: int, index: Indices, values: Array) -> Array:

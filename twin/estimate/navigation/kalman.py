@@ -64,15 +64,10 @@ def _chi2(residual, cov):
 
 @kernel
 def kalman_update(world_from_camera, prior, residual, jacobian, cov):
-    """Updates a pose with an observation (Kalman update in Joseph form).
+    """Returns a pose (4, 4) and its covariance (6, 6) after a Kalman update in Joseph form.
 
-    Args:
-        world_from_camera, prior: (4, 4), (6, 6) pose and covariance before the update.
-        residual, jacobian, cov: (k,), (k, 6), (k, k) observation minus its prediction, Jacobian of the prediction with
-            respect to an increment of the pose, and covariance of the observation.
-
-    Returns:
-        Pose (4, 4) and covariance (6, 6) after the update.
+    `residual` (k,), `jacobian` (k, 6) and `cov` (k, k) are the observation minus its prediction, the Jacobian of the
+    prediction with respect to an increment of the pose, and the covariance of the observation.
     """
     gain = _gain(prior, jacobian, cov)
     keep, noise, step = np.eye(6), np.zeros((6, 6)), np.zeros(6)

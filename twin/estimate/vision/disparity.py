@@ -17,22 +17,17 @@ Map = NDArray[np.float32]
 #: Block size of semi-global matching [px]. In turbid water, more pixels are matched with a block of 5 px than with one
 #: of 3 px; the refinement restores the sharpness of edges.
 BLOCK_PX = 5
-#: Connected regions of at most this many pixels are removed as mismatches.
-SPECKLE_PX = 60
+SPECKLE_PX = 60  #: connected regions of at most this many pixels are removed as mismatches
 #: Width of the window of the contrast normalisation before matching, as a fraction of the image width. It can be large,
-#: because illumination and backscatter vary slowly over the image. In a small window (25 px), the local mean near an
-#: object depends on the background, which differs between the two images.
+#: because illumination and backscatter vary slowly; in a small one, the mean near an object depends on the background.
 NORMALISATION_WINDOW = 1 / 7
-#: Largest difference between the left-to-right and the right-to-left disparity of a valid pixel [px]; a larger
-#: difference indicates an occlusion or a mismatch.
+#: Largest difference between the left-to-right and the right-to-left disparity of a valid pixel [px]; a larger one
+#: indicates an occlusion or a mismatch.
 CONSISTENCY_PX = 1.0
-#: Standard deviation of errors that the refinement does not model (interpolation, relief inside the window) [px]; it is
-#: added in quadrature.
+#: Standard deviation of errors that the refinement does not model (interpolation, relief inside the window) [px].
 MIN_SIGMA_PX = 0.03
-#: Largest disparity that is searched, as a fraction of the image width.
-MAX_DISPARITY_FRACTION = 0.4
-#: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px]; pixels above it
-#: are treated as mismatches.
+MAX_DISPARITY_FRACTION = 0.4  #: largest disparity that is searched, as a fraction of the image width
+#: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px].
 MAX_SIGMA_PX = 1.0
 
 
@@ -43,11 +38,7 @@ class Disparity(NamedTuple):
     sigma_px: Map  #: (H, W) float32 standard deviation of the disparity [px], NaN where unknown
 
     def with_sigma_below(self, sigma_px: float | Map) -> Disparity:
-        """Returns the disparity with the pixels whose standard deviation is not below `sigma_px` set to NaN.
-
-        Args:
-            sigma_px: limit of all pixels, or (H, W) limit of each pixel [px].
-        """
+        """Returns the disparity, NaN where its standard deviation is not below `sigma_px`, one limit or (H, W) [px]."""
         accepted = self.sigma_px < sigma_px
         unknown = np.float32(np.nan)
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
@@ -73,8 +64,6 @@ def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) 
 class SearchRange:
     """Range of the disparity search, at first the widest one, then adapted to the largest disparities of the last pair.
 
-    The widest range is `MAX_DISPARITY_FRACTION` of the image width.
-
     Attributes:
         max_disparity_px: largest disparity to search [px].
     """
@@ -96,22 +85,13 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
 
     Args:
         left, right: (H, W) uint8 rectified images with normalised contrast.
-        max_disparity_px: number of whole-pixel disparities that are searched, from 0 on; it is rounded up to a multiple
-            of 16.
+        max_disparity_px: number of whole-pixel disparities searched, rounded up to a multiple of 16.
     """
     count = -(-max_disparity_px // 16) * 16
     matcher = cv2.StereoSGBM.create(
-        minDisparity=0,
-        numDisparities=count,
-        blockSize=BLOCK_PX,
-        P1=8 * BLOCK_PX**2,
-        P2=32 * BLOCK_PX**2,
-        disp12MaxDiff=1,
-        preFilterCap=63,
-        speckleWindowSize=SPECKLE_PX,
-        speckleRange=1,
-        mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
-    )
+        0, count, BLOCK_PX, P1=8 * BLOCK_PX**2, P2=32 * BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=63,
+        speckleWindowSize=SPECKLE_PX, speckleRange=1, mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
+    )  # fmt: skip
     padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
     disparity = matcher.compute(*padded)[:, count:].astype(np.float32) / np.float32(16)
     column = np.arange(left.shape[1], dtype=np.float32)

@@ -20,24 +20,18 @@ Array = NDArray[np.float64]
 Map = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-#: Value of an unknown disparity in the kernels; it differs so much from any real disparity that such a pixel never
-#: supports the fit at another one.
+#: Value of an unknown disparity in the kernels; no real disparity is so near that such a pixel supports its fit.
 UNKNOWN_PX = np.float32(-1e4)
-#: A neighbour supports the fit at a pixel if their disparities differ by less than this [px]; otherwise it is on
-#: another surface.
-SUPPORT_PX = 1.2
+SUPPORT_PX = 1.2  #: a neighbour whose disparity differs by more is on another surface, and does not support a fit [px]
 #: Standard deviations of the priors of the disparity correction [px] and of the slopes of the disparity plane [px/px];
 #: the priors only matter where there is no texture.
 PRIOR_PX, PRIOR_SLOPE = 0.5, 0.3
 #: Standard deviation of the Gaussian window at low noise; its largest value; and the median standard deviation of the
 #: disparity up to which noise counts as low [px].
 WINDOW_PX, WIDEST_PX, LOW_NOISE_SIGMA_PX = 1.5, 2.5, 0.08
-#: Side of the window in which brightness and contrast of the two images are equalised [px of images at half size].
-BALANCE_PX = 13
-#: Windows in which the correlation between the two images is smaller are treated as mismatches.
-MIN_CORRELATION = 0.4
-#: Variance of the difference of two images due to rounding to grey levels alone [grey levels squared].
-MIN_NOISE_VARIANCE = 1 / 6
+BALANCE_PX = 13  #: side of the window in which brightness and contrast are equalised [px of images at half size]
+MIN_CORRELATION = 0.4  #: windows in which the correlation between the two images is smaller are mismatches
+MIN_NOISE_VARIANCE = 1 / 6  #: variance of the difference of two images due to rounding alone [grey levels squared]
 #: Per unit of noise variance: weights of the two priors, and expected square of an image gradient due to noise alone.
 _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 
@@ -45,8 +39,7 @@ _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 class TwoView(NamedTuple):
     """Two-view geometry: pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image.
 
-    K is the camera matrix, f the focal length [px], b the baseline of the stereo pair [m]; the pose of the reference
-    camera in the other camera has rotation R and translation t [m]. p is in homogeneous pixel coordinates.
+    p is in homogeneous pixel coordinates.
     """
 
     matrix: Array  #: (3, 3) K R K^-1, the infinite homography other_from_reference
@@ -78,12 +71,9 @@ STEREO = TwoView(np.eye(3), np.array([-1.0, 0.0, 0.0]))
 
 
 def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> TwoView:
-    """Returns the two-view geometry of a relative pose.
+    """Returns the two-view geometry of the pose (4, 4) of the reference camera in the other camera.
 
-    Args:
-        other_from_reference: (4, 4) pose of the reference camera in the other camera.
-        matrix: (3, 3) camera matrix K of both cameras [px].
-        baseline_m: baseline of the stereo pair, which defines disparity [m].
+    Both have the camera matrix (3, 3) [px]; the baseline of the stereo pair [m] defines disparity.
     """
     focal_baseline = matrix[0, 0] * baseline_m
     rotation, translation = other_from_reference[:3, :3], other_from_reference[:3, 3]
@@ -153,8 +143,7 @@ def _contrast(image: Map) -> Map:
 def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Map, Mask]:
     """Warps the other image O to the reference I, and adapts its local mean and standard deviation to those of I.
 
-    Returns:
-        Residual I - O (0 where not visible), gradient dO/dd and pixel locking (`_warp`), and mask of visible pixels.
+    Returns residual I - O (0 where not visible), gradient dO/dd and pixel locking (`_warp`), mask of visible pixels.
     """
     warped, slope, locking = np.zeros_like(reference), np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope, locking)
@@ -169,7 +158,7 @@ def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) ->
 def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
     """Returns the gain and the offset (H, W) that give `other` the local mean and standard deviation of `image`.
 
-    Pixels are weighted by `weight` (H, W). Where there is little texture, the gain is kept near 1.
+    The gain is near 1 where there is little texture.
     """
     count = _mean(weight) + 1e-3
     mean_i, mean_o = _mean(image * weight) / count, _mean(other * weight) / count
@@ -208,10 +197,7 @@ def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float
 
 
 def _correlations(residual: Map, visible: Mask, variance: float) -> tuple[float, float]:
-    """Returns the correlation of the residuals of neighbouring pixels in a row, and that of neighbours in a column.
-
-    The absolute values of the residuals are limited to three times the root of `variance`.
-    """
+    """Returns the correlation of the residuals, limited to 3 sigma, of neighbours in a row, and in a column."""
     noise = np.where(visible, np.clip(residual, -3 * variance**0.5, 3 * variance**0.5), 0)
     power = float(np.mean(noise * noise)) + 1e-6
     along, across = (float(np.mean(a * b)) / power for a, b in ((noise[:, 1:], noise[:, :-1]), (noise[1:], noise[:-1])))
@@ -287,8 +273,7 @@ def _interpolated_noise(t):
 def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
     """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fits, in place.
 
-    `centre` are the disparities of the pixels, the others belong to the neighbours; the compiler can vectorise the
-    loop.
+    `centre` are the disparities of the pixels, the others belong to the neighbours.
     """
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11, s12 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11], sums[12]
@@ -321,9 +306,8 @@ def _fit_planes(disparity, residual, slope, locking, noise, window, support, pri
     The expected noise product of residual and slope is subtracted: `locking` times the mean squared residual of the
     window, or times `noise` (H, W) if that is smaller.
 
-    Returns:
-        Disparity at the centre (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (see
-        `Refinement`) and mean squared residual, each (H, W).
+    Returns disparity (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (`Refinement`)
+    and mean squared residual, each (H, W).
     """
     height, width = disparity.shape
     half = window.size // 2

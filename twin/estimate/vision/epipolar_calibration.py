@@ -45,14 +45,7 @@ class RegionMeans(NamedTuple):
     jacobian: Array  #: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`)
 
     def plus(self, region: NDArray[np.int64], weight: Array, rows: Array, jacobian: Array) -> RegionMeans:
-        """Returns the sums with n more row differences.
-
-        Args:
-            region: (n,) numbers of the regions in which the points lie.
-            weight: (n,) weights.
-            rows: (n,) normalised row differences.
-            jacobian: (n, 4) derivatives of the row differences (`row_jacobian`).
-        """
+        """Returns the sums with n more row differences (n,), in the regions (n,), with weights and derivatives."""
         terms = np.column_stack([weight, weight * rows, weight[:, None] * jacobian])
         sums = np.zeros((len(self.weight), terms.shape[1]))
         np.add.at(sums, region, terms)
@@ -61,9 +54,8 @@ class RegionMeans(NamedTuple):
     def pattern(self, estimate: Array) -> float:
         """Returns the weighted RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
 
-        The expected contribution of matching noise is subtracted first: the weighted sum of the squared means has the
-        expectation m - 4 for m regions with observations and four estimated parameters. The unit is the focal length;
-        the result is 0 without observations.
+        The weighted sum of the squared means has the expectation m - 4 due to matching noise, which is subtracted, for
+        m regions with observations. The unit is the focal length; 0 without observations.
         """
         seen = self.weight > 0
         weight = self.weight[seen]
@@ -91,11 +83,7 @@ class EpipolarCalibration:
         self.removed = np.zeros(4)
 
     def add(self, points: StereoPoints, rig: StereoRig, patch_px: int) -> None:
-        """Adds the row differences of one stereo pair whose right image was rectified with `removed`.
-
-        Args:
-            patch_px: side of the matched patches [px], for the correlation between overlapping patches.
-        """
+        """Adds the row differences of one stereo pair whose right image was rectified with `removed`."""
         x, y = points.measured[:, 0] - points.measured[:, 2], points.measured[:, 1]
         jacobian = row_jacobian(x, y)
         rows = points.row_difference_px / rig.focal_px + jacobian @ self.removed
@@ -119,14 +107,15 @@ class EpipolarCalibration:
     def update(self, rig: StereoRig) -> bool:
         """Sets pitch, roll and offset of `removed` to their estimates if this changes a row significantly.
 
-        The condition is that the row changes by more than 4 standard deviations and by more than 0.02 px in at least
-        one corner of the image.
-
-        Returns:
-            Whether `removed` was changed.
+        That is by more than 4 standard deviations and 0.02 px in a corner of the image. Returns whether it was changed.
         """
         change = (self.estimate - self.removed) * CORRECTED
-        x, y = np.meshgrid(*((np.array([0, side - 1]) - c) / rig.focal_px for side, c in _sides(rig)))
+        x, y = np.meshgrid(
+            *(
+                (np.array([0, side - 1]) - centre) / rig.focal_px
+                for side, centre in ((rig.width_px, rig.cx_px), (rig.height_px, rig.cy_px))
+            )
+        )
         shift = row_jacobian(x.ravel(), y.ravel()) * CORRECTED
         cov = np.linalg.inv(self._information)
         shift_sigma = np.sqrt(np.einsum("ni,ij,nj->n", shift, cov, shift))
@@ -138,11 +127,7 @@ class EpipolarCalibration:
         return True
 
     def rectify(self, right: Image, rig: StereoRig) -> Image:
-        """Returns the right image (H, W, 3) corrected for the errors `removed`; the image itself if these are zero.
-
-        Args:
-            right: (H, W, 3) right image at full size.
-        """
+        """Returns the full right image (H, W, 3) corrected for the errors `removed`; itself if these are zero."""
         if not self.removed.any():
             return right
         matrix = rig.matrix
@@ -162,12 +147,9 @@ class EpipolarCalibration:
 
 
 def row_jacobian(x: Array, y: Array) -> Array:
-    """Returns the derivatives (n, 4) of the normalised rows of points in the right image.
+    """Returns the derivatives (n, 4) of the normalised rows of points at normalised x, y (n,) in the right image.
 
     They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset.
-
-    Args:
-        x, y: (n,) normalised coordinates of the points in the right image.
     """
     return np.column_stack([1 + y**2, -x * y, -x, np.ones_like(x)])
 
@@ -180,10 +162,9 @@ def _region(pixels: NDArray[np.floating], rig: StereoRig) -> NDArray[np.int64]:
 
 
 def row_sigma(points: StereoPoints) -> Array:
-    """Returns the standard deviation (n,) of the normalised row differences that follows from `points.cov`.
+    """Returns the standard deviation (n,) of the normalised row differences.
 
-    `stereo.fuse` averages the rows of a point in the two images, so `points.cov` has the variance of their average. The
-    variance of their difference is four times as large.
+    `points.cov` has the variance of the average of the two rows; that of their difference is four times as large.
     """
     return 2 * np.sqrt(points.cov[:, 1, 1])
 
@@ -192,7 +173,3 @@ def spread(points: StereoPoints) -> float:
     """Returns the robust standard deviation (1.4826 MAD) of the row differences [px]; 0 without points."""
     rows = points.row_difference_px
     return float(_MAD_TO_SIGMA * np.median(np.abs(rows - np.median(rows)))) if len(rows) else 0.0
-
-
-def _sides(rig: StereoRig) -> tuple[tuple[int, float], tuple[int, float]]:
-    return (rig.width_px, rig.cx_px), (rig.height_px, rig.cy_px)

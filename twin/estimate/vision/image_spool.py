@@ -21,7 +21,7 @@ class ImageSpool:
     """Stores stereo pairs on disk as lossless PNG, with a cache of the most recently used grey levels in memory.
 
     The size of the cache is limited, so memory does not grow with the length of the survey. `gray` may be called from
-    several threads.
+    several threads. All methods but `close` raise OSError if images could not be read, or the last pair not written.
 
     Args:
         folder: folder of the images; created if missing.
@@ -37,63 +37,33 @@ class ImageSpool:
         self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
 
     def put(self, row: int, left: Image, right: Image, gray: tuple[matching.Gray, matching.Gray]) -> None:
-        """Stores the stereo pair of a keyframe; another thread writes it to disk.
-
-        Args:
-            left, right: (height, width, 3) RGB images at full size.
-            gray: grey levels of both images at the binning of the spool (`matching.gray`).
-
-        Raises:
-            OSError: the previous pair could not be written, for example because the disk is full.
-        """
+        """Stores the full stereo pair of a keyframe, which another thread writes, and its binned grey levels."""
         self.flush()
         self._writing = self._writer.submit(self._write, row, left, right)
         with self._lock:
             self._cache(row, gray)
 
     def flush(self) -> None:
-        """Waits until the last pair is written.
-
-        Raises:
-            OSError: the pair could not be written.
-        """
+        """Waits until the last pair is written."""
         if self._writing is not None:
             writing, self._writing = self._writing, None
             writing.result()
 
     def close(self) -> None:
-        """Waits until all pairs are written, and ends the thread that writes them.
-
-        If the last pair cannot be written, no error is raised.
-        """
+        """Waits until all pairs are written, and ends the thread; an error of the last pair is not raised."""
         self._writer.shutdown()
 
     def pair(self, row: int) -> tuple[Image, Image]:
-        """Returns the left and the right image (height, width, 3) of the keyframe at frame index `row`.
-
-        Raises:
-            OSError: the images could not be read, or the last pair could not be written.
-        """
-        self.flush()
-        return self._read(row, "left"), self._read(row, "right")
+        """Returns the left and the right image (height, width, 3) of the keyframe at frame index `row`."""
+        return self.left(row), self._read(row, "right")
 
     def left(self, row: int) -> Image:
-        """Returns the left image (height, width, 3) of the keyframe at frame index `row`.
-
-        Raises:
-            OSError: the image could not be read, or the last pair could not be written.
-        """
+        """Returns the left image (height, width, 3) of the keyframe at frame index `row`."""
         self.flush()
         return self._read(row, "left")
 
     def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
-        """Returns the binned grey levels of the left and the right image of the keyframe at frame index `row`.
-
-        They are rounded to half precision.
-
-        Raises:
-            OSError: images that are not in the cache could not be read, or the last pair could not be written.
-        """
+        """Returns the binned grey levels of both images of the keyframe at frame index `row`, in half precision."""
         with self._lock:
             if row not in self._gray:
                 left, right = self.pair(row)
@@ -103,9 +73,7 @@ class ImageSpool:
         return left.astype(np.float32), right.astype(np.float32)
 
     def _cache(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
-        """Adds the grey levels of a pair to the cache; removes the least recently used beyond `_CACHE_BYTES`, except
-        the pair.
-        """
+        """Adds the grey levels of a pair to the cache, and removes the least recently used beyond `_CACHE_BYTES`."""
         self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
         while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)

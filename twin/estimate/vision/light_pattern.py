@@ -30,12 +30,9 @@ class LightPattern(NamedTuple):
 
 
 def pattern_fit(pair: tuple[Map, Map]) -> Array:
-    """Returns the coefficients (2, `DEGREE` + 1, `DEGREE` + 1) of Legendre polynomials fitted to each image of a pair.
+    """Returns the coefficients (2, `DEGREE` + 1, `DEGREE` + 1) of Legendre polynomials fitted to a pair (H, W).
 
     The second axis is the degree along the columns of the image, the third axis that along its rows.
-
-    Args:
-        pair: (H, W) float32 grey levels of the left and the right image.
     """
     rows, columns = (_fitting_matrix(n) for n in pair[0].shape)
     return np.array([rows @ image.astype(np.float64) @ columns.T for image in pair])
@@ -70,7 +67,7 @@ def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern
 
 
 def _power_without_mean(squares: Array) -> float:
-    """Returns the sum of the squared coefficients `squares` (2, d, d) without those of the constant polynomial."""
+    """Returns the sum of squared coefficients (2, d, d) without those of the constant polynomial."""
     return float(squares.sum() - squares[:, 0, 0].sum())
 
 

@@ -22,6 +22,8 @@ from twin.estimate.vision import matching, two_view_motion
 from twin.estimate.vision.tiles import TiledRaster
 from twin.kernels import kernel
 
+Map = NDArray[np.float32]
+
 _MAX_CELLS = 4000
 _MIN_CELLS = 300
 _MIN_GRADIENT = 4.0  # grey levels per cell
@@ -75,18 +77,10 @@ class Mosaic:
         """Empties all cells, before the mosaic is rebuilt after a global alignment."""
         self.cells.clear()
 
-    def add(
-        self, number: int, image: matching.Image, depth_m: NDArray[np.float32], world_from_camera: Array, rig: StereoRig
-    ) -> None:
-        """Fills empty cells of the mosaic from a keyframe; does nothing if no depth is known.
+    def add(self, number: int, image: matching.Image, depth_m: Map, world_from_camera: Array, rig: StereoRig) -> None:
+        """Fills empty cells of the mosaic from a keyframe with a normalised image and depth (height, width) [m].
 
-        Args:
-            image: (height, width) normalised left image.
-            depth_m: (height, width) depth [m], NaN where unknown.
-            world_from_camera: (4, 4) pose of the keyframe.
-
-        Raises:
-            OSError: a tile could not be read or written.
+        The depth is NaN where unknown. Raises OSError if a tile could not be read or written.
         """
         known = depth_m[np.isfinite(depth_m)]
         if known.size == 0:
@@ -102,18 +96,12 @@ class Mosaic:
         self.cells.write(row, col, cells)
 
     def register(
-        self,
-        image: matching.Image,
-        depth_m: NDArray[np.float32],
-        world_from_camera: Array,
-        half_window_m: float,
-        rig: StereoRig,
+        self, image: matching.Image, depth_m: Map, world_from_camera: Array, half_window_m: float, rig: StereoRig
     ) -> Registration | None:
         """Registers a frame with the mosaic.
 
         Args:
-            image: (height, width) normalised frame.
-            depth_m: (height, width) depth from the frame's own stereo pair [m], NaN where unknown.
+            image, depth_m: (height, width) normalised frame, and depth from its own stereo pair, NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
             half_window_m: half the side of the square of cells that is used, centred below the camera [m].
 
@@ -153,13 +141,11 @@ class Mosaic:
         half = int(np.ceil(half_m / self.cell_m))
         return int(centre[1] / self.cell_m) - half, int(centre[0] / self.cell_m) - half, 2 * half
 
-    def _textured_cells(
-        self, centre: Array, half_m: float
-    ) -> tuple[Array, NDArray[np.float32], NDArray[np.float32]] | None:
+    def _textured_cells(self, centre: Array, half_m: float) -> tuple[Array, Map, Map] | None:
         """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
 
-        It has the half side `half_m` [m] and is centred below the camera at `centre` (3,) [m]. From twice `_MAX_CELLS`
-        on, a regular subset; None for fewer than `_MIN_CELLS`, or fewer than 8 cells along a side.
+        From twice `_MAX_CELLS` on, a regular subset; None for fewer than `_MIN_CELLS`, or fewer than 8 cells along a
+        side.
         """
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
@@ -177,7 +163,7 @@ class Mosaic:
         return np.asarray(points, np.float64), bright[rows, cols], number[rows, cols]
 
 
-def _gradient(bright: NDArray[np.float32], height: NDArray[np.float32]) -> NDArray[np.float32]:
+def _gradient(bright: Map, height: Map) -> Map:
     """Returns the magnitude (rows, cols) of the brightness gradient [grey levels per cell]; 0 where it is not known."""
     strength = np.zeros_like(bright)
     across, along = bright[1:-1, 2:] - bright[1:-1, :-2], bright[2:, 1:-1] - bright[:-2, 1:-1]
@@ -194,8 +180,6 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
     pixels, which are not at the centre, would bias registered positions by 5 mm.
 
     Args:
-        image, depth: (H, W) normalised image, and depth [m].
-        pose, inverse: (4, 4) world_from_camera and camera_from_world.
         west, south, cell: south-west corner of the window and cell size [m].
         brightness, height, number: (rows, cols) layers of the window, NaN in empty cells.
     """
@@ -230,12 +214,10 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 
 @kernel
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """Linearises the brightness residuals (cell minus frame) of the cells that are visible in the frame at a known
-    depth.
+    """Linearises the brightness residuals (cell minus frame) of the cells visible in the frame at a known depth.
 
     Args:
         points, brightness: (n, 3), (n,) positions in the world [m] and brightness of the cells.
-        frame, depth: (height, width) brightness and depth [m] of the frame.
         camera: focal length, column and row of the principal point [px].
         max_residual: largest brightness residual of an inlier [grey levels].
 
@@ -284,9 +266,8 @@ def _normal_equations(jacobian, frame_jacobian, residuals, block):
 
     The Jacobian with the frame's depth gives instrumental variables, free of the mosaic's depth errors.
 
-    Returns:
-        Normal matrix, right-hand side, its covariance from the scatter over the image blocks, and the robust standard
-        deviation of the residuals. Zeros for fewer than six residuals.
+    Returns normal matrix, right-hand side, its covariance from the scatter over the image blocks, and the robust
+    standard deviation of the residuals; zeros for fewer than six residuals.
     """
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     if len(jacobian) < 6:

@@ -43,7 +43,7 @@ class MotionFilter:
         self._cov[:6], self._cov[:, :6] = 0.0, 0.0
 
     def predict(self, interval_s: float) -> None:
-        """Predicts the pose of the next frame; after a time without measurements the velocity decays (`braking_factor`)."""
+        """Predicts the pose of the next frame; after a time without measurements, the velocity decays."""
         self.velocity = braking_factor(self._blind_s, interval_s) * self.velocity
         self._blind_s += interval_s
         motion = geometry.exp(self.velocity * interval_s)

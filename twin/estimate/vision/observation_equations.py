@@ -62,12 +62,9 @@ def image_jacobian(x, y, depth):
 
 @kernel
 def normal_equations(jacobian, weight, residual):
-    """Returns the normal matrix (6, 6) and the right-hand side (6,) of a weighted least-squares problem.
+    """Returns the normal matrix (6, 6) and the right-hand side (6,) of a weighted least-squares problem of n points.
 
-    Args:
-        jacobian: (n, k, 6) derivatives of k observations per point.
-        weight: (n,) weights of the points.
-        residual: (n, k) residuals.
+    Jacobians (n, k, 6) and residuals (n, k) of k observations per point, weights (n,).
     """
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for i in range(len(jacobian)):
@@ -82,11 +79,7 @@ def normal_equations(jacobian, weight, residual):
 
 @kernel
 def transfer(points_b, a_from_b, baseline):
-    """Transfers points measured in pair b to pair a.
-
-    Args:
-        points_b: (n, 3) normalised (x, y, disparity) in b.
-        a_from_b: (4, 4) pose of b in a.
+    """Transfers points measured in pair b, normalised (x, y, disparity) (n, 3), to pair a.
 
     Returns:
         (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an
@@ -123,12 +116,7 @@ def transfer(points_b, a_from_b, baseline):
 
 @kernel
 def linearise(measured, structure, a_from_b, baseline):
-    """Returns the `LinearisedObservations` of two stereo pairs.
-
-    Args:
-        structure: (n, 3) points in b at which to linearise, normalised (x, y, disparity).
-        a_from_b: (4, 4) motion at which to linearise.
-    """
+    """Returns the `LinearisedObservations` of two pairs, at points in b, `structure` (n, 3), and a motion (4, 4)."""
     predicted, jacobian_point, jacobian_motion = transfer(structure, a_from_b, baseline)
     a, b, cov_a, cov_b = measured.a, measured.b, measured.cov_a, measured.cov_b
     n = len(a)
@@ -157,7 +145,6 @@ def linearise(measured, structure, a_from_b, baseline):
 
 @kernel
 def _invert(m, out):
-    """Writes the inverse of a (3, 3) matrix to `out`, by cofactors."""
     for r in range(3):
         for c in range(3):
             r1, r2, c1, c2 = (r + 1) % 3, (r + 2) % 3, (c + 1) % 3, (c + 2) % 3
@@ -168,14 +155,13 @@ def _invert(m, out):
 
 @kernel
 def motion_normal_equations(observations, weight):
-    """Returns the normal equations of the unknowns of the motion, with the structure eliminated.
+    """Returns the normal equations of the p unknowns of the motion, with the structure eliminated.
 
-    Args:
-        weight: (n,) robust weights; points of weight 0 are skipped.
+    Points of robust weight (n,) 0 are skipped.
 
     Returns:
-        For the p unknowns of `observations`: normal matrix (p, p), right-hand side (p,), and derivative (p, 3) of the
-        right-hand side with respect to biases of x, y and disparity in a that are the same at all points.
+        Normal matrix (p, p), right-hand side (p,), and derivative (p, 3) of the right-hand side with respect to biases
+        of x, y and disparity in a that are the same at all points.
     """
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     count = jacobian.shape[2]
@@ -203,14 +189,7 @@ def motion_normal_equations(observations, weight):
 
 @kernel
 def adjust_structure(observations, measured, update):
-    """Returns the adjusted points (n, 3) of stereo pair b, normalised (x, y, disparity), after an update of the motion.
-
-    Disparities are at least 1e-4, so that the points stay in front of the camera.
-
-    Args:
-        measured: `PairMeasurements` from which `observations` were computed.
-        update: (p,) solution of the normal equations.
-    """
+    """Returns the adjusted points (n, 3) of pair b after an update (p,) of the unknowns of the motion."""
     b, cov_b = measured.b, measured.cov_b
     structure = b.copy()
     remaining, weighted = np.empty(3), np.empty(3)

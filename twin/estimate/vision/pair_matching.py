@@ -16,7 +16,7 @@ from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
 from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.observation_equations import PairMeasurements, PixelLocking
-from twin.estimate.vision.stereo import Keyframe
+from twin.estimate.vision.stereo import Keyframe, StereoPoints
 
 _LEVELS = 2  # pyramid levels above the full image
 SEARCH_PX = 8.0  #: largest error of a predicted image position from which a point is found, with these levels [px]
@@ -47,14 +47,9 @@ class PairMatcher:
         self._workers.shutdown()
 
     def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[MatchedPair | None]:
-        """Matches the points of a node in both images of each of the other nodes, in two parallel threads.
+        """Returns, for each of the other nodes, the points of `node` matched in both images; None if it has no points.
 
-        Returns:
-            For each of the other nodes, the points measured in its stereo pair (a) and in that of `node` (b); None for
-            every node if `node` has no points.
-
-        Raises:
-            OSError: images could not be read or written.
+        Raises OSError if images could not be read or written.
         """
         points = node.points
         if points is None:
@@ -64,11 +59,7 @@ class PairMatcher:
         return list(self._workers.map(lambda other: self._match_pair(node, points, templates, other), others))
 
     def _match_pair(
-        self,
-        node: Keyframe,
-        points: stereo.StereoPoints,
-        templates: Sequence[patches.PatchTemplates],
-        other: Keyframe,
+        self, node: Keyframe, points: StereoPoints, templates: Sequence[patches.PatchTemplates], other: Keyframe
     ) -> MatchedPair:
         """Returns the points that were matched in both images of another node.
 
@@ -96,16 +87,13 @@ class PairMatcher:
         left_shift = patches.locking_shifts(left_px, left_warp[ok], self.patch_px)
         right_shift = patches.locking_shifts(right_px, right_warp[ok], self.patch_px)
         locking = stereo.fused_shift(left_shift, right_shift, measured_cov, rig)
-        return MatchedPair(
-            PairMeasurements(measured, node_points.measured, measured_cov, node_points.cov),
-            PixelLocking(locking, self._locking_in_node(node_points)),
-        )
+        pair = PairMeasurements(measured, node_points.measured, measured_cov, node_points.cov)
+        return MatchedPair(pair, PixelLocking(locking, self._locking_in_node(node_points)))
 
-    def _locking_in_node(self, points: stereo.StereoPoints) -> Array:
+    def _locking_in_node(self, points: StereoPoints) -> Array:
         """Returns the derivative (n, 3) [1/px] of a node's measurements with respect to the amplitude of pixel locking.
 
-        The measurements are normalised (x, y, disparity). The patches are centred at whole pixels of the left image, so
-        only their positions in the right image are biased.
+        The patches are centred at whole pixels of the left image, so only their positions in the right one are biased.
         """
         left_px, shift_px = self._project(points.measured)
         warp = np.tile(np.eye(2), (len(left_px), 1, 1))
@@ -113,7 +101,7 @@ class PairMatcher:
         right_shift = patches.locking_shifts(left_px - shift_px, warp, self.patch_px)
         return stereo.fused_shift(np.zeros_like(right_shift), right_shift, points.cov, self.rig)
 
-    def _in_view(self, points: stereo.StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
+    def _in_view(self, points: StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
         """Returns a mask (n,) of the points whose patches are predicted well inside both images of the other node."""
         smoothed = np.column_stack([points.measured[:, :2], points.mean_disparity_px / self.rig.focal_px])
         expected, _, _ = observation_equations.transfer(smoothed, other_from_node, self.rig.baseline_m)
@@ -122,10 +110,7 @@ class PairMatcher:
         return in_left & in_right
 
     def _project(self, points: Array) -> tuple[Array, Array]:
-        """Returns the left-image positions (n, 2) [px] of normalised points (n, 3), and their offsets (n, 2) [px].
-
-        An offset is (disparity, 0); the position in the right image is that in the left image minus the offset.
-        """
+        """Returns the left-image positions (n, 2) [px] of normalised points (n, 3), and (disparity, 0) (n, 2)."""
         left_px = points[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         return left_px, np.column_stack([points[:, 2] * self.rig.focal_px, np.zeros(len(points))])
 
@@ -133,10 +118,7 @@ class PairMatcher:
         """Estimates the pose of `node` in the axes of `other` from their matched points, jointly with the structure.
 
         The estimation starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the motion between the
-        current poses of the nodes if the closed form fails.
-
-        Returns:
-            The motion, or None if too few points are matched or too few of them are inliers.
+        current poses if that fails. None if too few points are matched or too few of them are inliers.
         """
         measured = matched.measured
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera

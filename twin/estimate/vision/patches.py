@@ -44,9 +44,7 @@ class PatchTemplates(NamedTuple):
     #: because it is too uniform, or not inside the image with a margin of one pixel.
     energy: Array
     gradient: NDArray[np.float32]  #: (n, 2, m) image gradient, with the nuisance parameters projected out
-    #: (n, 6, m) orthonormal basis of the nuisance parameters: brightness, contrast, and the linear gradients of both
-    #: with respect to column and row.
-    nuisance: NDArray[np.float32]
+    nuisance: NDArray[np.float32]  #: (n, 6, m) orthonormal basis of the nuisance parameters (`_NUISANCES`)
 
 
 class PatchMatches(NamedTuple):
@@ -54,8 +52,8 @@ class PatchMatches(NamedTuple):
 
     points: Array  #: (n, 2) positions in the target [px]
     ok: NDArray[np.bool_]  #: (n,) bool, true if the match converged and its correlation with the template is above 0.7
-    #: (n, 2, 2) covariance of the position due to the noise of one image, i.e. half the covariance due to the noise of
-    #: both, in the pixels and axes of the source image [px^2]; estimated from the texture and the residuals.
+    #: (n, 2, 2) covariance of the position due to the noise of one image, half of that of both, in the pixels and axes
+    #: of the source image [px^2]; estimated from the texture and the residuals.
     cov: Array
 
 
@@ -68,15 +66,7 @@ def pyramid(image: Image, levels: int) -> list[Image]:
 
 
 def extract_templates(images: Sequence[Image], points: NDArray[np.floating], patch_px: int) -> list[PatchTemplates]:
-    """Extracts the patches around points, at every level of a pyramid.
-
-    Args:
-        points: (n, 2) patch centres in the full image, at whole pixels.
-        patch_px: side of the patch (odd), the same at every level.
-
-    Returns:
-        The templates of each level.
-    """
+    """Returns the patches of side `patch_px` (odd) around points (n, 2) at whole pixels, at each level of a pyramid."""
     levels = []
     for level, image in enumerate(images):
         centres = np.round(points / 2.0**level).astype(np.int64)
@@ -125,15 +115,9 @@ def match_templates(
 
 
 def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floating], patch_px: int) -> Array:
-    """Returns the gradient of the disparity over each patch, from a plane fitted to the disparities.
+    """Returns the gradient (n, 2) of the disparity with respect to column and row over each patch; 0 where unknown.
 
-    Args:
-        disparity_px: (height, width) disparity map [px], NaN where unknown.
-        points: (n, 2) patch centres, whole pixels inside the map.
-        patch_px: side of the patch (odd).
-
-    Returns:
-        (n, 2) derivative of the disparity with respect to column and row [px/px]; 0 where it is unknown.
+    A plane is fitted to the disparity map (height, width) [px], NaN where unknown, around the whole pixels (n, 2).
     """
     return _slope(disparity_px, np.round(points).astype(np.int64), patch_px // 2)
 
@@ -195,7 +179,6 @@ def _slope(disparity, points, half):
 
 @kernel
 def _extract(source, centres, half):
-    """Returns energy (n,), gradient (n, 2, m) and nuisance basis (n, 6, m) of the patches, see `PatchTemplates`."""
     count, m = len(centres), (2 * half + 1) ** 2
     energy = np.zeros(count)
     gradient, nuisance = np.empty((count, 2, m), np.float32), np.empty((count, _NUISANCES, m), np.float32)
@@ -212,11 +195,9 @@ def _extract(source, centres, half):
 
 @kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _prepare(source, u0, v0, half, rows):
-    """Writes the nuisance basis (rows 0 to 5, orthonormal) and projected gradient (6 and 7) of a patch to `rows` (8,
-    m).
+    """Writes the nuisance basis (rows 0 to 5) and projected gradient (6 and 7) of a patch to `rows` (8, m).
 
-    Returns:
-        The sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
+    Returns the sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
     """
     side = 2 * half + 1
     mean = 0.0
@@ -256,7 +237,6 @@ def _prepare(source, u0, v0, half, rows):
 
 @kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _dot(a, b):
-    """Returns the dot product of two vectors (n,), summed in double precision."""
     total = 0.0
     for m in range(len(a)):
         total += float(a[m]) * float(b[m])
@@ -304,8 +284,7 @@ def _sample(spline, u0, v0, warp, half, values):
 def _match(energies, gradients, nuisances, spline, guess, warps, half, tolerance):
     """Matches patches at one pyramid level, in its pixels, until a step (|column| + |row|) is below `tolerance`.
 
-    Returns:
-        Positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where matching failed.
+    Returns positions (n, 2), correlations (n,) and covariances (n, 2, 2); the guess, -1 and zeros where it failed.
     """
     n = (2 * half + 1) ** 2
     height, width = spline.shape

@@ -22,12 +22,8 @@ class RepeatedImages:
 
     Noise changes every image of a live camera, so a repeated image means that the camera is frozen. Images without
     noise also repeat while the vehicle is at rest. They count as repeated only if the vehicle moves: it was faster at
-    the last new image than it can stop within a frame, or its sensors measure motion. A camera that is frozen stays so
-    until a new image arrives.
-
-    Args:
-        noisy: whether the images have noise.
-        noise: noise of the sensors that measure motion.
+    the last new image than it can stop within a frame, or its sensors, with this noise, measure motion. A camera that
+    is frozen stays so until a new image arrives.
     """
 
     def __init__(self, noisy: bool, noise: SensorNoise):

@@ -150,7 +150,7 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
 def corners_with_disparity(
     left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and their disparities (n,) [px]."""
+    """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and their disparities (n,)."""
     pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])

@@ -30,11 +30,7 @@ class TiledRaster:
         self._spooled: set[tuple[int, int]] = set()
 
     def read(self, row: int, col: int, rows: int, cols: int) -> Layers:
-        """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col).
-
-        Raises:
-            OSError: a tile could not be read from disk, or another one could not be moved to disk.
-        """
+        """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col). Raises OSError."""
         window = np.full((self.n_layers, max(rows, 0), max(cols, 0)), np.nan, np.float32)
         for key, in_tile, in_window in _overlapping_tiles(row, col, rows, cols):
             if key in self._tiles or key in self._spooled:
@@ -42,11 +38,7 @@ class TiledRaster:
         return window
 
     def write(self, row: int, col: int, window: Layers) -> None:
-        """Writes a window (n_layers, rows, cols) whose first cell is (row, col).
-
-        Raises:
-            OSError: a tile could not be read from disk, or another one could not be moved to disk.
-        """
+        """Writes a window (n_layers, rows, cols) whose first cell is (row, col). Raises OSError."""
         for key, in_tile, in_window in _overlapping_tiles(row, col, *window.shape[1:]):
             if key in self._tiles or key in self._spooled or not np.isnan(window[in_window]).all():
                 self._tile(key)[in_tile] = window[in_window]

@@ -42,8 +42,8 @@ class Motion(NamedTuple):
     a_from_b: Array  #: (4, 4) pose of the later camera b in the earlier camera a
     cov: Array  #: (6, 6) covariance of the motion [rotation, translation] (rad, m), in the axes of b
     n_points: int  #: number of inliers
-    #: robust standard deviation of the residuals: in normalised coordinates (`frame_motion`), divided by its expected
-    #: value (`pair_motion`), or in grey levels (`mosaic`); infinite for a predicted motion.
+    #: robust standard deviation of the residuals, divided by its expected value (`pair_motion`) or in grey levels
+    #: (`mosaic`); infinite for a predicted motion.
     residual: float
     #: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started; None if it
     #: started from another motion.
@@ -57,15 +57,13 @@ class PairMotionSettings(NamedTuple):
     """Stochastic model and number of iterations of `pair_motion`."""
 
     #: standard deviation of the biases of x, y and disparity, each of which is the same at all points; normalised.
-    #: Their effect does not average out over the points.
     common_sigma: float = 0.0
     variance_inflation: float = 1.0  #: factor on the covariance for correlated points (`matching.variance_inflation`)
     #: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has a large
     #: variance in `PairMeasurements.cov_a`.
     n_measured: int = 3
     iterations: int = 6  #: number of Gauss-Newton iterations
-    #: derivatives of the measurements with respect to the amplitude of pixel locking, which is then estimated with the
-    #: motion; None: the amplitude is not estimated.
+    #: with this, the amplitude of pixel locking is estimated together with the motion.
     locking: PixelLocking | None = None
     #: whether the covariance of the motion is computed from the residuals of the individual points (`_scatter_cov`),
     #: instead of from the covariances of the measurements and a common scale.
@@ -75,59 +73,22 @@ class PairMotionSettings(NamedTuple):
 _DEFAULT_SETTINGS = PairMotionSettings()
 
 
-def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Array) -> tuple[Array, Array]:
-    """Returns the weighted least-squares twist of the camera from flow and depth (Negahdaripour & Madjidi 2003, eq. 2).
+def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Array) -> Array:
+    """Returns the weighted least-squares twist (6,) of the camera from flow and depth, eq. (2).
 
     Args:
-        x, y: (n,) normalised image coordinates.
-        depth: (n,) depth [m].
-        flow: (n, 2) displacement of the normalised coordinates.
-        weight: (n,) weights of the points.
-
-    Returns:
-        Twist (6,) [rotation, translation] (rad, m) and normal matrix (6, 6).
+        x, y, depth: (n,) normalised image coordinates, and depth [m].
+        flow, weight: (n, 2), (n,) displacements of the normalised coordinates, and weights of the points.
     """
     normal, right = normal_equations(image_jacobian(x, y, depth), weight, flow)
-    return np.asarray(np.linalg.solve(normal, right), np.float64), normal
+    return np.asarray(np.linalg.solve(normal, right), np.float64)
 
 
-def frame_motion(points: Array, observed: Array, guess: Array, iterations: int = 4) -> Motion | None:
-    """Estimates the motion from 3-D points in one camera and their image positions in the next frame.
-
-    Iterates eq. (2) of Negahdaripour & Madjidi 2003 with Huber weights, which are 0 beyond five standard deviations.
-
-    Args:
-        points: (n, 3) positions in the earlier camera [m].
-        observed: (n, 2) normalised coordinates in the later image.
-        guess: (4, 4) initial pose of the later camera in the earlier one.
-
-    Returns:
-        The motion, or None if there are too few points or inliers, or a point is behind the later camera.
-    """
-    if len(points) < _MIN_POINTS:
-        return None
-    a_from_b, normal, weight, sigma = guess, np.eye(6), np.zeros(len(points)), 0.0
-    for _ in range(iterations):
-        xyz = geometry.transform(geometry.inverse(a_from_b), points)
-        if np.any(xyz[:, 2] <= 0):
-            return None
-        x, y = xyz[:, 0] / xyz[:, 2], xyz[:, 1] / xyz[:, 2]
-        residual = observed - np.stack([x, y], axis=1)
-        length = np.linalg.norm(residual, axis=1)
-        sigma = max(float(np.median(length)) / 1.1774, 1e-7)  # median of a Rayleigh distribution
-        weight = _huber_weights(length, sigma, cutoff=5.0)
-        twist, normal = closed_form_motion(x, y, xyz[:, 2], residual, weight)
-        a_from_b = a_from_b @ geometry.exp(twist)
-    n_points = int(np.count_nonzero(weight))
-    cov = np.asarray(np.linalg.inv(normal) * sigma**2, np.float64)
-    return None if n_points < _MIN_POINTS else Motion(a_from_b, cov, n_points, sigma)
-
-
-def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
+def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array, iterations: int = 4) -> Array | None:
     """Estimates the motion between two stereo pairs, taking the depth from the later pair b as exact.
 
-    Iterates the closed form of Negahdaripour & Madjidi 2003 (eq. 2) with Huber weights (`frame_motion`). This is fast,
-    but depth errors bias the estimate. The disparity in the earlier pair a is not used.
+    Iterates the closed form, eq. (2), with Huber weights that are 0 beyond five standard deviations. This is fast, but
+    depth errors bias the estimate. The disparity in the earlier pair a is not used.
 
     Args:
         a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
@@ -137,8 +98,18 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
         (4, 4) pose of b in a, or None if there are too few points or inliers, or a point is behind camera a.
     """
     points = np.column_stack([b[:, :2], np.ones(len(b))]) * baseline_m / b[:, 2:]
-    motion = frame_motion(points, a[:, :2], geometry.inverse(guess))
-    return None if motion is None else geometry.inverse(motion.a_from_b)
+    b_from_a, weight = geometry.inverse(guess), np.zeros(len(b))
+    for _ in range(iterations if len(b) >= _MIN_POINTS else 0):
+        xyz = geometry.transform(geometry.inverse(b_from_a), points)
+        if np.any(xyz[:, 2] <= 0):
+            return None
+        x, y = xyz[:, 0] / xyz[:, 2], xyz[:, 1] / xyz[:, 2]
+        residual = a[:, :2] - np.stack([x, y], axis=1)
+        length = np.linalg.norm(residual, axis=1)
+        sigma = max(float(np.median(length)) / 1.1774, 1e-7)  # median of a Rayleigh distribution
+        weight = _huber_weights(length, sigma, cutoff=5.0)
+        b_from_a = b_from_a @ geometry.exp(closed_form_motion(x, y, xyz[:, 2], residual, weight))
+    return None if np.count_nonzero(weight) < _MIN_POINTS else geometry.inverse(b_from_a)
 
 
 def _huber_weights(size: Array, sigma: float, cutoff: float) -> Array:
@@ -183,10 +154,8 @@ def pair_motion(
         return pair_motion(measured, baseline_m, guess, settings._replace(locking=None))
     if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
         return None
-    return Motion(
-        a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale,
-        disparity_offset=_disparity_offset(normals, settings),
-    )  # fmt: skip
+    n_points, offset = int(np.count_nonzero(normals.weight)), _disparity_offset(normals, settings)
+    return Motion(a_from_b, _pair_cov(normals, settings), n_points, normals.scale, disparity_offset=offset)
 
 
 class _WeightedNormals(NamedTuple):

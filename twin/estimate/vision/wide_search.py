@@ -30,9 +30,7 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
     """Returns whether the predicted image positions of the points may be wrong by more than a search range [px].
 
     That is, if three times the median standard deviation of the positions, along its largest direction, exceeds it.
-
-    Args:
-        cov: (6, 6) covariance of the predicted motion [rotation, translation] (rad, m), in the axes of the node.
+    `cov` (6, 6) is that of the predicted motion, in the axes of the node.
     """
     x, y, disparity = np.ascontiguousarray(points.measured.T)
     depth_m = rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX / rig.focal_px)
@@ -44,13 +42,8 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
 def agrees(found: Array, found_cov: Array, predicted: Array, cov: Array) -> bool:
     """Returns whether a measured motion lies within the errors of itself and its prediction (chi-square, 99.99 %).
 
-    Where the texture repeats, features of the whole images may agree on a motion that is wrong by a period.
-
-    Args:
-        found, predicted: (4, 4) motions between the same two cameras.
-        found_cov: (6, 6) covariance of `found` [rotation, translation] (rad, m), in the axes of the second camera.
-        cov: (6, 6) that of the prediction. As a difference of accumulated covariances it may have negative eigenvalues,
-            which count as zero.
+    Where the texture repeats, features of the whole images may agree on a motion that is wrong by a period. `cov`, as a
+    difference of accumulated covariances, may have negative eigenvalues, which count as zero.
     """
     error = geometry.log(geometry.inverse(predicted) @ found)
     values, axes = np.linalg.eigh((cov + cov.T) / 2)
@@ -63,12 +56,8 @@ def coarse_motion(
 ) -> Array | None:
     """Returns the pose (4, 4) of the left camera of a node in that of another node; None if too few features agree.
 
-    SIFT features (Lowe 2004) get their depth from the nearest stereo point within one patch side; the pose is that of
-    perspective-n-point with RANSAC. Its error of one or two pixels suffices to predict the measurement of a link.
-
-    Args:
-        node, other: (H, W) grey levels of the left images.
-        patch_px: largest distance of a feature from a stereo point [px].
+    SIFT features (Lowe 2004) of the left images get their depth from the nearest stereo point within `patch_px`; the
+    pose is that of perspective-n-point with RANSAC. Its error of a pixel or two suffices to predict a link.
     """
     sift = cv2.SIFT.create(nfeatures=_MOST_FEATURES)
     node_px, node_descriptors = _features(sift, node)
@@ -91,9 +80,8 @@ def coarse_motion(
     n = 0 if not ok or inliers is None else len(inliers)
     if n < max(_MIN_INLIERS, _MIN_INLIER_SHARE * len(xyz)):
         return None
-    return geometry.pose(
-        geometry.so3_exp(np.asarray(rotation, np.float64).ravel()), np.asarray(translation, np.float64).ravel()
-    )
+    rotation, translation = (np.asarray(part, np.float64).ravel() for part in (rotation, translation))
+    return geometry.pose(geometry.so3_exp(rotation), translation)
 
 
 def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
