@@ -99,7 +99,7 @@ MUTANTS = [
         ("twin/estimate/adjustment/pose_graph.py", "damping / 10 if damping > _MIN_DAMPING else 0.0", "damping * 10 if damping > _MIN_DAMPING else 0.0", "estimate_pose_graph"),
         ("twin/estimate/adjustment/pose_graph.py", "shared = (-equations.shared_gradient - float(np.sum(equations.border * poses))) / information", "shared = -equations.shared_gradient / information", "estimate_pose_graph estimate_aiding"),
         ("twin/estimate/link_selection.py", "return 1 / (1 - min(overlap, _LARGEST_OVERLAP))", "return 1 / (2 - min(overlap, _LARGEST_OVERLAP))", "estimate_network estimate_link_noise"),
-        ("twin/estimate/self_check.py", "lost = quality.frames_lost / max(len(result.online), 1)", "lost = quality.frames_lost / max(2 * len(result.online), 1)", "estimate_self_check"),
+        ("twin/estimate/self_check.py", "quality.frames_lost / max(n, 1), MAX_FRAMES_LOST", "quality.frames_lost / max(2 * n, 1), MAX_FRAMES_LOST", "estimate_self_check"),
         # judge
         ("twin/judge/consistency.py", "in_camera = np.einsum(\"nji,nj->ni\"", "in_camera = np.einsum(\"nij,nj->ni\"", "judge_metrics judge_trajectory"),
         ("twin/judge/consistency.py", "tail = (1 - share) / 2", "tail = 1 - share", "judge_metrics judge_trajectory"),

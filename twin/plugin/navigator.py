@@ -133,6 +133,4 @@ class PluginNavigator(Navigator):
         if points is None:
             return None
         depth_m = float(np.median(points.xyz[:, 2]))
-        return Keyframe(
-            number, row, track, self._pose, points, frame.readings, depth_m=depth_m, exposure=frame.exposure
-        )
+        return Keyframe(number, row, track, self._pose, points, frame.readings, depth_m, frame.exposure)

@@ -6,7 +6,7 @@ image noise. The standard deviation of the measured shift between two patches of
 c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound). Veil and unevenness of the light do not move with the floor, so
 the image of a floor with the same mean albedo, but without texture, is subtracted.
 
-In turbid water most corners of the full image are noise. The estimators then bin the images (`image_scale`), and the
+In turbid water most corners of the full image are noise. The estimators then bin the images (`choose_binning`), and the
 bound is that of the binned images, in their pixels.
 """
 

@@ -112,13 +112,8 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         sigma = np.sqrt(unit_variance * np.maximum(mean_square, noise))
         window_px = _choose_window_sigma(_measurement_sigma(sigma, gain), fitted, window_px)
     known = (fitted >= 0) & (mean_square < 2 * (1 - MIN_CORRELATION) * _contrast(reference))
-    return Refinement(
-        np.where(known, fitted, np.nan).astype(np.float32),
-        np.where(known, sigma, np.nan).astype(np.float32),
-        np.where(known, gain, np.nan).astype(np.float32),
-        float(noise_variance**0.5),
-        inflation,
-    )
+    disparity_px, sigma, gain = (np.where(known, layer, np.nan).astype(np.float32) for layer in (fitted, sigma, gain))
+    return Refinement(disparity_px, sigma, gain, float(noise_variance**0.5), inflation)
 
 
 def _measurement_sigma(sigma: Map, gain: Map) -> Map:
@@ -321,19 +316,11 @@ def _fit_planes(disparity, residual, slope, locking, noise, window, support, pri
         for j in range(max(-half, -v), min(half, height - 1 - v) + 1):
             for i in range(-half, half + 1):
                 lo, hi = max(0, -i), min(width, width - i)
-                neighbours = slice(lo + i, hi + i)
+                neighbours, weight = (v + j, slice(lo + i, hi + i)), window[j + half] * window[i + half]
                 _accumulate(
-                    sums[:, lo:hi],
-                    disparity[v, lo:hi],
-                    disparity[v + j, neighbours],
-                    residual[v + j, neighbours],
-                    slope[v + j, neighbours],
-                    locking[v + j, neighbours],
-                    np.float32(i),
-                    np.float32(j),
-                    window[j + half] * window[i + half],
-                    support,
-                )
+                    sums[:, lo:hi], disparity[v, lo:hi], disparity[neighbours], residual[neighbours],
+                    slope[neighbours], locking[neighbours], np.float32(i), np.float32(j), weight, support,
+                )  # fmt: skip
         for u in range(width):
             if disparity[v, u] < 0:
                 continue

@@ -6,13 +6,11 @@ point [focal lengths], the normalised row of a point at (x, y) changes by
     dy = w_x (1 + y^2) - w_y x y - w_z x + e
 
 (Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed from the right image; yaw is not, because a
-distortion error looks nearly the same and a wrong yaw would shift all disparities. `RegionMeans` separates matching
+distortion error looks nearly the same and a wrong yaw would shift all disparities. `_pattern` separates matching
 noise, which averages out in a region of the image, from errors of the calibration.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -37,36 +35,21 @@ _MAD_TO_SIGMA = 1.4826
 _REGIONS = (4, 3)  # regions of the image along columns and rows
 
 
-class RegionMeans(NamedTuple):
-    """Weighted sums of the row differences in each of m regions of the image, from which their means follow."""
+def _pattern(regions: Array, estimate: Array) -> float:
+    """Returns the weighted RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
 
-    weight: Array  #: (m,) sum of the weights, which is the inverse variance of the mean row difference
-    rows: Array  #: (m,) weighted sum of the normalised row differences
-    jacobian: Array  #: (m, 4) weighted sum of the derivatives of the row differences (`row_jacobian`)
+    The weighted sum of the squared means has the expectation m - 4 due to matching noise, which is subtracted, for m
+    regions with observations. The unit is the focal length; 0 without observations.
 
-    def plus(self, region: NDArray[np.int64], weight: Array, rows: Array, jacobian: Array) -> RegionMeans:
-        """Returns the sums with n more row differences (n,), in the regions (n,), with weights and derivatives."""
-        terms = np.column_stack([weight, weight * rows, weight[:, None] * jacobian])
-        sums = np.zeros((len(self.weight), terms.shape[1]))
-        np.add.at(sums, region, terms)
-        return RegionMeans(self.weight + sums[:, 0], self.rows + sums[:, 1], self.jacobian + sums[:, 2:])
-
-    def pattern(self, estimate: Array) -> float:
-        """Returns the weighted RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
-
-        The weighted sum of the squared means has the expectation m - 4 due to matching noise, which is subtracted, for
-        m regions with observations. The unit is the focal length; 0 without observations.
-        """
-        seen = self.weight > 0
-        weight = self.weight[seen]
-        mean = (self.rows[seen] - self.jacobian[seen] @ estimate) / weight
-        excess = float(np.sum(weight * mean**2)) - max(len(weight) - len(estimate), 0)
-        return float(np.sqrt(max(excess, 0.0) / np.sum(weight))) if len(weight) else 0.0
-
-
-def _no_regions() -> RegionMeans:
-    n = _REGIONS[0] * _REGIONS[1]
-    return RegionMeans(np.zeros(n), np.zeros(n), np.zeros((n, 4)))
+    Args:
+        regions: (m, 6) for each region of the image, the sums of the weights, which are inverse variances, of the
+            weighted normalised row differences, and of their weighted derivatives (`row_jacobian`).
+    """
+    regions = regions[regions[:, 0] > 0]
+    weight, rows, jacobian = regions[:, 0].copy(), regions[:, 1], regions[:, 2:].copy()
+    mean = (rows - jacobian @ estimate) / weight
+    excess = float(np.sum(weight * mean**2)) - max(len(weight) - len(estimate), 0)
+    return float(np.sqrt(max(excess, 0.0) / np.sum(weight))) if len(weight) else 0.0
 
 
 class EpipolarCalibration:
@@ -79,7 +62,7 @@ class EpipolarCalibration:
     def __init__(self) -> None:
         self._information = np.diag(_PRIOR_SIGMA**-2)
         self._vector = np.zeros(4)
-        self._regions = _no_regions()
+        self._regions = np.zeros((_REGIONS[0] * _REGIONS[1], 6))  # see `_pattern`
         self.removed = np.zeros(4)
 
     def add(self, points: StereoPoints, rig: StereoRig, patch_px: int) -> None:
@@ -97,7 +80,9 @@ class EpipolarCalibration:
             estimate = np.linalg.solve(information, self._vector + jacobian.T @ (weight * rows))
         self._information = self._information + jacobian.T @ (weight[:, None] * jacobian)
         self._vector = self._vector + jacobian.T @ (weight * rows)
-        self._regions = self._regions.plus(_region(points.pixels, rig), weight, rows, jacobian)
+        terms, sums = np.column_stack([weight, weight * rows, weight[:, None] * jacobian]), np.zeros_like(self._regions)
+        np.add.at(sums, _region(points.pixels, rig), terms)
+        self._regions = self._regions + sums
 
     @property
     def estimate(self) -> Array:
@@ -123,7 +108,7 @@ class EpipolarCalibration:
         if not np.any((size > _SIGNIFICANT * shift_sigma) & (size * rig.focal_px > NOTICEABLE_PX)):
             return False
         self.removed = self.removed + change
-        self._regions = _no_regions()  # before, matches with large row differences were rejected
+        self._regions = np.zeros_like(self._regions)  # before, matches with large row differences were rejected
         return True
 
     def rectify(self, right: Image, rig: StereoRig) -> Image:
@@ -143,7 +128,7 @@ class EpipolarCalibration:
     def report(self) -> EpipolarError:
         """Returns the estimated errors with standard deviations, the part that `rectify` removes, and the pattern."""
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
-        return EpipolarError(self.estimate, sigma, self.removed.copy(), self._regions.pattern(self.estimate))
+        return EpipolarError(self.estimate, sigma, self.removed.copy(), _pattern(self._regions, self.estimate))
 
 
 def row_jacobian(x: Array, y: Array) -> Array:
