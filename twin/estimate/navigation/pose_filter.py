@@ -159,7 +159,7 @@ class PoseFilter:
 
     @property
     def state(self) -> DeadReckoningState:
-        """The state of dead reckoning at the last frame; `dead_reckon` advances it by one frame."""
+        """Returns the state of dead reckoning at the last frame; `dead_reckon` advances it by one frame."""
         cov = np.ascontiguousarray(self.cov)
         return DeadReckoningState(self.f2f, self.world_from_camera, cov, self.since_node, self.since_node_cov)
 

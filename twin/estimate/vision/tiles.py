@@ -33,15 +33,18 @@ class TiledRaster:
         """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col). Raises OSError."""
         window = np.full((self.n_layers, max(rows, 0), max(cols, 0)), np.nan, np.float32)
         for key, in_tile, in_window in _overlapping_tiles(row, col, rows, cols):
-            if key in self._tiles or key in self._spooled:
+            if self._exists(key):
                 window[in_window] = self._tile(key)[in_tile]
         return window
 
     def write(self, row: int, col: int, window: Layers) -> None:
         """Writes a window (n_layers, rows, cols) whose first cell is (row, col). Raises OSError."""
         for key, in_tile, in_window in _overlapping_tiles(row, col, *window.shape[1:]):
-            if key in self._tiles or key in self._spooled or not np.isnan(window[in_window]).all():
+            if self._exists(key) or not np.isnan(window[in_window]).all():
                 self._tile(key)[in_tile] = window[in_window]
+
+    def _exists(self, key: tuple[int, int]) -> bool:
+        return key in self._tiles or key in self._spooled
 
     def clear(self) -> None:
         """Removes all tiles from memory and from disk."""
