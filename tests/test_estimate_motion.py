@@ -71,7 +71,6 @@ def pair_motion(a, b, sigma, guess):
 
 def test_too_few_points_give_no_motion():
     points = floor_points(np.random.default_rng(3), 8)
-    assert two_view_motion.frame_motion(points, points[:, :2] / points[:, 2:], np.eye(4)) is None
     a, b = measure(points, np.eye(4))
     assert pair_motion(a, b, np.full(3, 1e-3), np.eye(4)) is None
     assert two_view_motion.exact_depth_motion(a, b, BASELINE_M, np.eye(4)) is None
@@ -164,13 +163,10 @@ def test_eq_2_is_biased_by_noise_of_depth_and_joint_estimation_is_not():
     exact_depth, joint = [], []
     for _ in range(40):
         a, b = (z + rng.normal(size=z.shape) * sigma for z in measure(floor_points(rng, 200), true))
-        points = np.column_stack([a[:, :2], np.ones(len(a))]) * BASELINE_M / a[:, 2:]
-        first, second = (
-            two_view_motion.frame_motion(points, b[:, :2], true),
-            pair_motion(a, b, sigma, true),
-        )
+        first = two_view_motion.exact_depth_motion(b, a, BASELINE_M, geometry.inverse(true))
+        second = pair_motion(a, b, sigma, true)
         assert first is not None and second is not None
-        exact_depth.append(first.a_from_b[0, 3] - 0.4)
+        exact_depth.append(geometry.inverse(first)[0, 3] - 0.4)
         joint.append(second.a_from_b[0, 3] - 0.4)
     assert abs(np.mean(joint)) < 0.5 * abs(np.mean(exact_depth))
 
