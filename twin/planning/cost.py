@@ -57,7 +57,8 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
     size = mission.n_frames, n_keyframes, megapixels
     if mission.scenario.imaging.fidelity == "surrogate":
         return ComputingCost(_SURROGATE_S.total(*size), _SURROGATE_MB, _SURROGATE_DISK_MB.total(*size))
-    window = round(n_keyframes * min(1.0, (mission.scenario.estimate.window_tracks + 1) / len(mission.tracks)))
+    window_tracks = mission.scenario.estimator_settings().window_tracks
+    window = round(n_keyframes * min(1.0, (window_tracks + 1) / len(mission.tracks)))
     memory_mb = _RENDERED_MB.total(mission.n_frames, window, megapixels) + _IMAGES_MB_PER_MPX * megapixels
     return ComputingCost(_RENDERED_S.total(*size), memory_mb + _floor_mb(mission), _RENDERED_DISK_MB.total(*size))
 
