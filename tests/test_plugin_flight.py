@@ -11,7 +11,7 @@ from twin.core.records import Trajectory
 from twin.errors import ScenarioError, TwinError
 from twin.plugin import guard
 from twin.plugin.guard import GuardedPlugin, PluginFailed
-from twin.world.floor import load_terrain
+from twin.world.height_floor import load_terrain
 from twin.world.mission import prepare
 
 pytestmark = pytest.mark.long

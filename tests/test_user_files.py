@@ -18,7 +18,7 @@ import trimesh
 from rasterio.transform import from_origin
 
 from twin import terrains
-from twin.core.user_files import read_bytes, read_json, read_text
+from twin.core.user_files import path_problem, read_bytes, read_json, read_text
 from twin.datasets.text_files import read_yaml
 from twin.errors import TwinError
 from twin.report.comparison import load_runs
@@ -299,3 +299,19 @@ def test_only_twin_errors_come_out_of_damaged_files(tmp_path):
 def report_memory():
     """Prints the largest memory of this program [kB]; `ru_maxrss` would include that of the process that started it."""
     print(re.search(r"VmHWM:\s+(\d+) kB", Path("/proc/self/status").read_text())[1])
+
+
+def test_links_to_themselves_and_to_missing_files_are_problems_and_new_paths_are_not(tmp_path):
+    loop, dangling = tmp_path / "loop", tmp_path / "dangling"
+    loop.symlink_to("loop")
+    dangling.symlink_to("nothing")
+    for path in (loop, loop / "run"):
+        assert "symbolic links" in (path_problem(path) or "")
+    assert "missing file" in (path_problem(dangling) or "")
+    for path in (tmp_path, tmp_path / "new" / "run"):
+        assert path_problem(path) is None
+
+
+@pytest.mark.parametrize(("name", "reason"), [("a\0b", "null byte"), ("x" * 300, "too long")])
+def test_an_invalid_name_is_a_problem(tmp_path, name, reason):
+    assert reason in (path_problem(tmp_path / name) or "")

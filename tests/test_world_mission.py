@@ -6,7 +6,7 @@ import pytest
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.surrogate import matchability
-from twin.world.floor import load_terrain
+from twin.world.height_floor import load_terrain
 from twin.world.mission import prepare
 
 BAD_BEACONS = [

@@ -19,8 +19,8 @@ from twin.estimate.pipeline import Navigator
 from twin.scenario.model import Scenario
 from twin.session.assembly import make_navigator, open_world
 from twin.session.mission_actions import MissionActions
-from twin.world.flight import Flight
 from twin.world.mission import Mission, prepare
+from twin.world.mission_flight import Flight
 from twin.world.pace import FULL, Pace
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World

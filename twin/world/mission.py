@@ -28,7 +28,7 @@ from twin.simulate.hull import physics_timestep_s
 from twin.simulate.inertial_sensor import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.asked_area import extent_of
-from twin.world.floor import load_terrain
+from twin.world.height_floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
 from twin.world.pace import SAME_TIME_S, Pace
