@@ -1,5 +1,6 @@
 """Replay of a recorded data set: path, map and report without a simulator; swapped cameras, clocks, preview."""
 
+import json
 import re
 import runpy
 import shutil
@@ -23,7 +24,7 @@ from twin.errors import TwinError
 from twin.estimate.first_pair import floor_plane, inspect_pair
 from twin.exchange.geotiff import write_elevations
 from twin.plugin import loading
-from twin.recordings import preview, replay
+from twin.recordings import opened_dataset, preview, replay
 from twin.recordings.frames import RecordedFrames
 from twin.recordings.replay import ReplayOptions, alignment_name, bayer_pattern, open_dataset
 from twin.report import recording, survey_page
@@ -115,6 +116,8 @@ def test_a_replay_without_a_tenth_of_its_frames_is_degraded(frames, tmp_path):
     found = twin.replay(folder, tmp_path / "run", ReplayOptions(outputs=())).metrics
     assert found["status"] == "degraded"
     assert found["reason"] == "2 of 10 frames of the data set could not be used, see replay.skipped"
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [line["check"] for line in log if line["event"] == "finding"] == ["frames_used"]
 
 
 class Known:
@@ -259,7 +262,7 @@ def test_an_interrupt_before_the_first_frame_leaves_a_run_folder(euroc, tmp_path
 
 
 def test_an_interrupt_of_the_evaluation_ends_this_stage_only(euroc, replayed, tmp_path, monkeypatch):
-    monkeypatch.setattr(replay, "evaluate_replay", interrupt)
+    monkeypatch.setattr("twin.session.conclusion.evaluate", interrupt)
     found = twin.replay(euroc, tmp_path / "run", ReplayOptions(outputs=()))
     assert found.status == "aborted" and found.metrics["reason"] == "interrupted; evaluation skipped"
     assert found.elevation is not None and (tmp_path / "run" / "dem.tif").exists()
@@ -461,12 +464,12 @@ def test_pairs_too_far_apart_for_tracking_are_linked_directly(tmp_path):
 def test_the_truth_is_sorted_and_of_equal_times_the_first_pose_counts():
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 0, 3] = [2, 0, 1, 9]
-    found = replay._ordered(Trajectory(np.array([2.0, 0.0, 1.0, 1.0]), poses), "truth.txt")
+    found = opened_dataset._ordered(Trajectory(np.array([2.0, 0.0, 1.0, 1.0]), poses), "truth.txt")
     np.testing.assert_array_equal(found.times_s, [0, 1, 2])
     np.testing.assert_array_equal(found.positions[:, 0], [0, 1, 2])
     poses[2, 1, 3] = 1e200
     with pytest.raises(TwinError, match=r"truth.txt: a coordinate of a true position is 1e.200 m"):
-        replay._ordered(Trajectory(np.arange(4.0), poses), "truth.txt")
+        opened_dataset._ordered(Trajectory(np.arange(4.0), poses), "truth.txt")
 
 
 def test_topics_of_a_data_set_that_is_no_bag_are_refused(euroc):

@@ -10,9 +10,12 @@ import pytest
 from twin.core.links import Link, Links
 from twin.core.quality import EpipolarError, EstimationQuality, Finding
 from twin.core.records import ElevationMap, Estimate, Frame, SurveyResult, Trajectory
+from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
 from twin.estimate.alignment import _mean_chi2
+from twin.estimate.stereo_vision import StereoVision
 from twin.scenario.file import load_scenario
+from twin.session.assembly import make_navigator
 from twin.session.conclusion import status
 from twin.session.flown_survey import plugin_notes
 from twin.session.monitor import SurveyMonitor
@@ -143,3 +146,12 @@ def test_findings_degrade_a_survey_and_an_abort_outranks_them():
 def test_the_chi_square_of_links_is_that_of_their_own_covariances():
     links = Links(Link(0, k, np.eye(4), 3 * np.eye(6), 0.8, 100, shared_by=3) for k in (1, 2))
     assert _mean_chi2(links, np.array([2.0, 4.0])) == pytest.approx(3 * 3.0 / 6)
+
+
+def test_the_threads_that_store_images_end_with_the_estimators(tmp_path, monkeypatch):
+    closed = []
+    monkeypatch.setattr(StereoVision, "close", lambda self: closed.append(self))
+    rendered = prepare(load_scenario("quickstart"))
+    with make_navigator(rendered, SimpleNamespace(), tmp_path, Stopwatch()) as navigator:
+        assert closed == []
+    assert closed == [navigator.vision]

@@ -47,7 +47,8 @@ def _keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
     in_world = anchored[:, :3, 3] - true[frames, :3, 3]
     in_camera = np.einsum("nji,nj->ni", anchored[:, :3, :3], in_world)
     cov = np.asarray(result.node_cov)[1:n, 3:, 3:]
-    usable = _positive_definite(cov)
+    finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
+    usable = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0] > 0
     return in_camera[usable], cov[usable]
 
 
@@ -71,10 +72,3 @@ def nees_interval(independent_errors: float | None, share: float = 0.99) -> tupl
     tail = (1 - share) / 2
     low, high = chi2.ppf([tail, 1 - tail], 3 * independent_errors) / independent_errors
     return float(low), float(high)
-
-
-def _positive_definite(cov: Array) -> np.ndarray:
-    """Returns whether each of the matrices (n, d, d) is finite and positive definite, (n,) bool."""
-    finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
-    smallest = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0]
-    return np.asarray(smallest > 0)

@@ -10,28 +10,16 @@ from twin.errors import TwinError
 
 #: Prefixes of metrics whose limit is a lower bound. The limit of every other metric is an upper bound.
 MORE_IS_BETTER = (
-    "map.completeness",
-    "timing.real_time_factor",
-    "overlap.",
-    "consistency.within_",
-    "vision.points_",
-    "vision.contrast_",
-    "orthomosaic.coverage_",
-    "orthomosaic.matched",
-)
+    "map.completeness", "timing.real_time_factor", "overlap.", "consistency.within_", "vision.points_",
+    "vision.contrast_", "orthomosaic.coverage_", "orthomosaic.matched",
+)  # fmt: skip
 
 #: Metrics that can be negative, for which the ratio of two values has no meaning.
 SIGNED = (
-    "map.bias_m",
-    "orthomosaic.bias_east_m",
-    "orthomosaic.bias_north_m",
-    "self_check.disparity_offset",
-    "self_check.pitch_deg",
-    "self_check.roll_deg",
-    "self_check.row_offset_px",
-    "self_check.row_shift",
+    "map.bias_m", "orthomosaic.bias_east_m", "orthomosaic.bias_north_m", "self_check.disparity_offset",
+    "self_check.pitch_deg", "self_check.roll_deg", "self_check.row_offset_px", "self_check.row_shift",
     "self_check.yaw_deg",
-)
+)  # fmt: skip
 
 
 def judge_requirements(limits: Mapping[str, float], metrics: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

@@ -155,7 +155,7 @@ def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions
 def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Trajectory | None:
     """Returns the true poses of the rectified left camera, in the order of time, at times relative to the first frame.
 
-    Of several poses at the same time, only the first one is kept. Returns None without a truth.
+    Returns None without a truth.
 
     Raises:
         TwinError: the truth is damaged or has no poses, a true position is impossible, or there are several frames and
@@ -164,17 +164,27 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
     truth, source = _sound(dataset.truth if file is None else read_truth(file, dataset)), str(file or dataset.folder)
     if truth is None:
         return None
+    truth = _ordered(truth, source)
+    poses = truth.world_from_camera @ frames.rectification.left_from_rectified
+    moved = Trajectory(truth.times_s - frames.start_s, poses)
+    times_s = np.array([frame.time_s for frame in dataset.images]) - frames.start_s
+    if len(times_s) > 1 and len(associate(times_s, moved.times_s).estimate) == 0:
+        span = f"{truth.times_s.min():.3f} to {truth.times_s.max():.3f} s"
+        given = f"{frames.start_s:.3f} to {frames.start_s + times_s.max():.3f} s"
+        raise TwinError(source, f"the truth is of another clock: {span}", f"the times of the frames, {given}")
+    return moved
+
+
+def _ordered(truth: Trajectory, source: str) -> Trajectory:
+    """Returns the true poses in the order of time; of several poses at the same time, only the first one is kept.
+
+    Raises:
+        TwinError: there are no poses, or a coordinate of a position is larger than 1e8 m or not a number.
+    """
     if not len(truth):
         raise TwinError(source, "the truth has no poses", "true poses at the times of the frames")
     largest_m = float(np.abs(truth.positions).max())
     if not largest_m <= _FARTHEST_M:
         raise TwinError(source, f"a coordinate of a true position is {largest_m:g} m", f"up to {_FARTHEST_M:g} m")
-    recorded_s, first = np.unique(truth.times_s, return_index=True)
-    poses = truth.world_from_camera[first] @ frames.rectification.left_from_rectified
-    moved = Trajectory(recorded_s - frames.start_s, poses)
-    times_s = np.array([frame.time_s for frame in dataset.images]) - frames.start_s
-    if len(times_s) > 1 and len(associate(times_s, moved.times_s).estimate) == 0:
-        span = f"{recorded_s.min():.3f} to {recorded_s.max():.3f} s"
-        given = f"{frames.start_s:.3f} to {frames.start_s + times_s.max():.3f} s"
-        raise TwinError(source, f"the truth is of another clock: {span}", f"the times of the frames, {given}")
-    return moved
+    times_s, first = np.unique(truth.times_s, return_index=True)
+    return Trajectory(times_s, truth.world_from_camera[first])
