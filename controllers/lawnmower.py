@@ -1,10 +1,9 @@
 """Lawnmower survey: L tracks of two legs, joined by short segments (Negahdaripour & Madjidi 2003, section III-A).
 
-By default the bow always points along the first leg (east if the heading is 0), and every second leg is flown
-backwards, so the images of all legs have the same orientation. With `turns` = "bow_first" the vehicle turns by 180
-degrees at the end of each leg except the last, alternately counter-clockwise and clockwise so that a tether is not
-twisted. In both cases consecutive keyframes are displaced along the image height, neighbouring swaths along the image
-width.
+By default every second leg is flown backwards, so the images of all legs have the same orientation. With `turns` =
+"bow_first" the vehicle turns by 180 degrees at the end of each leg except the last, alternately counter-clockwise and
+clockwise so that a tether is not twisted. Consecutive keyframes are displaced along the image height, neighbouring
+swaths along the image width.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from twin.controllers.survey_plan import (
     SurveyPlan,
     SurveyRequest,
     check_request,
-    frames_per_keyframe,
     n_tracks_to_fly,
+    survey_plan,
 )
 
 
@@ -32,11 +31,9 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     """Plans a lawnmower survey of an area (Negahdaripour & Madjidi 2003, section III-A).
 
     The legs run along the heading of the area. Their distance is at most (1 - overlap_across) ImgSize Altitude /
-    FocalLength (ImgSize is the image width), times `across_scale` of the request. The extent of the area is divided
-    into an even number of strips of equal width, with a leg along the centre line of each; the first leg is the
-    rightmost as seen along the heading. In a polygon, a leg spans the extent of the polygon within its strip. Where
-    two neighbouring legs are joined, the one that ends first is extended to the end of the other, so that the segment
-    between them is perpendicular to both.
+    FocalLength (ImgSize is the image width), times `across_scale`. The area is divided into an even number of strips of
+    equal width, with a leg along the centre line of each, spanning the extent of the area within its strip; the first
+    leg is the rightmost as seen along the heading. Where two legs are joined, the one that ends first is extended.
 
     Raises:
         TwinError: a requirement is invalid or cannot be met.
@@ -51,22 +48,16 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     spacing_m = width_m / (2 * n_filling)
     legs = _leg_extents(area, spacing_m, 2 * n_filling)
     corners = [_corners(area, legs, spacing_m, track, last=track == n_tracks) for track in range(1, n_tracks + 1)]
-    return SurveyPlan(
+    return survey_plan(
+        request,
         paths=tuple(_track(request, area, track) for track in corners),
         area=area,
-        altitude_m=request.altitude_m,
         speed_mps=request.speed_mps,
-        frame_rate_hz=request.frame_rate_hz,
-        n_frames_per_keyframe=frames_per_keyframe(request, request.speed_mps),
         swath_length_m=float(np.mean([end - start for start, end in legs])),
         swath_spacing_m=spacing_m,
         n_tracks_to_fill=n_filling,
-        footprint_m=request.footprint_m,
         side_along_m=request.footprint_m[1],
         side_across_m=request.footprint_m[0],
-        focal_px=float(request.focal_px),
-        acceleration_mps2=request.acceleration_mps2,
-        surface=request.surface,
     )
 
 
@@ -79,11 +70,7 @@ def _leg_extents(area: SurveyArea, spacing_m: float, n_legs: int) -> list[tuple[
 def _corners(
     area: SurveyArea, legs: list[tuple[float, float]], spacing_m: float, track: int, last: bool
 ) -> list[tuple[float, float]]:
-    """Returns the corners (u, v) of a track (numbered from 1) in the axes of the legs [m].
-
-    They are the two ends of the first leg, the two ends of the return leg and, unless `last`, the start of the next
-    track.
-    """
+    """Returns the corners (u, v) [m] of a track: the ends of its two legs and, unless `last`, the start of the next."""
     first = 2 * (track - 1)  # index of the track's first leg
     south = (2 * track - 1.5) * spacing_m - area.size_m[1] / 2
     start = min(u for u, _ in legs[max(first - 1, 0) : first + 1])
@@ -94,10 +81,7 @@ def _corners(
 
 
 def _track(request: SurveyRequest, area: SurveyArea, corners: list[tuple[float, float]]) -> tuple[Segment, ...]:
-    """Returns the segments of a track between its corners (u, v) in the axes of the legs [m].
-
-    With `turns` = "bow_first", they include the turns on the spot at the ends of the legs.
-    """
+    """Returns the segments of a track between its corners (u, v) [m], with its turns on the spot."""
     scene = [area.to_scene(u, v) for u, v in corners]
     points: list[Point] = [(float(x), float(y), request.altitude_m) for x, y in scene]
     turning = request.turns == "bow_first"

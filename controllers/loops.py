@@ -12,16 +12,15 @@ import math
 
 from twin.controllers.segments import Circle, circle, max_circle_speed_mps
 from twin.controllers.survey_area import SurveyArea
-from twin.controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, frames_per_keyframe, n_tracks_to_fly
+from twin.controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, n_tracks_to_fly, survey_plan
 from twin.errors import TwinError
 
 
 def plan(request: SurveyRequest) -> SurveyPlan:
     """Plans a loop survey of the disc inscribed in the area; each loop is a track.
 
-    The distance between neighbouring loops is at most (1 - overlap_across) times the shorter side of the image on the
-    reference plane (times `across_scale` of the request), because loops run in every direction. On small loops, the
-    greatest acceleration limits the speed.
+    The distance between neighbouring loops is at most (1 - overlap_across) times the shorter side of the footprint,
+    times `across_scale`, because loops run in every direction. On small loops, acceleration limits the speed.
 
     Raises:
         TwinError: a requirement is invalid or cannot be met.
@@ -35,30 +34,23 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     n_filling = n_loops_to_fill(loop_diameter_m, (1 - request.overlap_across) * shorter_m * request.across_scale)
     n_tracks = n_tracks_to_fly(request, n_filling)
     speed_mps = min(request.speed_mps, max_circle_speed_mps(loop_diameter_m / 2, request.acceleration_mps2))
-    return SurveyPlan(
+    return survey_plan(
+        request,
         paths=tuple((_loop(request, area, loop_diameter_m, 2 * math.pi * k / n_filling),) for k in range(n_tracks)),
         area=area,
-        altitude_m=request.altitude_m,
         speed_mps=speed_mps,
-        frame_rate_hz=request.frame_rate_hz,
-        n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
         swath_length_m=math.pi * loop_diameter_m,
         swath_spacing_m=loop_spacing_m(loop_diameter_m, n_filling),
         n_tracks_to_fill=n_filling,
-        footprint_m=request.footprint_m,
         side_along_m=shorter_m,
         side_across_m=shorter_m,
-        focal_px=float(request.focal_px),
-        acceleration_mps2=request.acceleration_mps2,
-        surface=request.surface,
     )
 
 
 def loop_spacing_m(loop_diameter_m: float, n_loops: int) -> float:
     """Returns the greatest distance between neighbouring loops [m]: a sin(pi / n) for n loops of diameter a.
 
-    Two equal circles are farthest apart along the line through their centres, by the distance between the centres. The
-    centres of neighbouring loops lie at a / 2 from the start, in directions that differ by 2 pi / n.
+    This is the distance between their centres, at a / 2 from the start in directions that differ by 2 pi / n.
     """
     return loop_diameter_m * math.sin(math.pi / n_loops)
 

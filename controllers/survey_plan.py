@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -171,6 +171,25 @@ class SurveyPlan:
     def camera_height_at(self, x_m: Array, y_m: Array) -> Array:
         """Returns the planned height z of the camera (n,) at points (x, y) of the path [m]."""
         return np.full(len(x_m), self.altitude_m) if self.surface is None else self.surface.height_at(x_m, y_m)
+
+
+def survey_plan(request: SurveyRequest, *, speed_mps: float, **pattern: Any) -> SurveyPlan:
+    """Returns the plan of a pattern at a speed, with all that the request states; raises TwinError if that is too fast.
+
+    Args:
+        pattern: paths, area and distances of the pattern: fields of `SurveyPlan` by name.
+    """
+    return SurveyPlan(
+        altitude_m=request.altitude_m,
+        speed_mps=speed_mps,
+        frame_rate_hz=request.frame_rate_hz,
+        n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
+        footprint_m=request.footprint_m,
+        focal_px=float(request.focal_px),
+        acceleration_mps2=request.acceleration_mps2,
+        surface=request.surface,
+        **pattern,
+    )
 
 
 def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:

@@ -6,6 +6,7 @@ import difflib
 import importlib
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from operator import attrgetter
 from typing import Any, NamedTuple, TypeVar
 
 from twin.errors import TwinError, described
@@ -69,9 +70,7 @@ def attempt(key: str, name: str, function: Callable[[], T]) -> T:
 
 def _attribute(module: Any, dotted: str) -> Callable[..., Any]:
     """Returns the class with a dotted name in a module. Raises AttributeError or TypeError if the module has none."""
-    found = module
-    for part in dotted.split("."):
-        found = getattr(found, part)
+    found = attrgetter(dotted)(module)
     if not callable(found):
         raise TypeError(f"{dotted} is not a class")
     return found

@@ -32,8 +32,7 @@ def checked_metrics(metrics: Any) -> dict[str, Any]:
     """Returns the contents of metrics.json, validated, with None for each missing number and [] for each missing list.
 
     Raises:
-        ValueError: a value does not have the type that `twin` writes, or `name`, `status` or a value in a row of
-            `tracks` is missing; the message names the key.
+        ValueError: a value has another type than `twin` writes, or a necessary one is missing; names the key.
     """
     template = empty_metrics()
     texts = dict.fromkeys(("name", "status"), "")

@@ -20,33 +20,21 @@ class StageRow(NamedTuple):
 
 def stage_rows(metrics: Mapping[str, Any], scenario: Mapping[str, Any]) -> list[StageRow]:
     """Returns a row for each positioning stage of metrics.json that has an error."""
-    return [
-        StageRow(row.stage, _inputs(row.stage, scenario), row.rmse_m, row.gain, _disabled(row.stage, scenario))
-        for row in stage_errors(metrics)
-    ]
-
-
-def _inputs(stage: str, scenario: Mapping[str, Any]) -> str:
-    """Returns the measurements that a stage uses in this scenario."""
+    estimate = scenario.get("estimate", {})
+    f2m, ga = estimate.get("use_f2m", True), estimate.get("use_ga", True)
     aiding = list(scenario.get("navigation", {}).get("aiding", []))
-    enabled = _enabled(scenario)
-    f2m, ga = ["F2M"] if enabled["F2M"] else [], ["previous GA"] if enabled["GA"] else []
-    return {
+    inputs = {
         "f2f": "optical flow between frames",
         "chain": "stereo pairs of consecutive keyframes",
-        "online": ", ".join(["chain", *f2m, *aiding, *ga]),
-        "final": ", ".join(["all links", *aiding]) if enabled["GA"] else "same as online",
-    }[stage]
-
-
-def _disabled(stage: str, scenario: Mapping[str, Any]) -> str:
-    """Returns a note such as "F2M disabled" on the parts of a stage that the scenario disables; "" if none."""
-    parts = {"online": ("F2M", "GA"), "final": ("GA",)}.get(stage, ())
-    disabled = [part for part in parts if not _enabled(scenario)[part]]
-    return f"{' and '.join(disabled)} disabled" if disabled else ""
-
-
-def _enabled(scenario: Mapping[str, Any]) -> dict[str, bool]:
-    """Returns whether the scenario enables F2M and GA."""
-    estimate = scenario.get("estimate", {})
-    return {"F2M": estimate.get("use_f2m", True), "GA": estimate.get("use_ga", True)}
+        "online": ", ".join(["chain", *(["F2M"] if f2m else []), *aiding, *(["previous GA"] if ga else [])]),
+        "final": ", ".join(["all links", *aiding]) if ga else "same as online",
+    }
+    disabled = {
+        "online": " and ".join([*([] if f2m else ["F2M"]), *([] if ga else ["GA"])]),
+        "final": "" if ga else "GA",
+    }
+    notes = {stage: f"{parts} disabled" for stage, parts in disabled.items() if parts}
+    return [
+        StageRow(row.stage, inputs[row.stage], row.rmse_m, row.gain, notes.get(row.stage, ""))
+        for row in stage_errors(metrics)
+    ]

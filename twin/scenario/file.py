@@ -76,8 +76,8 @@ def read_tree(path: str | Path) -> dict[str, Any]:
     """Returns the keys and values of a scenario, merged over those of its base file; the values are not validated.
 
     Raises:
-        ScenarioError: there is no such scenario, or a file cannot be read, is not TOML, exceeds the limits of
-            `toml_text`, extends itself or an unknown file, or contains the old name of a renamed key.
+        ScenarioError: there is no such scenario, or a file is invalid (`read_toml`), extends itself or an unknown file,
+            or contains the old name of a renamed key.
     """
     tree, _, errors = _read_with_base(find_scene(path))
     if errors:
@@ -95,7 +95,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
         source: file that the new values come from, for error messages.
 
     Raises:
-        ScenarioError: a key is renamed or cannot be set, or the scenario is invalid; lists the errors.
+        ScenarioError: a key is renamed or cannot be set, or the scenario is invalid.
     """
     changed = copy.deepcopy(dict(tree))
     for key, value in values.items():
@@ -267,10 +267,7 @@ def _absolute(key: str, value: Any, folder: Path) -> Any:
 
 
 def _expand(value: str, folder: Path) -> Path:
-    """Returns the absolute path of a file: a relative path refers to `folder`, and ${TWIN_DATA} is expanded.
-
-    If the expanded ${TWIN_DATA} is relative, as its default ../shared/data, the path refers to the current folder.
-    """
+    """Returns the absolute path of a file in a folder; one in ${TWIN_DATA} may refer to the current folder."""
     data = os.environ.get("TWIN_DATA", "../shared/data")
     if "${TWIN_DATA}" in value:
         return resolved(Path(value.replace("${TWIN_DATA}", data)))
