@@ -37,11 +37,7 @@ _DARK = 1e-6  # pixels whose light of a white floor, relative to the brightest p
 
 
 class Restoration:
-    """Restoration of the images of the left camera of a survey.
-
-    Args:
-        elevation: estimated map, with at least one height.
-    """
+    """Restoration of the images of the left camera of a survey, from an estimated map with at least one height."""
 
     def __init__(self, scenario: Scenario, illumination: Illumination, rig: StereoRig, elevation: ElevationMap):
         self._rig, self._optics = rig, Optics(rig, illumination, scenario.lamps)
@@ -62,11 +58,7 @@ class Restoration:
         self._world_from_map = geometry.inverse(elevation.map_from_world)
 
     def __call__(self, image: Image, exposure: Exposure | None, map_from_camera: Array) -> Radiance:
-        """Returns the albedo (H, W, 3) float32 of the floor in a left image (H, W, 3) uint8, 255 = white.
-
-        Raises:
-            TwinError: the exposure is not known.
-        """
+        """Returns the albedo (H, W, 3) of the floor in a left image, 255 = white. Raises TwinError without exposure."""
         if exposure is None:
             raise TwinError("map.restore", "the exposures of the images are not known", "frames with an exposure")
         radiance = (self._signal[image] / (self._vignetting * np.array(exposure))).astype(np.float32)

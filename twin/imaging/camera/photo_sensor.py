@@ -52,10 +52,7 @@ class PhotoSensor:
         return None if gain is None else self._setting(gain, self._white.next_factors)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns this frame's exposure, and meters `light` (H, W, 3) at the raw pixels for the later frames.
-
-        The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
-        """
+        """Returns this frame's exposure, and meters `light` (H, W, 3); the first frame is metered on itself."""
         mean = _weighted_mean(light, self._vignetting)
         white = self._white.factors(mean, self._exposure.share)
         return self._setting(self._exposure.gain_for(float((mean * self._white.relative(white)).max())), white)
@@ -71,9 +68,8 @@ class PhotoSensor:
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
         """Returns the motion of a camera during its exposure; None if it has no effect on the image.
 
-        Args:
-            twist: (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-            n_rows: rows of the rendered image, margin included; the read-out time of the result is that of these rows.
+        The read-out time of the result is that of the `n_rows` of the rendered image, margin included. `twist` (6,) is
+        the [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
         """
         row_ratio = (n_rows - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
         readout_s = row_ratio * self._sensor.readout_ms / 1000
@@ -92,7 +88,10 @@ class PhotoSensor:
 
     def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
         """Returns raw digital numbers: (H, W) with a Bayer filter, else (H, W, 3); without noise if `rng` is None."""
-        return read_out(light, self._vignetting, self._response(setting), self._sensor.bayer, rng)
+        electrons, gain = self._electrons_per_cd_s * setting.exposure_s, self._dn_per_e * setting.analogue_gain
+        noise = self._sensor.full_well_e, self._sensor.read_noise_e
+        response = PixelResponse(electrons, *noise, gain, self._black_dn, self._top_dn)
+        return read_out(light, self._vignetting, response, self._sensor.bayer, rng)
 
     def develop(self, raw: Raw, white: tuple[float, float, float] | None = None) -> Image:
         """Returns the 8-bit RGB image (H, W, 3) of raw digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
@@ -108,12 +107,6 @@ class PhotoSensor:
         image = np.empty((*raw.shape, 3), np.uint8)
         cv2.cvtColor(toned, cv2.COLOR_BayerRGGB2RGB, image)
         return image
-
-    def _response(self, setting: ExposureSetting) -> PixelResponse:
-        return PixelResponse(
-            self._electrons_per_cd_s * setting.exposure_s, self._sensor.full_well_e, self._sensor.read_noise_e,
-            self._dn_per_e * setting.analogue_gain, self._black_dn, self._top_dn,
-        )  # fmt: skip
 
     def _tone_table(self, white: Array) -> NDArray[np.uint8]:
         """Returns the tone table (3, 2^bits): the 8-bit value of each digital number in each band."""

@@ -33,18 +33,13 @@ class PixelResponse(NamedTuple):
 
 
 def read_out(
-    light: NDArray[np.float32],
-    vignetting: NDArray[np.float32],
-    response: PixelResponse,
-    bayer: bool,
+    light: NDArray[np.float32], vignetting: NDArray[np.float32], response: PixelResponse, bayer: bool,
     rng: np.random.Generator | None,
-) -> Raw:
+) -> Raw:  # fmt: skip
     """Returns raw digital numbers: (H, W) with a Bayer filter (R G / G B from the top left), else (H, W, 3).
 
-    Args:
-        light: (H, W, 3) light per colour band in photometric units [cd/m2].
-        vignetting: (H, W) illuminance relative to the axis.
-        rng: random stream, of which one number is drawn per image; None = no noise.
+    `light` (H, W, 3) is in photometric units [cd/m2], `vignetting` (H, W) relative to the axis. Of the random stream,
+    one number is drawn per image; None = no noise.
     """
     height, width = vignetting.shape
     out = np.empty((height, width, 1 if bayer else 3), np.uint16)
@@ -87,7 +82,7 @@ def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end)
 
 @kernel
 def _normal_to_poisson(expected, shot):
-    """Replaces standard normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
+    """Replaces normal numbers z in `shot` (n,) by approximately Poisson-distributed counts of mean `expected`.
 
     The counts are round(m + s z + (z^2 - 1) / 6), the first terms of the Cornish-Fisher expansion (1938); s^2 = m -
     1/18 - 1/12 compensates for the variance of the quadratic term and of the rounding.

@@ -60,8 +60,7 @@ def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
 def air_coordinates(port: PortConfig, points_m: Array) -> Array:
     """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN where none is found.
 
-    `water_rays` is inverted by Newton's method, starting from the equivalent pinhole. For a flat pane, convergence is
-    monotonic, because the angle in air grows faster than the angle in water.
+    `water_rays` is inverted by Newton's method from the equivalent pinhole, which is monotonic for a flat pane.
     """
     normalised = points_m[..., :2] / points_m[..., 2:]
     if port.kind == "none":

@@ -35,15 +35,11 @@ class AutoExposure:
     """
 
     def __init__(
-        self,
-        gray_level: float,
-        frame_rate_hz: float,
-        lag_s: float = EXPOSURE_LAG_S,
+        self, gray_level: float, frame_rate_hz: float, lag_s: float = EXPOSURE_LAG_S,
         limits: tuple[float, float] = (0.0, math.inf),
-    ):
-        self._gray_level = gray_level
+    ):  # fmt: skip
+        self._gray_level, self._limits = gray_level, limits
         self.share = 1 - np.exp(-1 / (frame_rate_hz * lag_s)) if lag_s else 1.0
-        self._limits = limits
         self._log_gain: float | None = None
 
     @property
@@ -58,8 +54,7 @@ class AutoExposure:
     def gain_for(self, brightest: float) -> float:
         """Returns the gain of this frame [1 / (cd/m2)], given the mean radiance of its brightest band [cd/m2].
 
-        Except for the first frame, this mean affects only the gain of later frames. The target gain is clipped to the
-        limits.
+        Except for the first frame, this mean affects only the gain of later frames.
         """
         least, most = self._limits
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
@@ -95,10 +90,7 @@ class PlainSensor:
         return None if gain is None else ExposureSetting(gain)
 
     def meter(self, light: Radiance) -> ExposureSetting:
-        """Returns this frame's exposure, and meters `light` (H, W, 3) for the later frames.
-
-        The exposure of the first frame is metered on `light`, that of every other frame on the frames before it.
-        """
+        """Returns this frame's exposure, and meters `light` (H, W, 3); the first frame is metered on itself."""
         return ExposureSetting(self._exposure.gain(light))
 
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:

@@ -47,10 +47,9 @@ class CameraModel(NamedTuple):
     believed_from_camera: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water.
+        """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water, in believed axes.
 
-        Both are in the axes of the believed camera. The direction is NaN for a pixel without a ray, e.g. if the ray is
-        totally reflected at the port.
+        The direction is NaN for a pixel without a ray, e.g. if the ray is totally reflected at the port.
         """
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
         if self.port.kind == "none":
@@ -60,9 +59,9 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixel coordinates (..., 2) of points (..., 3) [m] in front of the believed camera, in its axes.
+        """Returns the pixels (..., 2) of points (..., 3) [m] in front of the believed camera, in its axes; NaN if none.
 
-        They are NaN for a point without a ray through the port, or too far off the axis for the distortion model.
+        A point has none without a ray through the port, or too far off the axis for the distortion model.
         """
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
@@ -101,12 +100,10 @@ class TrueCameras:
     rectified_depth_m: float  # depth of the points for which the rectification is computed
 
     def sample(self, light: Radiance, depth: Depth, camera: int, motion: ExposureMotion | None = None) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right).
+        """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right), from the rendered image.
 
-        Args:
-            light: (H, W, 3) radiance in the rendered image.
-            depth: (H, W) depth in the rendered image [m].
-            motion: its rolling shutter is applied if `sampling` is not None. None: no motion.
+        `light` (H, W, 3) and `depth` (H, W) [m] are rendered; the rolling shutter of `motion` is applied if `sampling`
+        is not None.
         """
         if self.sampling is None:
             return light
@@ -148,7 +145,7 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     believed_rig, calibration = scenario.believed_rig(), scenario.calibration_error
     _check_port(scenario.port)
     true_rig = replace(believed_rig, baseline_m=believed_rig.baseline_m * (1 + calibration.baseline_error))
-    models, believed = _true_models(scenario), _believed_model(scenario)
+    models, believed = _models(scenario)
     calibrated = scenario.port.kind != "none" and scenario.port.calibrated_at_m > 0
     depth_m = scenario.port.calibrated_at_m if calibrated else 1.0
     if _is_ideal(scenario, believed):
@@ -172,29 +169,21 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     )  # fmt: skip
 
 
-def _true_models(scenario: Scenario) -> tuple[CameraModel, CameraModel]:
-    """Returns the models of the true left and right camera."""
-    calibration, pinhole, rig = scenario.calibration_error, ports.pinhole(scenario.port), scenario.believed_rig()
-    focal_px = rig.focal_px / pinhole.focal_ratio * (1 + calibration.focal_error)
-    lens = lenses.true_lens(scenario.lens)
-    errors = (calibration.left_principal_point_error_px, calibration.right_principal_point_error_px)
-    rotations = (np.eye(3), right_rotation(calibration))
-    left, right = (
-        CameraModel(focal_px, np.array([rig.cx_px, rig.cy_px]) + error, lens, scenario.port, pinhole, rotation)
-        for error, rotation in zip(errors, rotations, strict=True)
-    )
-    return left, right
+def _models(scenario: Scenario) -> tuple[tuple[CameraModel, CameraModel], CameraModel]:
+    """Returns the models of the true left and right camera, and the one by which the images of both are rectified."""
+    calibration, port, rig = scenario.calibration_error, scenario.port, scenario.believed_rig()
+    pinhole, principal_px = ports.pinhole(port), np.array([rig.cx_px, rig.cy_px])
+    focal_px, lens = rig.focal_px / pinhole.focal_ratio, lenses.true_lens(scenario.lens)
 
+    def true_model(error_px: tuple[float, float], rotation: Array) -> CameraModel:
+        focal = focal_px * (1 + calibration.focal_error)
+        return CameraModel(focal, principal_px + error_px, lens, port, pinhole, rotation)
 
-def _believed_model(scenario: Scenario) -> CameraModel:
-    """Returns the camera model for the rectification."""
-    rig, pinhole = scenario.believed_rig(), ports.pinhole(scenario.port)
-    lens = lenses.believed_lens(scenario.lens, scenario.calibration_error)
-    port = scenario.port
-    if not port.calibrated_at_m:
-        port, pinhole = PortConfig(), Pinhole(0.0, pinhole.focal_ratio)
-    principal_px = np.array([rig.cx_px, rig.cy_px])
-    return CameraModel(rig.focal_px / pinhole.focal_ratio, principal_px, lens, port, pinhole, np.eye(3))
+    left = true_model(calibration.left_principal_point_error_px, np.eye(3))
+    right = true_model(calibration.right_principal_point_error_px, right_rotation(calibration))
+    known = (port, pinhole) if port.calibrated_at_m else (PortConfig(), Pinhole(0.0, pinhole.focal_ratio))
+    believed_lens = lenses.believed_lens(scenario.lens, calibration)
+    return (left, right), CameraModel(focal_px, principal_px, believed_lens, *known, np.eye(3))
 
 
 def right_rotation(calibration: CalibrationErrorConfig) -> Array:

@@ -58,10 +58,9 @@ def material_of(terrain: TerrainConfig) -> Material | None:
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def reflectance(material, albedo, mu_i, mu_o, phase):
-    """Returns the bidirectional reflectance [1/sr], in single precision.
+    """Returns the bidirectional reflectance [1/sr], in single precision, for an albedo of 0 to 1.
 
-    `mu_i`, `mu_o` are the cosines of incidence and of view, above 0, `phase` that of the phase angle, `albedo` is 0 to
-    1.
+    `mu_i`, `mu_o` are the cosines of incidence and of view, above 0, `phase` that of the phase angle.
     """
     kind, a, b, specular, alpha_squared = material
     one, two, zero = np.float32(1), np.float32(2), np.float32(0)

@@ -60,9 +60,8 @@ def wall_surface(terrain: Terrain) -> WallSurface | None:
     height = ((walls.high_m - terrain.height_m.astype(np.float64)) / texel_m).astype(np.float32)
     spacing, length = np.float32(terrain.spacing_m / texel_m), np.float32(walls.texture.shape[1])
     corner_m = np.array([terrain.west_m, terrain.south_m])
-    return WallSurface(
-        height, walls.number, walls.weights, texels, levels, spacing, length, corner_m, walls.high_m, texel_m
-    )
+    weights = walls.number, walls.weights
+    return WallSurface(height, *weights, texels, levels, spacing, length, corner_m, walls.high_m, texel_m)
 
 
 def _levels(texture: Image) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
@@ -158,12 +157,8 @@ def _find(surface, depth, y, view, origin, focal, work, steep):
     per_cell = one / surface.spacing
     west, south = -np.float32(origin[0]), -np.float32(origin[1])
     east, north = west + np.float32(cols - 1), south + np.float32(rows - 1)
-    col_x, row_x, col_0, row_0 = (
-        view[0, 0] * per_cell,
-        view[1, 0] * per_cell,
-        view[0, 3] * per_cell,
-        view[1, 3] * per_cell,
-    )
+    col_x, row_x = view[0, 0] * per_cell, view[1, 0] * per_cell
+    col_0, row_0 = view[0, 3] * per_cell, view[1, 3] * per_cell
     col_z, row_z = (view[0, 1] * y + view[0, 2]) * per_cell, (view[1, 1] * y + view[1, 2]) * per_cell
     centre = half * np.float32(depth.size - 1)
     col, row, column, line = work[_EAST], work[_NORTH], work[_X], work[_Y]  # filled anew by `_place`
@@ -196,14 +191,10 @@ def _place(surface, origin, work, steep, n):
         north_west, north_east = height[r + 1, c], height[r + 1, c + 1]
         east, north = rises(south_west, south_east, north_west, north_east, s, t)
         work[_EAST, i], work[_NORTH, i] = east * per_cell, north * per_cell
-        k = number[r, c]
+        w = weights[number[r, c]]
         sw, se, nw, ne = (one - s) * (one - t), s * (one - t), (one - s) * t, s * t
-        work[_X, i] = (
-            sw * weights[k, 0, 0, 0] + se * weights[k, 0, 1, 0] + nw * weights[k, 1, 0, 0] + ne * weights[k, 1, 1, 0]
-        )
-        work[_Y, i] = (
-            sw * weights[k, 0, 0, 1] + se * weights[k, 0, 1, 1] + nw * weights[k, 1, 0, 1] + ne * weights[k, 1, 1, 1]
-        )
+        work[_X, i] = sw * w[0, 0, 0] + se * w[0, 1, 0] + nw * w[1, 0, 0] + ne * w[1, 1, 0]
+        work[_Y, i] = sw * w[0, 0, 1] + se * w[0, 1, 1] + nw * w[1, 0, 1] + ne * w[1, 1, 1]
 
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
