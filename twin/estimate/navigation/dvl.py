@@ -171,13 +171,9 @@ def _displacement_cov(state):
 
 @kernel
 def fuse_displacement(a_from_b, cov, step, step_cov, body_from_camera, gates):
-    """Updates a camera motion with a displacement of the body's origin (Kalman update).
+    """Returns a motion, its covariance and whether it was used, after a Kalman update with a body displacement.
 
-    Args:
-        step, step_cov: (3,), (3, 3) displacement [m] in the axes of the body before the motion, and its covariance.
-
-    Returns:
-        Motion (4, 4) and covariance (6, 6) after the update, and whether the displacement was used.
+    The displacement (3,) [m] and its covariance (3, 3) are in the axes of the body before the motion.
     """
     expected, by_motion = body_displacement(a_from_b, body_from_camera)
     return fuse_reading(a_from_b, cov, step - expected, by_motion, step_cov, gates, DVL)

@@ -13,6 +13,7 @@ from twin.estimate.vision import matching, observation_equations, two_view_motio
 from twin.estimate.vision.motion_filter import MotionFilter
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.stereo import StereoPoints
+from twin.estimate.vision.two_view_motion import Motion, PairMotionSettings
 
 MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
 _MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
@@ -42,7 +43,7 @@ class _Located(NamedTuple):
     """Pose of an image relative to the reference, from tracked points."""
 
     #: pose of the image in the reference camera, its covariance and the number of inliers.
-    motion: two_view_motion.Motion
+    motion: Motion
     inlier_share: float  #: fraction of the tracked points that are inliers, 0 to 1
     tracked_share: float  #: fraction of the points of the reference that were tracked, 0 to 1
     residual_px: float  #: median distance between the tracked and the fitted positions of the points [px]
@@ -87,9 +88,7 @@ class FrameToFrame:
         self._reference_cov = np.zeros((6, 6))
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
-    def step(
-        self, image: matching.Image, interval_s: float | None = None, unusable: str = ""
-    ) -> tuple[two_view_motion.Motion, str]:
+    def step(self, image: matching.Image, interval_s: float | None = None, unusable: str = "") -> tuple[Motion, str]:
         """Returns the motion from the last frame to this normalised image, and "ok" or the reason for a failure.
 
         At the first frame, these are the identity and "ok". As covariance of a measured motion, that of the pose of
@@ -102,7 +101,7 @@ class FrameToFrame:
         """
         if not self.started:
             self.started = True
-            return two_view_motion.Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
+            return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         last_from_reference = geometry.inverse(self.filter.pose)
         self.filter.predict(1 / self.rig.frame_rate_hz if interval_s is None else interval_s)
         reference = None if unusable else self.reference
@@ -167,9 +166,8 @@ class FrameToFrame:
         current, current_cov = np.zeros_like(measured), np.zeros_like(cov)
         current[:, :2], current_cov[:, :2, :2] = self.rig.normalised(pixels), cov[:, :2, :2]
         current_cov[:, 2, 2] = _UNKNOWN_VARIANCE
-        settings = two_view_motion.PairMotionSettings(
-            variance_inflation=matching.variance_inflation(pixels, self.patch_px), n_measured=2, measured_scatter=True
-        )
+        inflation = matching.variance_inflation(pixels, self.patch_px)
+        settings = PairMotionSettings(variance_inflation=inflation, n_measured=2, measured_scatter=True)
         pair = PairMeasurements(current, measured, current_cov, cov)
         motion = two_view_motion.pair_motion(pair, self.rig.baseline_m, current_from_reference, settings)
         if motion is None:
@@ -204,10 +202,8 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
     return measured, cov
 
 
-def constant_velocity_motion(
-    motion: Array, status: str = "too few points matched"
-) -> tuple[two_view_motion.Motion, str]:
+def constant_velocity_motion(motion: Array, status: str = "too few points matched") -> tuple[Motion, str]:
     """Returns a motion (4, 4) predicted at constant velocity, with a large covariance, and `status` unchanged."""
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])
-    return two_view_motion.Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), status
+    return Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), status

@@ -117,8 +117,7 @@ def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
 
     Row differences of a stereo pair, minus their median (calibration errors), measure the matching noise. The ratio is
     1.4826 times the median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors
-    of 1.17 / sqrt(n).
-    Positions (n, 2) and their covariance are those of `fuse`.
+    of 1.17 / sqrt(n). Positions (n, 2) and their covariance are those of `fuse`.
     """
     n = len(left)
     if n < _MIN_ROW_DIFFERENCES:
