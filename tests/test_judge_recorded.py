@@ -109,6 +109,16 @@ def test_a_turn_of_the_axes_is_found_along_a_curve_in_spite_of_drift():
     assert truth_warnings(noisy(drifted, 0, rng), noisy(curve_m, 1e-3, rng)) == []
 
 
+def test_a_straight_path_shows_no_turn_about_itself():
+    """Bends of 0.1 mm towards opposite sides are fitted best by half a turn about the path."""
+    rng, t = np.random.default_rng(9), np.linspace(-1, 1, 60)
+    bent = np.column_stack([0.2 * t, 1e-4 * t**2, 0 * t])
+    estimate, truth = noisy(bent, 0, rng), noisy(bent * [1, -1, 1], 0, rng)
+    assert truth_warnings(estimate, truth) == []
+    across = noisy(bent, 0, rng, np.pi / 2)
+    assert "turned by 90 degrees" in truth_warnings(estimate, across)[-1]
+
+
 def test_a_truth_without_poses_is_a_warning(pair):
     estimate, truth = pair
     empty = Trajectory(truth.times_s[:0], truth.world_from_camera[:0])

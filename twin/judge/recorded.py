@@ -116,7 +116,8 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
             "seems to have another unit or scale."
         )
     angle_deg, sigma_deg = _axis_turn_deg(a, b)
-    if angle_deg > max(_MAX_AXIS_DEG, _SIGNIFICANT * sigma_deg) and sigma_deg < _MAX_AXIS_SIGMA_DEG:
+    least_deg = max(_MAX_AXIS_DEG, _SIGNIFICANT * sigma_deg)
+    if min(angle_deg, _turn_of_positions_deg(a, b)) > least_deg and sigma_deg < _MAX_AXIS_SIGMA_DEG:
         found.append(
             f"The axes of the truth are turned by {angle_deg:.0f} degrees (sigma {sigma_deg:.0f}) from those of the "
             "left camera: the truth seems to be that of another body."
@@ -137,6 +138,16 @@ def _axis_turn_deg(estimate: Trajectory, truth: Trajectory) -> tuple[float, floa
     changes = [geometry.so3_log(turns[0].T @ part) for part in turns[1:]]
     sigma = np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum(np.square(changes)))
     return float(np.rad2deg(np.linalg.norm(geometry.so3_log(turns[0])))), float(np.rad2deg(sigma))
+
+
+def _turn_of_positions_deg(estimate: Trajectory, truth: Trajectory) -> float:
+    """Returns the angle by which these two rotations turn the positions apart [deg]: 0 about a straight path."""
+    by_position = rigid_alignment(estimate.positions, truth.positions)[:3, :3]
+    turns = truth.world_from_camera[:, :3, :3] @ np.swapaxes(estimate.world_from_camera[:, :3, :3], 1, 2)
+    by_attitude = geometry.nearest_rigid(geometry.pose(turns.mean(axis=0), np.zeros(3)))[:3, :3]
+    centred = estimate.positions - estimate.positions.mean(axis=0)
+    chord = np.linalg.norm(centred @ (by_position - by_attitude).T) / max(float(np.linalg.norm(centred)), 1e-12)
+    return float(np.rad2deg(2 * np.arcsin(min(chord / 2, 1.0))))
 
 
 def _axis_turn(estimate: Trajectory, truth: Trajectory) -> Array:
