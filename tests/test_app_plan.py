@@ -13,8 +13,7 @@ from twin.planning import summary as plan_summary
 from twin.planning.expected_error import ExpectedError
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
-from twin.surrogate.error_model import BinnedDepthLaw, ScatterLaw
-from twin.surrogate.window_texture import EVEN_TEXTURE, WindowTexture
+from twin.surrogate.matchability import EVEN_TEXTURE, WindowTexture
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import prepare
 
@@ -60,8 +59,7 @@ def test_requirements_that_cannot_be_predicted_are_left_out():
 def test_over_a_level_floor_the_expected_sigma_is_that_of_the_disparity_times_z2_over_f_b(tmp_path):
     """The error model has no scatter over cells, and further keyframes, which depend on the baseline, add nothing."""
     fitted = error_model_file.load()
-    gainless = fitted.model.depth_error._replace(gain=0.0)
-    model = fitted.model._replace(depth_error=gainless, depth_texture_scatter=ScatterLaw(0.0, 1.0))
+    model = fitted.model._replace(depth_gain=0.0, efficiency=0.0, texture_scatter=0.0)  # without noise of the images
     error_model_file.save(replace(fitted, model=model), tmp_path / "one.toml")
     flat = (
         "terrain.kind=flat",
@@ -85,25 +83,23 @@ def _expected_over_a_flat_floor(binning, model, monkeypatch, texture=EVEN_TEXTUR
     fitted = replace(FITTED, model=model)
     monkeypatch.setattr(expected_error.error_model_file, "load", lambda _: fitted)
     matching = SimpleNamespace(
-        binning=binning, depths_m=np.array([1.0, 3.0]), bounds_px=np.full(2, 0.05), lamp_share=1.0,
-        window_bounds_px=np.full(2, 0.05 * texture.median_ratio), texture=texture,
-    )  # fmt: skip
+        binning=binning, bound_at=lambda depth_m: np.full(np.shape(depth_m), 0.05), lamp_share=1.0, texture=texture
+    )
     monkeypatch.setattr(expected_error, "Matchability", lambda *_: matching)
     return expected_error.expected_error(mission, forecast_over_floor(mission))
 
 
 @pytest.mark.parametrize("binning", [1, 2])
 def test_the_expected_error_scatters_over_cells_as_the_texture_over_windows(binning, monkeypatch):
-    """The logarithm of the error, over a level floor at one depth, has the standard deviation 0.6 times 2 times 0.2."""
-    model = FITTED.model._replace(depth_texture_scatter=ScatterLaw(2.0, 0.0), error_scatter_share=0.6)
+    """The logarithm of the error, over a level floor at one depth, has the standard deviation 1.2 times 0.2."""
+    model = FITTED.model._replace(texture_scatter=1.2, flow_floor_px=1e-9)
     found = _expected_over_a_flat_floor(binning, model, monkeypatch, WindowTexture(1.0, 0.2))
-    assert np.log(found.sigma_m).std() == pytest.approx(0.6 * 0.4, rel=0.01)  # 20,000 even quantiles
+    assert np.log(found.sigma_m).std() == pytest.approx(1.2 * 0.2, rel=0.01)  # 20,000 even quantiles
 
 
 def test_the_expected_error_is_that_of_the_bound_of_the_median_window(monkeypatch):
     """The depth error is proportional to the bound here, and all other errors of a level floor are zero."""
-    proportional = FITTED.model.depth_error._replace(floor_px=0.0)
-    model = FITTED.model._replace(depth_error=proportional, depth_texture_scatter=ScatterLaw(0.0, 1.0))
+    model = FITTED.model._replace(flow_floor_px=0.0, texture_scatter=0.0)
     even, uneven = (
         _expected_over_a_flat_floor(1, model, monkeypatch, WindowTexture(ratio, 0.4)).sigma_m for ratio in (1.0, 1.3)
     )
@@ -112,9 +108,7 @@ def test_the_expected_error_is_that_of_the_bound_of_the_median_window(monkeypatc
 
 def test_the_expected_error_of_binned_images_has_the_factor_of_the_error_model(monkeypatch):
     """A pixel of binned images is two pixels wide, so the same error in pixels is twice as large in metres."""
-    law = FITTED.model.depth_error
-    change = BinnedDepthLaw(1.5, 2.0, law.common, law.gain, law.noise_gain)
-    model = FITTED.model._replace(depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_binned_error=change)
+    model = FITTED.model._replace(binned_factor=1.5, texture_scatter=0.0)
     full, binned = (_expected_over_a_flat_floor(by, model, monkeypatch).sigma_m for by in (1, 2))
     np.testing.assert_allclose(binned / full, 2 * 1.5, rtol=1e-9)
 

@@ -1,5 +1,6 @@
 """Surrogate: calibration errors, ports and marine snow, and the refusal of surveys outside the range of the fit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,7 @@ from twin.studies.flight import fly
 from twin.studies.surveys import Survey, surveys
 from twin.surrogate import error_model_file
 from twin.surrogate.coverage import QUANTITIES, quantities_outside_fit
-from twin.surrogate.error_model import ErrorModel
-from twin.surrogate.matchability import FloorImages, floor_albedos, precision
+from twin.surrogate.matchability import FloorImages, floor_albedos, in_snow
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, measured_view
 from twin.surrogate.snow_noise import snow_effect
 from twin.surrogate.surrogate_world import SurrogateWorld
@@ -183,11 +183,13 @@ def test_the_share_of_matches_falls_with_the_part_of_the_image_that_flakes_cover
 
 
 def test_more_snow_gives_less_precise_and_fewer_matches():
-    mission, depths_m = prepare(scenario()), np.array([1.8])
-    views = [FloorImages(scenario(f"snow.density_per_m3={n}"), mission.illumination) for n in (0, 400, 1600)]
-    bounds_px, clear = np.transpose([
-        precision(images, floor_albedos(images, mission.terrain, depths_m), depths_m) for images in views
-    ])[0]  # fmt: skip
+    mission, found = prepare(scenario()), []
+    for n in (0, 400, 1600):
+        images = FloorImages(scenario(f"snow.density_per_m3={n}"), mission.illumination)
+        (albedo,) = floor_albedos(images, mission.terrain, np.array([1.8]))
+        matched = images.matched(albedo, 1.8, np.random.default_rng(0))
+        found.append(in_snow(images, albedo, 1.8, matched, 1))
+    bounds_px, clear = np.transpose(found)
     assert bounds_px[0] < bounds_px[1] < bounds_px[2]
     assert clear[0] == 1 > clear[1] > clear[2]
 
@@ -252,7 +254,7 @@ def test_extrapolate_of_the_command_line_sets_the_key_of_every_survey():
 
 
 def test_every_range_in_the_file_limits_the_surveys(tmp_path):
-    fitted = error_model_file.FittedErrorModel(ErrorModel(), 3, {}, {"lamp_share": (0.0, 0.5)})
+    fitted = replace(error_model_file.load(), fitted_range={"lamp_share": (0.0, 0.5)}, misfit={})
     error_model_file.save(fitted, tmp_path / "model.toml")
     assert error_model_file.load(tmp_path / "model.toml") == fitted
     with pytest.raises(ScenarioError, match="share of the light from the lamps of 1 .allowed: 0 to 0.5"):

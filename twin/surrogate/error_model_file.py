@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from twin.core.user_files import read_text, reading
 from twin.errors import TwinError
@@ -23,17 +22,17 @@ class FittedErrorModel:
 
     model: ErrorModel  #: fitted parameters
     n_surveys: int  #: number of rendered surveys to which the model was fitted
-    #: root mean square over the surveys of ln(reported / fitted standard deviation), for each fitted parameter that is
-    #: a reported standard deviation of a motion or match (see `surrogate_fit.fit.log_misfit`)
+    largest_bound_px: float  #: largest Cramér-Rao bound of these surveys; that of a survey is its median over keyframes
+    #: root mean square of ln(measured / fitted) over the surveys, for each kind of measurement
     misfit: Mapping[str, float]
     #: smallest and largest value of each of `coverage.QUANTITIES` in these surveys, by name. The upper end of the
     #: Cramér-Rao bound is infinite if a survey with a larger bound than all fitted ones lost too many frames or links
-    #: to be fitted. Without an entry for the bound, its range is `ErrorModel.bound_range_px`.
+    #: to be fitted.
     fitted_range: Mapping[str, Range] = field(default_factory=dict)
 
     def quantities_outside_fit(self, conditions: Mapping[str, Range]) -> list[QuantityOutsideFit]:
         """Returns the quantities of a survey (`coverage.survey_conditions`) in which the model may not be used."""
-        return quantities_outside_fit(conditions, {"bound_px": self.model.bound_range_px, **self.fitted_range})
+        return quantities_outside_fit(conditions, {"bound_px": (0.0, self.largest_bound_px), **self.fitted_range})
 
 
 def load(path: str | Path | None = None) -> FittedErrorModel:
@@ -52,8 +51,9 @@ def load(path: str | Path | None = None) -> FittedErrorModel:
             if name not in QUANTITIES:
                 raise TwinError(_KEY, f"{path}: fitted_range.{name}: unknown quantity", _ALLOWED)
         ranges = {name: (float(low), float(high)) for name, (low, high) in tree.get("fitted_range", {}).items()}
-        model = ErrorModel(**{name: _value(name, tree["model"][name]) for name in ErrorModel._fields})
-        return FittedErrorModel(model, int(tree["n_surveys"]), dict(tree["misfit"]), ranges)
+        model = ErrorModel(**{name: float(tree["model"][name]) for name in ErrorModel._fields})
+        n_surveys, largest_px = int(tree["n_surveys"]), float(tree["largest_bound_px"])
+        return FittedErrorModel(model, n_surveys, largest_px, dict(tree["misfit"]), ranges)
 
 
 def save(fitted: FittedErrorModel, path: Path) -> None:
@@ -62,35 +62,18 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    ranges = [f"{name} = {_text(limits)}" for name, limits in fitted.fitted_range.items()]
     lines = [
         "# Error model of the surrogate, fitted to rendered surveys by `twin fit-surrogate`; see error_model.py.",
         f"n_surveys = {fitted.n_surveys}",
+        f"largest_bound_px = {fitted.largest_bound_px:.4g}",
         "",
-        "[misfit]  # root mean square of ln(reported / fitted)",
+        "[misfit]  # root mean square of ln(measured / fitted)",
         *(f"{name} = {value:.4g}" for name, value in fitted.misfit.items()),
-        *(["", "[fitted_range]  # smallest and largest value in the surveys of the fit", *ranges] if ranges else []),
+        "",
+        "[fitted_range]  # smallest and largest value in the surveys of the fit",
+        *(f"{name} = [{low:.4g}, {high:.4g}]" for name, (low, high) in fitted.fitted_range.items()),
         "",
         "[model]",
-        *(f"{name} = {_text(value)}" for name, value in fitted.model._asdict().items()),
+        *(f"{name} = {value:.4g}" for name, value in fitted.model._asdict().items()),
     ]
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _value(name: str, given: Any) -> Any:
-    """Converts a TOML value to the type of the parameter `name`; keys of a law that have a default may be missing."""
-    default = ErrorModel._field_defaults[name]
-    if isinstance(default, float):
-        return float(given)
-    if not isinstance(given, dict):
-        return tuple(map(float, given))
-    return type(default)(**{key: float(given[key]) for key in given if key in default._fields})
-
-
-def _text(value: Any) -> str:
-    """Returns the value of a parameter in TOML syntax."""
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if hasattr(value, "_asdict"):
-        return "{ " + ", ".join(f"{key} = {number:.4g}" for key, number in value._asdict().items()) + " }"
-    return str([float(f"{v:.4g}") for v in value])

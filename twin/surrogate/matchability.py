@@ -13,8 +13,7 @@ bound is that of the binned images, in their pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from functools import cached_property
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -26,27 +25,27 @@ from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
 from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import BINNINGS
-from twin.imaging.camera.photo_sensor import Sensor, sensor_of
-from twin.imaging.camera.sensor import ExposureSetting
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.camera.photo_sensor import sensor_of
+from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
 from twin.imaging.light.illumination import Illumination
-from twin.imaging.light.optics import Radiance
+from twin.imaging.light.optics import Optics, Radiance
 from twin.imaging.stereo_camera import Depth
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
-from twin.surrogate.window_texture import window_texture
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.terrain import texture_shape
 from twin.terrains.textures import generate_texture
 
+TEXTURE_WINDOW_PX = 5  #: side of the windows of dense matching, with about the area of that of `epipolar`
 #: Bound above which fewer than two thirds of the corners are matched, so that the estimators bin the images [px]. In
 #: rendered surveys they binned at 0.111 px (full image) and 0.13 px (binned by 2), and did not at 0.108 and 0.101 px.
 _CORNERS_BOUND_PX = 0.11
-_DEPTHS = 6  # number of tabulated depths
+_DEPTHS, _MIDDLE = 3, 1  # number of tabulated depths, and the one in the middle
 _LARGEST_UNEVENNESS = 2.0  # largest unevenness with which a patch is counted, relative to the median of the patches
 _BLOCKS = (6, 8)  # rows and columns of blocks of the image in `PositionDependence`
-_GRAY, _CONTRAST, _OCTAVES = 90, 12, 5  # random texture: mean, standard deviation per octave (0 to 255), octaves
 _PATCHES, _SAMPLES = 300, 9  # patches sampled for the unevenness; height samples along each side of a patch
+_BOUND_LIMITS_PX = 1e-9, 1e6  # bounds that replace zero and infinity between tabulated depths
+_WEAKEST = 0.05  # smallest RMS gradient of a window that is counted, relative to that of the image
 
 
 class PositionDependence(NamedTuple):
@@ -59,11 +58,26 @@ class PositionDependence(NamedTuple):
 NO_DEPENDENCE = PositionDependence(np.ones((1, 1)), np.ones((1, 1)))
 
 
-class Precision(NamedTuple):
-    """Cramér-Rao bound (m,) [px of the binned images] and fraction (m,) of matches that remain in snow, at m depths."""
+class WindowTexture(NamedTuple):
+    """Distribution of the Cramér-Rao bound over the windows of dense matching."""
 
-    bounds_px: Array
-    clear_share: Array
+    median_ratio: float  #: bound of the median window, divided by that of the RMS gradient of the image
+    scatter: float  #: standard deviation over windows of the logarithm of the bound
+
+
+EVEN_TEXTURE = WindowTexture(1.0, 0.0)
+
+
+class MatchedImages(NamedTuple):
+    """Images (H, W, 3) [grey levels]: the part that texture causes, and the difference of two images by their noise."""
+
+    signal: NDArray[np.float32]
+    noise: NDArray[np.float32]
+
+    def bound_px(self, patch_px: int, binning: int) -> float:
+        """Returns the Cramér-Rao bound of a patch's position [px of the images binned to `binning`]."""
+        gradient = float(np.sqrt(np.mean(np.diff(matching.gray(self.signal, binning), axis=1) ** 2)))
+        return float(matching.gray(self.noise, binning).std()) / (patch_px * max(gradient, 1e-6))
 
 
 class FloorImages:
@@ -81,61 +95,48 @@ class FloorImages:
         imaging = scenario.imaging.model_copy(update={"shadows": False})
         linear = {"tone_curve": "linear", "white_balance": "white_light"}
         sensor = scenario.sensor and scenario.sensor.model_copy(update=linear)
-        self._with_snow = scenario.model_copy(update={"imaging": imaging, "sensor": sensor})
-        no_snow = scenario.snow.model_copy(update={"density_per_m3": 0.0})
-        self.scenario = self._with_snow.model_copy(update={"snow": no_snow})
+        self.scenario = scenario.model_copy(update={"imaging": imaging, "sensor": sensor})
         self.rig, self.illumination = scenario.believed_rig(), illumination
-        self._formation = self._formation_of(self.scenario)
+        self._formation = ImageFormation(self.scenario, illumination, None, np.random.default_rng(0))
 
-    @property
-    def snowy(self) -> bool:
-        """Returns whether there is marine snow in the scenario."""
-        return self._with_snow.snow.density_per_m3 > 0
+    def radiance(self, albedo: Image, depth_m: float) -> Radiance:
+        """Returns the radiance (H, W, 3) of a floor with an albedo image at a depth, without marine snow."""
+        return self._formation.radiance_without_snow(albedo, *self._level_floor(depth_m))
 
-    def pair(self, albedo: Image, depth_m: float) -> tuple[Radiance, Radiance]:
-        """Returns the radiances (H, W, 3) of a floor at a depth: with an albedo image, and with its mean colour."""
-        mean = albedo.mean(axis=(0, 1)).round().astype(np.uint8)
-        return self._radiance(albedo, depth_m), self._radiance(np.broadcast_to(mean, albedo.shape).copy(), depth_m)
+    def matched(self, albedo: Image, depth_m: float, rng: np.random.Generator) -> MatchedImages:
+        """Returns what matching sees of a floor with an albedo image at a depth."""
+        light, sensor = self.radiance(albedo, depth_m), sensor_of(self.scenario, self.rig)
+        setting = sensor.meter(light)
+        signal = _levels(light, setting.gain) - _levels(self.radiance(_mean_colour(albedo), depth_m), setting.gain)
+        first, second = (sensor.image(light, setting, rng).astype(np.float32) for _ in range(2))
+        return MatchedImages(signal, first - second)
 
-    def sensor(self) -> Sensor:
-        """Returns the sensor in its initial state: the first frame that it meters has its own exposure."""
-        return sensor_of(self.scenario, self.rig)
+    def components(self, albedo: Image, depth_m: float) -> RadianceComponents:
+        """Returns the components of the light of a floor that has the mean colour of an albedo image."""
+        return self._formation.components(_mean_colour(albedo), *self._level_floor(depth_m))
 
     def snow_views(self, albedo: Image, depth_m: float) -> tuple[list[Radiance], list[Radiance]]:
         """Returns views (H, W, 3) of a floor without snow, and the same with different particles of marine snow."""
-        formations = self._formation, self._snow_formation
-        depth, camera_pose = self._level_floor(depth_m)
-        clean, snowy = ([one.radiance(albedo, depth, 0, p) for p in snow_poses(camera_pose)] for one in formations)
+        depth, camera, camera_pose = self._level_floor(depth_m)
+        clean, snowy = (
+            [view(albedo, depth, camera, p) for p in snow_poses(camera_pose)]
+            for view in (self._formation.radiance_without_snow, self._formation.radiance)
+        )
         return clean, snowy
 
-    @cached_property
-    def _snow_formation(self) -> ImageFormation:
-        return self._formation_of(self._with_snow)
-
-    def reflected(self, lamps: bool) -> float:
-        """Returns the radiance that a white floor at the planned altitude reflects, with or without lamps [cd/m2].
-
-        It is the mean difference between the images of a white and a black floor, which removes the veil.
-        """
-        unlit = self.scenario.model_copy(update={"lamps": ()})
-        formation = self._formation if lamps else self._formation_of(unlit)
-        depth, camera_pose = self._level_floor(self.scenario.plan.altitude_m)
-        albedos = (np.full((*depth.shape, 3), level, np.uint8) for level in (255, 0))
-        white, black = (formation.radiance(albedo, depth, 0, camera_pose) for albedo in albedos)
-        return float(np.mean(white - black))
-
-    def _formation_of(self, scenario: Scenario) -> ImageFormation:
-        return ImageFormation(scenario, self.illumination, None, np.random.default_rng(0))
-
-    def _radiance(self, albedo: Image, depth_m: float) -> Radiance:
-        depth, camera_pose = self._level_floor(depth_m)
-        return self._formation.radiance(albedo, depth, 0, camera_pose)
-
-    def _level_floor(self, depth_m: float) -> tuple[Depth, StampedPose]:
-        """Returns the depth image of a level floor seen from above, and the camera's pose at the planned altitude."""
+    def _level_floor(self, depth_m: float) -> tuple[Depth, int, StampedPose]:
+        """Returns the depth image of a level floor, the left camera, and its pose at the planned altitude."""
         world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))
         depth = np.full((self.rig.height_px, self.rig.width_px), depth_m, np.float32)
-        return depth, StampedPose(world_from_left, 0.0)
+        return depth, 0, StampedPose(world_from_left, 0.0)
+
+
+def _mean_colour(albedo: Image) -> Image:
+    return np.broadcast_to(albedo.mean(axis=(0, 1)).round().astype(np.uint8), albedo.shape).copy()
+
+
+def _levels(light: Radiance, gain: float) -> NDArray[np.float32]:
+    return np.minimum(np.float32(255 * gain) * light, np.float32(255))
 
 
 class Matchability:
@@ -173,51 +174,50 @@ class Matchability:
         if scenario.plan.height == "floor":
             highest_m += terrain.highest_m
         self.depths_m = np.geomspace(0.8 * nearest, 1.2 * (highest_m - terrain.lowest_m), _DEPTHS)
-        images = FloorImages(scenario, illumination)
-        self._set_image_scale(images, floor_albedos(images, terrain, self.depths_m))
-        self.dependence = position_dependence(images, self.medium_depth_m, self.binning)
-        self.texture = window_texture(self._texture_signal(images, terrain), self.dependence.gradients)
+        images, rng = FloorImages(scenario, illumination), np.random.default_rng(0)
+        albedos = floor_albedos(images, terrain, self.depths_m)
+        found = [images.matched(albedo, z, rng) for albedo, z in zip(albedos, self.depths_m, strict=True)]
+        self._set_image_scale(images, albedos, found)
+        light = images.components(albedos[_MIDDLE], self.medium_depth_m)
+        self.dependence = position_dependence(light.direct, found[_MIDDLE].noise)
+        signal = matching.gray(found[_MIDDLE].signal, self.binning)
+        self.texture = window_texture(signal, self.dependence.gradients)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
-        self.lamp_share = lamp_share(images)
+        self.lamp_share = lamp_share(images, light.floor_lx, self.medium_depth_m)
 
     @property
     def medium_bound_px(self) -> float:
         """Returns the Cramér-Rao bound of a patch's position at `medium_depth_m` [px of the binned images]."""
-        return self.bound_at(self.medium_depth_m)
-
-    @property
-    def window_bounds_px(self) -> Array:
-        """Returns the bound (m,) of the median window of dense matching at `depths_m` [px of the binned images]."""
-        return self.bounds_px * self.texture.median_ratio
+        return float(self.bounds_px[_MIDDLE])
 
     @property
     def medium_depth_m(self) -> float:
         """Returns the geometric mean of the smallest and the largest of `depths_m` [m]."""
-        return float(np.sqrt(self.depths_m[0] * self.depths_m[-1]))
+        return float(self.depths_m[_MIDDLE])
 
-    def _set_image_scale(self, images: FloorImages, albedos: list[Image]) -> None:
+    def _set_image_scale(self, images: FloorImages, albedos: list[Image], found: Sequence[MatchedImages]) -> None:
         """Sets `binning`, `bounds_px` and `clear_share`."""
-        best_px = np.inf
+        self.bounds_px, patch_px = np.zeros(0), images.scenario.estimator_settings().patch_px
         for binning in BINNINGS:
             if images.rig.width_px % binning or images.rig.height_px % binning:
                 break
-            found = precision(images, albedos, self.depths_m, binning)
-            medium_px = float(np.interp(self.medium_depth_m, self.depths_m, found.bounds_px))
-            if binning == BINNINGS[0] or medium_px < best_px:
-                best_px, self.binning, (self.bounds_px, self.clear_share) = medium_px, binning, found
-            if medium_px < _CORNERS_BOUND_PX:
+            bounds, clear = np.array([one.bound_px(patch_px, binning) for one in found]), np.ones(len(found))
+            if images.scenario.snow.density_per_m3 > 0:
+                pairs = zip(albedos, self.depths_m, found, strict=True)
+                bounds, clear = np.array([in_snow(images, *one, binning) for one in pairs]).T
+            if not self.bounds_px.size or bounds[_MIDDLE] < self.medium_bound_px:
+                self.binning, self.bounds_px, self.clear_share = binning, bounds, clear
+            if bounds[_MIDDLE] < _CORNERS_BOUND_PX:
                 break
 
-    def _texture_signal(self, images: FloorImages, terrain: terrains.Terrain) -> NDArray[np.floating]:
-        """Returns the part (rows, cols) of the grey image at the medium depth that the texture causes [grey levels]."""
-        (albedo,) = floor_albedos(images, terrain, np.array([self.medium_depth_m]))
-        radiance, untextured = images.pair(albedo, self.medium_depth_m)
-        gain = images.sensor().meter(radiance).gain
-        return _grey(radiance, gain, self.binning) - _grey(untextured, gain, self.binning)
+    def bound_at(self, depth_m: Array | float) -> Array:
+        """Returns the Cramér-Rao bound of a patch's position [px of the binned images] at depths [m].
 
-    def bound_at(self, depth_m: float) -> float:
-        """Returns the Cramér-Rao bound of a patch's position [px of the binned images] at a depth [m]."""
-        return float(np.interp(depth_m, self.depths_m, self.bounds_px))
+        Its logarithm is interpolated by the parabola in the logarithm of the depth, and constant outside the table.
+        """
+        depth_m, bounds_px = np.clip(depth_m, *self.depths_m[[0, -1]]), np.clip(self.bounds_px, *_BOUND_LIMITS_PX)
+        parabola = np.polyfit(np.log(self.depths_m / self.medium_depth_m), np.log(bounds_px), 2)
+        return np.exp(np.polyval(parabola, np.log(depth_m / self.medium_depth_m)))
 
     def clear_share_at(self, depth_m: float) -> float:
         """Returns the fraction of the matches that remain in the presence of marine snow, at a depth [m]."""
@@ -228,103 +228,52 @@ class Matchability:
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
-def precision(images: FloorImages, albedos: list[Image], depths_m: Array, binning: int = 1) -> Precision:
-    """Returns the precision of matching a floor with an albedo image for each of its depths (m,).
-
-    `binning` is the side of the squares of pixels that are averaged to one pixel [px].
-    """
-    rng = np.random.default_rng(0)
-    if images.snowy:
-        found = [_in_snow(images, albedo, z, binning) for albedo, z in zip(albedos, depths_m, strict=True)]
-        return Precision(*np.array(found).T)
-    bounds = [_bound_px(images, albedo, z, rng, binning) for albedo, z in zip(albedos, depths_m, strict=True)]
-    return Precision(np.array(bounds), np.ones(len(depths_m)))
-
-
-class _MatchedImages(NamedTuple):
-    """Binned grey images (rows, cols) [grey levels]: the part that texture causes; difference of two with noise."""
-
-    signal: NDArray[np.floating]
-    difference: NDArray[np.floating]
-
-
-def _matched_images(
-    sensor: Sensor, textured: Radiance, untextured: Radiance, binning: int, rng: np.random.Generator
-) -> _MatchedImages:
-    setting = sensor.meter(textured)
-    signal = _grey(textured, setting.gain, binning) - _grey(untextured, setting.gain, binning)
-    return _MatchedImages(signal, _noise_difference(sensor, textured, setting, binning, rng))
-
-
-def _noise_difference(
-    sensor: Sensor, light: Radiance, setting: ExposureSetting, binning: int, rng: np.random.Generator
-) -> NDArray[np.floating]:
-    first, second = (matching.gray(sensor.image(light, setting, rng).astype(np.float32), binning) for _ in range(2))
-    return first - second
-
-
-def _bound_px(images: FloorImages, albedo: Image, depth_m: float, rng: np.random.Generator, binning: int) -> float:
-    """Returns the Cramér-Rao bound [px of the binned images] for a level floor at a depth, with an albedo image."""
-    matched = _matched_images(images.sensor(), *images.pair(albedo, depth_m), binning, rng)
-    noise = float(matched.difference.std()) / np.sqrt(2)
-    gradient = float(np.sqrt(np.mean(np.diff(matched.signal, axis=1) ** 2)))
-    return np.sqrt(2) * noise / (images.scenario.estimator_settings().patch_px * max(gradient, 1e-6))
-
-
-def _in_snow(images: FloorImages, albedo: Image, depth_m: float, binning: int) -> tuple[float, float]:
+def in_snow(
+    images: FloorImages, albedo: Image, depth_m: float, matched: MatchedImages, binning: int
+) -> tuple[float, float]:
     """Returns the bound [px of the binned images] and the fraction of matches that remain in snow, at one depth."""
     clean, snowy = images.snow_views(albedo, depth_m)
-    sensor = images.sensor()
-    setting = sensor.meter(snowy[0])
-    difference = _noise_difference(sensor, clean[0], setting, binning, np.random.default_rng(0))
-    noise = float(difference.std()) / np.sqrt(2)
-    signals = [[_grey(light, setting.gain, binning) for light in lights] for lights in (clean, snowy)]
+    gain = sensor_of(images.scenario, images.rig).meter(snowy[0]).gain
+    noise = float(matching.gray(matched.noise, binning).std()) / np.sqrt(2)
+    signals = [[matching.gray(_levels(light, gain), binning) for light in lights] for lights in (clean, snowy)]
     effect = snow_effect(signals[0], signals[1], noise, images.scenario.estimator_settings().patch_px)
     return float(np.sqrt(effect.variance_px2)), effect.matched_share
 
 
-def _grey(light: Radiance, gain: float, binning: int) -> NDArray[np.floating]:
-    """Returns the binned grey image (rows, cols) of a radiance (H, W, 3) without noise [grey levels]."""
-    return matching.gray(np.minimum(255 * gain * light, 255).astype(np.float32), binning)
+def lamp_share(images: FloorImages, floor_lx: Radiance, depth_m: float) -> float:
+    """Returns the fraction of the light reflected by a level floor that is due to the lamps.
 
-
-def lamp_share(images: FloorImages) -> float:
-    """Returns the fraction of the light reflected by a level floor at the planned altitude that is due to the lamps."""
+    Args:
+        floor_lx: (H, W, 3) illuminance of the floor by lamps and daylight [lx].
+        depth_m: depth of the floor.
+    """
     scenario = images.scenario
     if not scenario.lamps or scenario.sun.illuminance_lx == 0:
         return float(bool(scenario.lamps))
-    return 1 - images.reflected(lamps=False) / max(images.reflected(lamps=True), np.finfo(float).tiny)
+    depth = np.full(floor_lx.shape[:2], depth_m, np.float32)
+    unlit_lx = Optics(images.rig, images.illumination, ()).floor_lx(depth, 0)
+    back = np.exp(-images.illumination.water.camera_loss_per_m * depth_m)
+    lit, unlit = (float(np.nan_to_num(lx * back).mean()) for lx in (floor_lx, unlit_lx))
+    return 1 - unlit / max(lit, np.finfo(float).tiny)
 
 
-def position_dependence(images: FloorImages, depth_m: float, binning: int = 1) -> PositionDependence:
-    """Returns the dependence of matching on the position in the image, for a level floor at a depth [m].
+def position_dependence(contrast: Radiance, noise: NDArray[np.float32]) -> PositionDependence:
+    """Returns the dependence of matching on the position in the image.
 
-    Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The floor has a
-    random texture whose statistics are the same everywhere. The squares of gradients and noise are averaged over each
-    block, and their logarithms are smoothed by a polynomial in the position, because a block of binned images has few
-    pixels. The result is `NO_DEPENDENCE` if a block shows no texture or no noise.
+    Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The gradients of
+    an even texture are proportional to the unscattered light of an even floor. The squares of gradients and noise are
+    averaged over each block; the logarithm of the noise is smoothed by a polynomial in the position. The result is
+    `NO_DEPENDENCE` if a block has no light or no noise.
+
+    Args:
+        contrast: (H, W, 3) unscattered light of an even floor [cd/m2].
+        noise: (H, W, 3) difference of two images by their noise [grey levels].
     """
-    rng, sensor, shape = np.random.default_rng(0), images.sensor(), (images.rig.height_px, images.rig.width_px)
-    gradients, noise = np.zeros(_BLOCKS), np.zeros(_BLOCKS)
-    for _ in range(binning):
-        lights = images.pair(_random_albedo(shape, binning, rng), depth_m)
-        matched = _matched_images(sensor, *lights, binning, rng)
-        gradients += _block_means(np.diff(matched.signal, axis=1) ** 2)
-        noise += _block_means(matched.difference**2)
-    if not gradients.min() > 1e-12 * binning or not noise.min() > 0:
+    gradients, variance = (_block_means(matching.gray(image) ** 2) for image in (contrast, noise))
+    if not gradients.min() > 1e-12 * gradients.max() or not variance.min() > 0:
         return NO_DEPENDENCE
-    noise, gradients = (_smooth(values) / values.mean() for values in (noise, gradients))
-    return PositionDependence(np.sqrt(noise / gradients), np.sqrt(gradients))
-
-
-def _random_albedo(shape: tuple[int, int], binning: int, rng: np.random.Generator) -> Image:
-    """Returns an albedo image (H, W, 3) of a grey random texture: equal variance in octaves from `binning` px up."""
-    albedo = np.full(shape, _GRAY, np.float32)
-    for octave in range(_OCTAVES):
-        side_px = binning * 2**octave
-        coarse = rng.standard_normal([-(-n // side_px) for n in shape], np.float32)
-        albedo += _CONTRAST * cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_LINEAR)
-    return np.repeat(np.clip(albedo, 0, 255).round().astype(np.uint8)[..., None], 3, axis=2)
+    gradients, variance = gradients / gradients.mean(), _smooth(variance) / variance.mean()
+    return PositionDependence(np.sqrt(variance / gradients), np.sqrt(gradients))
 
 
 def _block_means(values: NDArray[np.floating]) -> Array:
@@ -338,6 +287,31 @@ def _smooth(values: Array) -> Array:
     terms = np.column_stack([u**i * v**k for i in range(5) for k in range(5 - i)])
     fitted = terms @ np.linalg.lstsq(terms, np.log(values).ravel(), rcond=None)[0]
     return np.exp(fitted).reshape(values.shape)
+
+
+def window_texture(signal: NDArray[np.floating], relative_gradients: Array) -> WindowTexture:
+    """Returns the distribution of the bound over the windows of dense matching.
+
+    The bound of an image contains the RMS gradient of the whole image. Dense matching fits a plane of disparities in a
+    small Gaussian window, so the bound of a pixel contains the RMS gradient in that window. Over even texture, such as
+    sand, it is nearly the same in all windows; over reefs, it is several times larger at bright edges than in dark
+    areas without texture. Gradients also vary with the light over the image; that part is removed, because it belongs
+    to the position in the image (`PositionDependence`). The result is `EVEN_TEXTURE` for an image that has no texture
+    or is smaller than a window.
+
+    Args:
+        signal: (rows, cols) grey levels of the part of the image that the texture causes, without noise.
+        relative_gradients: (r, c) RMS gradients of an even texture in blocks of the image, relative to the whole image.
+    """
+    squares = np.diff(signal.astype(np.float64), axis=1) ** 2
+    squares /= cv2.resize(np.square(relative_gradients), squares.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    whole, inner = float(np.sqrt(squares.mean())), TEXTURE_WINDOW_PX // 2
+    # the running sums of the blur end just below zero in windows without texture
+    means = np.maximum(cv2.blur(squares, (TEXTURE_WINDOW_PX,) * 2)[inner:-inner, inner:-inner], 0)
+    if whole == 0 or not means.size:
+        return EVEN_TEXTURE
+    relative = np.maximum(np.sqrt(means) / whole, _WEAKEST)
+    return WindowTexture(1 / float(np.median(relative)), float(np.std(np.log(relative))))
 
 
 def unevenness_px(

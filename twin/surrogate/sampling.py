@@ -35,7 +35,7 @@ def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
 @kernel
 def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
-    bias_fraction, relief_sigma, common_bias, distance_growth, common_sigma, inflation, noise_share,
+    bias_fraction, relief_sigma, distance_growth, common_sigma, noise_share,
 ):  # fmt: skip
     """Samples the motion between two keyframes: estimates it from points with sampled noise.
 
@@ -54,7 +54,8 @@ def sample_link(
             [m]; table of the measured positions of true points (`measured_view.ViewTable`).
         cov: (3, 3) reported covariance of a point (x, y, disparity) in either stereo pair.
         error_root: (3, 3) lower Cholesky factor of the true covariance of a point in either stereo pair.
-        distance_growth: growth of the true and of the reported variance in the earlier pair with distance / depth.
+        distance_growth: growth of the variance in the earlier pair with distance / depth.
+        common_sigma: standard deviation of the bias that all points of a link share.
         noise_share: number of points divided by the number of matches that they represent: the variance of the mean of
             independent matches that a point represents, divided by that of a single match.
 
@@ -63,7 +64,7 @@ def sample_link(
         Motion and covariance are valid only if at least `MIN_POINTS` points are seen.
     """
     focal, cx, cy, width, height, margin, baseline, table = camera
-    earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_bias
+    earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_sigma
     transferred, _, _ = observation_equations.transfer(points, earlier_from_later, baseline)
     inverse_depth = np.mean(points[:, 2]) / baseline
     distance = inverse_depth * earlier_from_later[:3, 3]  # in units of depth
@@ -109,7 +110,7 @@ def sample_link(
         inverse = np.linalg.inv(normal)
         motion = motion @ geometry.exp(inverse @ right)
     common = inverse @ bias_jacobian * common_sigma
-    return n, motion, inverse * inflation + common @ common.T
+    return n, motion, inverse + common @ common.T
 
 
 @kernel
@@ -163,7 +164,7 @@ def measured_motion(points, earlier_pose, later_pose, camera, cov):
     noise, cells, normals = np.zeros(points.shape), np.zeros((1, 1, 3)), np.zeros((len(points) + 1, 3))
     return sample_link(
         points, noise, cells, np.zeros((1, 1, 2)), normals, earlier_pose, later_pose, camera, cov, np.zeros((3, 3)),
-        0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0,
+        0.0, 0.0, 0.0, 0.0, 1.0,
     )[1]  # fmt: skip
 
 

@@ -163,9 +163,8 @@ def surrogate_vision(
     view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
     floor = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
     heights = true_heights(mission.grid, terrain.height_at)
-    depth_m = float(np.sqrt(matchability.depths_m[0] * matchability.depths_m[-1]))
     rig = mission.rig.binned(matchability.binning)
-    map_model = MapModel(mission.grid, heights, rig, floor, depth_m, view.table, matchability.dependence.bounds)
+    map_model = MapModel(mission.grid, heights, rig, floor, matchability, view)
     scene = TrueScene(true_pose, floor, matchability, map_model, view)
     rng = streams(scenario.seed)["surrogate"]
     return SurrogateVision(rig, scenario.estimator_settings(), model, scene, rng, stopwatch)

@@ -33,20 +33,11 @@ from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
 from twin.surrogate.error_model import ErrorModel
-from twin.surrogate.map_model import (
-    CellErrors,
-    MapModel,
-    depth_errors,
-    edge_border_factor,
-    heavy_tailed,
-    window_noise,
-)
+from twin.surrogate.map_model import MapModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, MeasuredView
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
 
-_BORDER_STEPS = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0])  # tabulated distances, in widths of `border_error`
-_BOUND_RATIOS = np.geomspace(0.25, 8.0, 21)  # tabulated ratios of a bound to that of the whole image
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
 _CORNER_AREA_PX2 = 75.0  # smallest image area per detected corner, in rendered surveys
@@ -223,7 +214,7 @@ class SurrogateVision:
                 self.stereo_observations.append(StereoObservation(row, 0, None))
                 return None
             mean_m = float(depth_m[hits].mean())
-            bound_px = scene.matchability.bound_at(mean_m)
+            bound_px = float(scene.matchability.bound_at(mean_m))
             n_points = len(hits) / len(self._rays) * model.point_fraction(bound_px) * self.n_corners
             clear_share = scene.matchability.clear_share_at(mean_m)
             matched = self._are_matched(hits, depth_m)
@@ -242,16 +233,15 @@ class SurrogateVision:
             cells = floor_cells(pose, points, self.rig.baseline_m)
             observation, noise_ratio = StereoObservation(row, int(n_points), None), 1.0
             if self._rows is not None:
-                observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px))
+                observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px, 0.0))
             self.stereo_observations.append(observation)
             self._pose_at[row] = pose
             latest = self._latest = KeyframeTruth(
                 pose, points, hits, noise, bound_px, unevenness_px, n_points, self.rig.baseline_m, *unit, cells,
                 clear_share, noise_ratio,
             )  # fmt: skip
-            sigma_px = match_sigma_px(model, bound_px, latest.stereo_parallax_px) * np.sqrt(n / n_points)
-            error_root = self._unit_root.T * sigma_px * model.match_error_ratio
-            measured = true_measured + noise.reshape(-1, 3)[hits] @ error_root
+            sigma_px = model.match_sigma_px(bound_px, latest.stereo_parallax_px) * np.sqrt(n / n_points)
+            measured = true_measured + noise.reshape(-1, 3)[hits] @ (self._unit_root.T * sigma_px)
             sigma_px *= noise_ratio
             xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
             cov = np.broadcast_to(self._unit_cov * sigma_px**2, (n, 3, 3))
@@ -281,10 +271,10 @@ class SurrogateVision:
 
     def restart_tracking(self) -> None:
         model = self.model
-        if model.match_fraction(self.latest.bound_px) * self.latest.clear_share < MIN_MATCHED:
+        if model.rematched(self.latest.bound_px) * self.latest.clear_share < MIN_MATCHED:
             return  # vision is lost until the next keyframe
-        root, cov = self._motion_errors(model.f2f_sigma_px(self.latest.bound_px))
-        independent = model.f2f_error_ratio / np.sqrt(1 + model.f2f_anticorrelation**2)
+        root, cov = self._motion_errors(float(model.difference_sigma_px(self.latest.bound_px)))
+        independent = 1 / np.sqrt(1 + model.f2f_anticorrelation**2)
         gain = self.scene.view.motion_gain(self.latest.points, self.rig.baseline_m)
         self._f2f = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
         self.last_normals, self._tracking_cov = np.zeros(6), cov
@@ -299,13 +289,13 @@ class SurrogateVision:
         if view is None:
             return None
         points, pose = self.latest.points, self.latest.pose
-        cov = self._unit_cov * self.model.match_sigma_px(self.latest.bound_px) ** 2
+        cov = self._unit_cov * self.model.match_sigma_px(self.latest.bound_px, 0.0) ** 2
         measured = np.array([
             sampling.measured_motion(points, self._poses[number], pose, self._camera, cov)
             for number in view.numbers
         ])  # fmt: skip
         mean = sampling.mosaic_correction(view.estimated, measured, view.fractions, world_from_camera)
-        root, cov = self._motion_errors(self.model.mosaic_sigma_px(self.latest.bound_px) / np.sqrt(view.coverage))
+        root, cov = self._motion_errors(self.model.mosaic_sigma_px / np.sqrt(view.coverage))
         error = root @ self.draw_normals(1)[0] * self.model.mosaic_error_ratio
         correction = Motion(geometry.exp(mean + error), cov, len(self.latest.points), 1.0)
         return Registration(correction, view.numbers[int(np.searchsorted(np.cumsum(view.fractions), 0.5))])
@@ -346,25 +336,19 @@ class SurrogateVision:
         """
         n, parallax_px = len(later.points), later.parallax_px(earlier.pose)
         bound_px = max(later.bound_px, earlier.bound_px)
-        stereo_sigma_px = match_sigma_px(model, bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
-        clear_share = min(later.clear_share, earlier.clear_share)
-        match_fraction = (
-            clear_share * model.match_fraction(bound_px) / (1 + (parallax_px / model.match_parallax_px) ** 2)
-        )
+        stereo_sigma_px = model.match_sigma_px(bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
+        match_fraction = min(later.clear_share, earlier.clear_share) * model.rematched(bound_px)
         n_matches = later.n_points * match_fraction
         inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
         noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
-        sigma_px = stereo_sigma_px * noise_scale
-        lamp_factor = np.hypot(1, model.lamp_error_growth * self.lamp_share)
-        error_ratio = model.match_error_ratio * lamp_factor
-        normals = self._link_normals(number, other, n + 1)
+        sigma_px, lamp_factor = stereo_sigma_px * noise_scale, model.lamp_factor(self.lamp_share)
         in_view, motion, cov = sampling.sample_link(
-            later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise, normals,
-            earlier.pose, later.pose, self._camera, self._unit_cov * (sigma_px * later.noise_ratio) ** 2,
-            self._unit_root * (sigma_px * error_ratio), model.match_bias_fraction,
+            later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise,
+            self._link_normals(number, other, n + 1), earlier.pose, later.pose, self._camera,
+            self._unit_cov * (sigma_px * later.noise_ratio) ** 2, self._unit_root * (sigma_px * lamp_factor),
+            model.match_bias_fraction,
             model.relief_gain * lamp_factor * later.unevenness_px / self.rig.focal_px * noise_scale,
-            model.common_bias_px / self.rig.focal_px, model.distance_growth,
-            COMMON_BIAS_PX / self.rig.focal_px, model.match_covariance_inflation, single,
+            model.distance_growth, COMMON_BIAS_PX / self.rig.focal_px, single,
         )  # fmt: skip
         n_matched = int(in_view / n * later.n_points * match_fraction)
         if in_view < sampling.MIN_POINTS or n_matched < _MIN_POINTS or match_fraction < MIN_INLIER_SHARE:
@@ -372,8 +356,7 @@ class SurrogateVision:
         # relief increases the variance of the difference of a match's two image positions, 2 sigma^2 without it
         growth = 1 + (model.relief_gain * parallax_px) ** 2 / (2 * stereo_sigma_px**2)
         residual = np.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
-        lamp_growth = 1 + (model.lamp_sigma_growth * self.lamp_share) ** 2
-        return Motion(motion, cov * growth * lamp_growth, n_matched, float(residual))
+        return Motion(motion, cov * growth, n_matched, float(residual))
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns standard normal numbers (n, 3) of a link; in a survey, they depend only on its keyframe numbers."""
@@ -389,54 +372,19 @@ class SurrogateVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        model, mapper, map_model = self.model, elevation.ElevationMapper(grid), self.scene.map_model
-        errors = self._cell_errors(model, (grid.rows, grid.cols))
+        mapper, map_model, rng = elevation.ElevationMapper(grid), self.scene.map_model, self._rng
+        noise = map_model.new_noise(self.model, rng)
         estimated = result.final.world_from_camera[result.keyframe_rows]
         true = [self._pose_at[row] for row in result.keyframe_rows.tolist()]
-        following = None
-        for k, pose in enumerate(estimated):
-            observed = map_model.observe(true[k], pose) if following is None else following
-            is_last = k == len(estimated) - 1
+        following = map_model.observe(true[0], estimated[0]) if true else None
+        for k, cov in enumerate(result.node_cov):
+            observed, is_last = following, k == len(true) - 1
             following = None if is_last else map_model.observe(true[k + 1], estimated[k + 1])
-            patch = map_model.sample_patch(observed, following, result.node_cov[k], errors, self._rng)
+            patch = observed and map_model.sample_patch(observed, following, cov, self.model, noise, rng)
             if patch is not None:
                 mapper.fuse(patch)
             progress(k + 1)
         return mapper.result()
-
-    @np.errstate(invalid="raise")
-    def _cell_errors(self, model: ErrorModel, shape: tuple[int, int]) -> CellErrors:
-        """Samples the errors of the depths of the Kalman filter, for a map with (rows, cols) cells."""
-        lateral_noise, dropout = self._rng.standard_normal(shape, np.float32), self._rng.random(shape, np.float32)
-        cells = self.scene.map_model.correlated_cells
-        relief_noise, cell_noise, wall_noise = (window_noise(shape, cells, self._rng) for _ in range(3))
-        edge_noise = heavy_tailed(wall_noise)
-        level, ratio = self._rng.standard_normal(2) * [model.depth_survey_scatter, model.depth_ratio_scatter]
-        matchability, laws = self.scene.matchability, depth_errors(model, self.scene.matchability)
-        window_px = matchability.window_bounds_px
-        border_px = model.border_error.width_px * _BORDER_STEPS
-        bound_ratios, bound_factors = self._bound_factors(model)
-        return CellErrors(
-            lateral_noise, relief_noise, edge_noise, cell_noise, dropout, model.lateral_sigma_px,
-            matchability.depths_m, laws.error_px * float(np.exp(level + ratio)), laws.sigma_px * float(np.exp(level)),
-            laws.cell_scatter, laws.completeness, laws.error_law, laws.sigma_law, model.relief_error_gain,
-            model.relief_error_limit_px, laws.edge_error, model.edge_sigma_gain, model.edge_half_px,
-            model.border_holes.share, model.border_holes.width_px(matchability.bounds_px, self.lamp_share),
-            model.error_scatter_share,
-            border_px, model.border_error(border_px), edge_border_factor(border_px, self.rig.height_px),
-            bound_ratios, *bound_factors,
-            error_noise_share=laws.error_law.noise_share(window_px),
-            sigma_noise_share=laws.sigma_law.noise_share(window_px),
-        )  # fmt: skip
-
-    def _bound_factors(self, model: ErrorModel) -> tuple[Array, list[Array]]:
-        """Returns ratios (q,) of the Cramér-Rao bound to that of the whole image, and two arrays of factors (q,)."""
-        scene = self.scene.matchability
-        medium_px = scene.medium_bound_px * scene.texture.median_ratio
-        laws = model.depth_laws(self.binning)
-        return _BOUND_RATIOS, [
-            law.sigma_px(medium_px * _BOUND_RATIOS, 0.0) / law.sigma_px(medium_px, 0.0) for law in laws
-        ]
 
     def draw_normals(self, n: int) -> Array:
         """Returns the next standard normal numbers (n, 6) of the random stream, which is generated in blocks."""
@@ -445,16 +393,6 @@ class SurrogateVision:
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0
         self._n_used += n
         return self._normals[self._n_used - n : self._n_used]
-
-
-def match_sigma_px(model: ErrorModel, bound_px: float, stereo_parallax_px: float) -> float:
-    """Returns the reported standard deviation of a patch's position in one image [px].
-
-    Args:
-        bound_px: Cramér-Rao bound [px].
-        stereo_parallax_px: RMS parallax of the relief in a patch between the two cameras [px].
-    """
-    return float(np.hypot(model.match_sigma_px(bound_px), model.stereo_relief_gain * stereo_parallax_px))
 
 
 def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:

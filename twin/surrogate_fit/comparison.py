@@ -1,9 +1,8 @@
-"""Statistics that compare image measurements with surrogate measurements and with the truth, for the fit.
+"""Statistics of image measurements compared with the surrogate's and with the truth, for the fit.
 
-During a rendered survey, every measurement is made in the images and is also sampled by the surrogate at the same true
-poses. Most statistics are ratios of the reported standard deviations (image measurement / surrogate), or errors
-relative to the truth, normalised by reported covariances. Image and surrogate measurements have the same geometry,
-which therefore cancels in the ratios.
+During a rendered survey, every measurement is made in the images, and the surrogate samples the same one at the same
+true poses. Reported covariances and errors of motions are expressed as standard deviations of a single match or flow
+vector [px], by the covariance that the surrogate reports for one of unit standard deviation.
 """
 
 from __future__ import annotations
@@ -13,6 +12,7 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from twin.core import geometry
@@ -23,32 +23,22 @@ from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
-from twin.surrogate.error_model import BinnedDepthLaw, BorderErrorLaw, DepthLaw, ErrorModel, ScatterLaw, SigmaLaw
-from twin.surrogate.map_model import WALL_SLOPE
+from twin.surrogate.error_model import ErrorModel
+from twin.surrogate.floor_relief import WALL_SLOPE
 from twin.surrogate.vision import SurrogateVision
 
-_MIN_CELLS = 200  # smallest number of cells of a class; half as many near borders, a tenth for fractions of holes
-_STEEP_SLOPE = 0.6  # rise over run that level cells do not reach
+_MIN_CELLS = 100  # smallest number of cells of a class
 _VIEW_BINS = (1, 2, 3, 4, 6, 9, 15, 26, 10_000)  # first number of keyframes of each class of level cells, and the end
-ROUGH_PX = 0.25  #: roughness that smooth and level cells do not reach [px]
-#: Classes of level cells by name, with their lowest and highest roughness.
-_RELIEF_BINS_PX = {"smooth": (0.0, 0.03), "rough": (0.03, 0.08), "rougher": (0.08, ROUGH_PX)}
-_EDGE = "edge"  # first part of the names of the classes of cells near walls
-_EDGE_BINS = (0.15, 0.3, 0.5, 0.8, 1.2, np.inf)  # `edge_strength` of these classes
-_ROUGHNESS_BINS_PX = (0.0, ROUGH_PX, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
-_BORDER_BINS_PX = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0, 20.0)  # see `MapModel.border_px`
-_DISTANCE_BINS_PX = (0.0, 2.0, 4.0, 7.0, 12.0, 20.0, 40.0)  # see `MapModel.border_distance_px`
-_GROSS = 5.0  # error / sigma beyond which an error counts as a gross error
+_ROUGHNESS_BINS_PX = (0.0, 0.03, 0.08, 0.25)  # ends of the roughness of the classes of level cells
+_EDGE_BINS = (0.15, 0.3, 0.5, 0.8, 1.2, np.inf)  # ends of the strength of edges of the classes of cells near walls
+_HOLE_ROUGHNESS_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, np.inf)
+_HOLE_BORDER_PX = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.5, 7.0, 10.0, 15.0)
+_INNER_PX = 20.0  # distance from the border of the images beyond which the border has no effect
+_NORMAL_MEDIAN = 0.6745  # of the absolute value of a standard normal variable
 _HEAVY_P90 = 1.562  # 90th percentile of the absolute value of `map_model.heavy_tailed`
-_NORMAL_P90 = 1.2816  # 90th percentile of a standard normal variable
-_NONE = DepthLaw(1e-4, 0.0, 0.0, 1.0, 0.0, 0.0)
-_NO_CHANGE = BinnedDepthLaw(1.0, 1.0, _NONE.common, _NONE.gain, _NONE.noise_gain)
-UNIT_PX = 0.1  #: standard deviation of the depth in the sampled map "depth", for any number of keyframes [px]
-#: Quantities of a class of map cells, in the order of the statistic `map_<error or sigma>_<class>`: variances of the
-#: maps from images and sampled maps [m^2], and conditions of the class.
-MAP_STATISTICS = ("images", "pose", "depth", "lateral", "edge", "all", "views", "step_baselines", "roughness_px")
-#: Parameter values of the models of `single_error_models`, in which one error source acts alone.
-BIAS_FRACTION, RELIEF_GAIN = 0.8, 0.2
+_UPPER_TAIL = 1.2816  # 90th percentile of a standard normal variable
+#: Parameters of `single_error_models`; the relief gain is so large that the bias common to all points is negligible.
+RELIEF_GAIN, BIAS_FRACTION = 10.0, 0.8
 
 
 class ComparisonVision:
@@ -60,9 +50,9 @@ class ComparisonVision:
         true_pose: returns the current true pose (4, 4) of the left camera.
 
     Attributes:
-        statistics: samples by name. `..._sigma_ratio` is the ratio of the standard deviation reported for the image
-            measurement to the one that the surrogate reports. `..._nees...` is a squared error or difference,
-            normalised by a reported covariance and divided by the number of degrees of freedom.
+        statistics: samples by name; see `fit`.
+        classes: for each class of map cells, the measured values and the medians of the conditions of its cells, by
+            name of the kind of value.
     """
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
@@ -70,9 +60,8 @@ class ComparisonVision:
         self.stereo_observations = images.stereo_observations
         self.runs_in_background = images.runs_in_background
         self.statistics: dict[str, list[float]] = defaultdict(list)
+        self.classes: dict[str, list[list[float]]] = defaultdict(list)
         self.statistics["lamp_share"] = [surrogate.lamp_share]
-        texture = surrogate.scene.matchability.texture
-        self.statistics["window_ratio"], self.statistics["texture_scatter"] = [texture.median_ratio], [texture.scatter]
         self._poses: dict[int, Array] = {}
         self._last_node = -1
         self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the chain's previous link
@@ -80,32 +69,36 @@ class ComparisonVision:
         self._frames: list[tuple[Array, Array]] = []  # error and covariance of each F2F motion since the last keyframe
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        (measured, status), (sampled, _) = self.images.track_frame(frame), self.surrogate.track_frame(frame)
+        (measured, status), _ = self.images.track_frame(frame), self.surrogate.track_frame(frame)
         last, self._last_pose = self._last_pose, self._true_pose()
         self.statistics["frame_lost"].append(float(status != "ok"))
-        if last is not None and status == "ok" and measured.n_points:
-            true = geometry.inverse(last) @ self._last_pose
-            self.statistics["f2f_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
-            errors = [geometry.log(geometry.inverse(true) @ motion.a_from_b) for motion in (measured, sampled)]
-            self.statistics["f2f_nees"].append(_chi2(errors[0], measured.cov) / 6)
-            self.statistics["f2f_nees_surrogate"].append(_chi2(errors[1], sampled.cov) / 6)
-            self._frames.append((errors[0], measured.cov))
+        if last is not None and status == "ok" and measured.n_points and self.surrogate.frame_errors is not None:
+            true, unit = geometry.inverse(last) @ self._last_pose, self._unit_cov()
+            error = geometry.log(geometry.inverse(true) @ measured.a_from_b)
+            self.statistics["f2f_reported_px"].append(_sigma_ratio(measured.cov, unit))
+            self.statistics["f2f_error_px"].append(float(np.sqrt(_chi2(error, unit) / 6)))
+            self._frames.append((error, unit))
         return measured, status
+
+    def _unit_cov(self) -> Array:
+        """Returns the covariance (6, 6) of a frame-to-frame motion for flow vectors of 1 px."""
+        return self.surrogate.latest.unit_cov / self.surrogate.rig.focal_px**2
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         points, sampled = self.images.observe_stereo(frame, row), self.surrogate.observe_stereo(frame, row)
         self.statistics["binning"] = [float(self.images.binning), float(self.surrogate.binning)]
         if len(self._frames) > 1:
             error, cov = (np.sum(x, axis=0) for x in zip(*self._frames, strict=True))
-            self.statistics["f2f_interval_nees"].append(_chi2(error, cov) / 6)
+            self.statistics["f2f_interval_px"].append(float(np.sqrt(_chi2(error, cov) / 6)))
             self.statistics["f2f_interval_frames"].append(float(len(self._frames)))
         self._frames = []
         if points is not None and sampled is not None:
-            self.statistics["point_fraction"].append(len(points.xyz) / self.surrogate.n_corners)
-            latest = self.surrogate.latest
+            latest, model = self.surrogate.latest, self.surrogate.model
             traces = [float(np.median(np.trace(x.cov, axis1=1, axis2=2))) for x in (points, sampled)]
-            sigma_ratio = np.sqrt(traces[0] / traces[1] * (len(latest.points) / latest.n_points))
-            self.statistics["match_sigma_ratio"].append(float(sigma_ratio))
+            of_match = np.sqrt(traces[0] / traces[1] * len(latest.points) / latest.n_points) / latest.noise_ratio
+            reported_px = of_match * model.match_sigma_px(latest.bound_px, latest.stereo_parallax_px)
+            self.statistics["match_reported_px"].append(float(reported_px))
+            self.statistics["point_fraction"].append(len(points.xyz) / self.surrogate.n_corners)
             self.statistics["bound_px"].append(latest.bound_px)
             self.statistics["stereo_parallax_px"].append(latest.stereo_parallax_px)
         return points
@@ -121,10 +114,11 @@ class ComparisonVision:
         measured = self.images.register_with_mosaic(world_from_camera)
         sampled = self.surrogate.register_with_mosaic(world_from_camera)
         if measured is not None and sampled is not None:
-            ours, theirs = measured.correction, sampled.correction
-            self.statistics["mosaic_sigma_ratio"].append(_sigma_ratio(ours.cov, theirs.cov))
+            ours, theirs, model = measured.correction, sampled.correction, self.surrogate.model
+            self.statistics["mosaic_reported_px"].append(_sigma_ratio(ours.cov, theirs.cov) * model.mosaic_sigma_px)
             difference = geometry.log(geometry.inverse(theirs.a_from_b) @ ours.a_from_b)
-            self.statistics["mosaic_difference_nees"].append(_chi2(difference, theirs.cov) / 6)
+            of_images = max(_chi2(difference, theirs.cov) / 6 - model.mosaic_error_ratio**2, 0.01)
+            self.statistics["mosaic_error_px"].append(float(np.sqrt(of_images)) * model.mosaic_sigma_px)
         return measured
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
@@ -147,41 +141,36 @@ class ComparisonVision:
         self.surrogate.discard(numbers)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Returns the links measured in images, and adds statistics of their comparison with sampled links.
-
-        Links are sampled with all errors and with one error source at a time (`single_error_models`).
-        """
+        """Returns the links measured in images, and adds statistics of their comparison with sampled links."""
         measured = {"images": self.images.measure_motions(node, others)}
-        models = {"all": self.surrogate.model, **single_error_models(self.surrogate.model)}
-        measured |= {name: self.surrogate.sample_links(node, others, model) for name, model in models.items()}
+        for name, model in single_error_models(self.surrogate.model).items():
+            measured[name] = self.surrogate.sample_links(node, others, model)
         pose = self._poses.get(node.number)
         node_pose = self._true_pose() if pose is None else pose
         for k, other in enumerate(others):
-            links = {name: motions[k] for name, motions in measured.items()}
             true = geometry.inverse(self._poses[other.number]) @ node_pose
-            self._compare_link(other.number, node.number, links, true)
+            self._compare_link(other.number, node.number, {name: found[k] for name, found in measured.items()}, true)
         self._last_node = node.number
         return measured["images"]
 
     def _compare_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
-        """Adds the statistics of one link, measured in images and sampled from each error model."""
-        measured, sampled = links["images"], links["all"]
-        self.statistics["link_failed_images"].append(float(measured is None))
-        self.statistics["link_failed_surrogate"].append(float(sampled is None))
+        """Adds the statistics of one link, measured in images and sampled with one error source at a time."""
+        measured, sampled = links["images"], links["patches"]
+        self.statistics["link_failed"].append(float(measured is None))
         if sampled is not None:
-            self.statistics["link_parallax_px"].append(self.surrogate.latest.parallax_px(self._poses[i]))
-            n_points = 0 if measured is None else measured.n_points
-            self.statistics["link_matched"].append(n_points / sampled.n_points)
-        if measured is None or sampled is None:
+            self.statistics["link_matched"].append((0 if measured is None else measured.n_points) / sampled.n_points)
+        known = {name: motion for name, motion in links.items() if motion is not None}
+        if measured is None or len(known) < len(links):
             return
-        self.statistics["link_sigma_ratio"].append(_sigma_ratio(measured.cov, sampled.cov))
+        cov = known["patches"].cov
+        self.statistics["link_reported_ratio"].append(_sigma_ratio(measured.cov, cov))
         self.statistics["link_distance"].append(self.surrogate.latest.distance_in_depths(true))
-        errors = {name: geometry.log(geometry.inverse(true) @ m.a_from_b) for name, m in links.items() if m is not None}
+        errors = {name: geometry.log(geometry.inverse(true) @ motion.a_from_b) for name, motion in known.items()}
         for name, error in errors.items():
-            self.statistics[f"link_nees_{name}"].append(_chi2(error, sampled.cov) / 6)
+            self.statistics[f"link_nees_{name}"].append(_chi2(error, cov) / 6)
         if i == self._last_node:
             (end, previous), self._last_link = self._last_link, (j, errors)
-            sigma, adjoint = np.sqrt(np.diag(sampled.cov)), geometry.adjoint(geometry.inverse(true))
+            sigma, adjoint = np.sqrt(np.diag(cov)), geometry.adjoint(geometry.inverse(true))
             for name, last in previous.items() if end == i else ():
                 product = float(adjoint @ last / sigma @ (errors[name] / sigma)) / 6
                 self.statistics[f"consecutive_product_{name}"].append(product)
@@ -189,141 +178,94 @@ class ComparisonVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        """Returns the map from images, and adds statistics of its comparison with sampled maps along the same path.
+        """Returns the map from images, and adds its classes of cells.
 
-        There are five sampled maps: one with pose errors alone; three with pose errors and one other kind of error of
-        known size (depth errors of `UNIT_PX`, lateral errors of 1 px, or errors near walls with the gain 1); and one
-        with all errors of the error model, without the scatter of depth errors between surveys.
+        Errors and reported variances are relative to a sampled map without errors of measurement along the same path,
+        so that those due to the poses cancel. Only cells to which one patch contributed are compared.
         """
-        elevation, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
-        none = model._replace(
-            depth_error=_NONE, depth_sigma=_NONE, lateral_sigma_px=0.0, relief_error_gain=0.0,
-            edge_error=SigmaLaw(0.0, 0.0), edge_sigma_gain=0.0, border_error=BorderErrorLaw(0.0, 1.0),
-            depth_texture_scatter=ScatterLaw(0.0, 1.0), depth_survey_scatter=0.0, depth_ratio_scatter=0.0,
-            depth_binned_error=_NO_CHANGE, depth_binned_sigma=_NO_CHANGE,
-        )  # fmt: skip
-        unit = _NONE._replace(floor_px=UNIT_PX)
-        models = {
-            "pose": none,
-            "depth": none._replace(depth_error=unit, depth_sigma=unit),
-            "lateral": none._replace(lateral_sigma_px=1.0),
-            "edge": none._replace(edge_error=SigmaLaw(1.0, 0.0), edge_sigma_gain=1.0),
-            "all": model._replace(depth_survey_scatter=0.0, depth_ratio_scatter=0.0),
-        }
-        maps = {"images": elevation}
-        for name, self.surrogate.model in models.items():
-            maps[name] = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
+        found, model = self.images.build_map(result, grid, step_cov, progress), self.surrogate.model
+        self.surrogate.model = exact_map_model(model)
+        exact = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
         self.surrogate.model = model
-        rig, map_model = self.surrogate.rig, self.surrogate.scene.map_model
-        self.statistics["metres_per_px"] = [map_model.depth_m**2 / (rig.focal_px * rig.baseline_m)]
-        for name, cells in self._cell_classes().items():
-            self._compare_maps(name, cells, maps)
-        self._compare_borders(maps)
-        self._count_holes(elevation)
-        return elevation
-
-    def _compare_maps(self, name: str, cells: np.ndarray, maps: dict[str, ElevationMap]) -> None:
-        """Adds four statistics of a class of cells: variance of errors, reported variance, tail ratio and scatter."""
         map_model = self.surrogate.scene.map_model
-        heights = np.array([elevation.height_m for elevation in maps.values()])
-        known = cells & map_model.seen & np.isfinite(heights).all(axis=0)
-        if known.sum() < _MIN_CELLS:
-            return
-        errors = (heights - map_model.height_m)[:, known].astype(np.float64)
-        sigmas = np.array([elevation.sigma_m[known] for elevation in maps.values()], np.float64)
-        typical = np.median(sigmas, axis=1)
-        normalised = np.abs(errors - np.median(errors, axis=1, keepdims=True)) / np.maximum(sigmas, 1e-12)
-        variances = np.mean(np.square(np.minimum(normalised, _GROSS)), axis=1) * typical**2
-        if name.startswith(_EDGE):
-            centred = np.abs(errors - np.median(errors, axis=1, keepdims=True))
-            variances = np.square(np.percentile(centred, 90, axis=1) / _HEAVY_P90)
-        reported = np.square(typical)
-        names = list(maps)
-        log_ratio = np.log(sigmas[names.index("images")] / sigmas[names.index("depth")])
-        scatter = np.diff(np.percentile(log_ratio, (50, 90))) / _NORMAL_P90
-        conditions = [
-            float(np.mean(map_model.views[known])), float(np.median(map_model.step_baselines[known])),
-            float(np.sqrt(np.mean(self._in_px(map_model.roughness_m)[known] ** 2))),
-        ]  # fmt: skip
-        self.statistics[f"map_error_{name}"] = [*variances.tolist(), *conditions]
-        self.statistics[f"map_sigma_{name}"] = [*reported.tolist(), *conditions]
-        self.statistics[f"map_scatter_{name}"] = scatter.tolist()
-        centred = np.abs(errors - np.median(errors, axis=1, keepdims=True))[[names.index("images"), names.index("all")]]
-        median, p90 = np.maximum(np.percentile(centred, (50, 90), axis=1), 1e-12)
-        self.statistics[f"map_tail_{name}"] = (p90 / median).tolist()
-
-    def _compare_borders(self, maps: dict[str, ElevationMap]) -> None:
-        """Adds the ratios of errors and of reported standard deviations near image borders, images / sampled map."""
-        map_model = self.surrogate.scene.map_model
-        images, sampled = maps["images"], maps["all"]
-        steepest = np.asarray(maximum_filter(map_model.steepness, 2 * map_model.window_cells + 1))
-        level = (
-            map_model.seen
-            & (steepest <= WALL_SLOPE)
-            & (self._in_px(map_model.roughness_m) < _RELIEF_BINS_PX["rough"][1])
-        )
-        level &= np.isfinite(images.height_m) & np.isfinite(sampled.height_m)
-        for low, high in pairwise((*_DISTANCE_BINS_PX, np.inf)):
-            cells = level & (map_model.border_distance_px >= low) & (map_model.border_distance_px < high)
-            if cells.sum() < _MIN_CELLS / 2:
-                continue
-            errors = [np.median(np.abs(x.height_m - map_model.height_m)[cells]) for x in (images, sampled)]
-            sigmas = [np.median(x.sigma_m[cells]) for x in (images, sampled)]
-            self.statistics["border_error_ratio"].append(float(errors[0] / max(errors[1], 1e-12)))
-            self.statistics["border_sigma_ratio"].append(float(sigmas[0] / max(sigmas[1], 1e-12)))
-            self.statistics["border_distance_px"].append(float(np.median(map_model.border_distance_px[cells])))
-
-    def _cell_classes(self) -> dict[str, np.ndarray]:
-        """Returns the masks (rows, cols) of the classes of cells for which the errors of maps are compared, by name."""
-        map_model = self.surrogate.scene.map_model
-        rough = self._in_px(map_model.roughness_m)
-        steepness, views, inner = map_model.steepness, map_model.views, map_model.border_px > _BORDER_BINS_PX[-1]
-        wall, edge = (rough > ROUGH_PX) | (steepness > WALL_SLOPE), self._in_px(map_model.edge_m)
-        plain = inner & ~np.asarray(maximum_filter(wall, 2 * map_model.window_cells + 1), np.bool_)
-        classes = {"steep": plain & (steepness > _STEEP_SLOPE) & (rough < _RELIEF_BINS_PX["smooth"][1])}
-        for low, high in pairwise(_EDGE_BINS):
-            classes[f"{_EDGE}{low:g}"] = inner & (edge >= low) & (edge < high)
-        for name, (smoothest, roughest) in _RELIEF_BINS_PX.items():
-            level = plain & (steepness < _STEEP_SLOPE) & (rough >= smoothest) & (rough < roughest)
-            for low, high in pairwise(_VIEW_BINS):
-                classes[f"{name}{low}"] = level & (views >= low) & (views < high)
-        return classes
-
-    def _in_px(self, height_m: np.ndarray) -> np.ndarray:
-        """Returns heights [m] converted to differences of disparity at the typical depth of the floor [px]."""
-        rig, map_model = self.surrogate.rig, self.surrogate.scene.map_model
-        return height_m * (rig.focal_px * rig.baseline_m / map_model.depth_m**2)
-
-    def _count_holes(self, elevation: ElevationMap) -> None:
-        """Adds the number of observed cells and their fraction with a height, by roughness and border distance."""
-        map_model = self.surrogate.scene.map_model
-        roughness = self._in_px(map_model.roughness_m)
-        seen, border, known = map_model.seen, map_model.border_px, np.isfinite(elevation.height_m)
-        inner, smooth = seen & (border > _BORDER_BINS_PX[-1]), seen & (roughness < ROUGH_PX)
-        for name, values, cells, bins in (
-            ("hole", roughness, inner, _ROUGHNESS_BINS_PX), ("border", border, smooth, _BORDER_BINS_PX),
-        ):  # fmt: skip
+        cells, seen = map_model.conditions, map_model.n_heights == 1
+        inner = seen & (cells.border_px > _INNER_PX)
+        level = cells.roughness_px < _ROUGHNESS_BINS_PX[1]
+        known = np.isfinite(found.height_m).ravel()
+        for bins, values, chosen in (
+            (_HOLE_ROUGHNESS_PX, cells.roughness_px, inner),
+            (_HOLE_BORDER_PX, cells.border_px * np.sqrt(cells.views), seen & level),
+        ):
             for low, high in pairwise(bins):
-                chosen = cells & (values >= low) & (values < high)
-                if chosen.sum() > _MIN_CELLS / 10:
-                    self.statistics[f"{name}_cells"].append(float(chosen.sum()))
-                    self.statistics[f"{name}_known"].append(float(known[chosen].mean()))
-                    self.statistics[f"{name}_px"].append(float(np.median(values[chosen])))
+                self._add_class("known", chosen & (values >= low) & (values < high), lambda one: [known[one].mean()])
+        known &= np.isfinite(exact.height_m).ravel()
+        error_m = (found.height_m.astype(np.float64) - exact.height_m).ravel()
+        variance = np.square(found.sigma_m.astype(np.float64)) - np.square(exact.sigma_m.astype(np.float64))
+        noise_m = np.sqrt(np.maximum(variance, 1e-12)).ravel()
+        plain = inner & known & ~self._near_walls()
+        for low, high in pairwise(_EDGE_BINS):
+            strength = cells.edge_m / np.maximum(cells.metres_per_px, 1e-12)
+            edge = inner & known & (strength >= low) & (strength < high)
+            self._add_class("edge", edge, lambda one: [_p90(error_m[one]) / _HEAVY_P90])
+        for smoothest, roughest in pairwise(_ROUGHNESS_BINS_PX):
+            for low, high in pairwise(_VIEW_BINS):
+                rough = (cells.roughness_px >= smoothest) & (cells.roughness_px < roughest)
+                chosen = plain & rough & (cells.views >= low) & (cells.views < high)
+                self._add_class("level", chosen, lambda one: _level_values(error_m[one], noise_m[one]))
+        return found
+
+    def _near_walls(self) -> NDArray[np.bool_]:
+        """Returns the mask (rows * cols,) of the cells whose matching window shows a wall or an edge."""
+        relief = self.surrogate.scene.map_model.relief
+        wall = (np.hypot(*np.moveaxis(relief.slope, -1, 0)) > WALL_SLOPE) | (relief.edge_m > 0)
+        return np.asarray(maximum_filter(wall, 2 * round(relief.window_cells) + 1), np.bool_).ravel()
+
+    def _add_class(
+        self, kind: str, chosen: NDArray[np.bool_], values: Callable[[NDArray[np.bool_]], Sequence[float]]
+    ) -> None:
+        """Adds a class of cells, if it has enough of them: values, then conditions."""
+        if chosen.sum() < _MIN_CELLS:
+            return
+        conditions = self.surrogate.scene.map_model.conditions
+        medians = [float(np.median(part[chosen])) for part in conditions]
+        self.classes[kind].append([float(value) for value in values(chosen)] + medians)
+
+
+def exact_map_model(model: ErrorModel) -> ErrorModel:
+    """Returns an error model with which every cell in view has a height without errors of measurement."""
+    return model._replace(
+        flow_floor_px=1e-4, efficiency=0.0, texture_scatter=0.0, survey_scatter=0.0, lateral_sigma_px=0.0,
+        relief_error_px=0.0, edge_error=0.0, edge_half_px=1e9, border_holes=0.0, map_half_px=1e9,
+    )  # fmt: skip
 
 
 def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
-    """Returns two error models for links: "patches" without errors due to relief, "relief" with these errors alone.
+    """Returns two error models for links: "patches" without errors due to relief, "relief" with hardly any others.
 
-    In "patches", the relief gain is 0, the match error ratio is 1, without growth under lamps, and the bias fraction is
-    `BIAS_FRACTION`. In "relief", the relief gain is `RELIEF_GAIN`, and the match error ratio and the common bias are 0.
-    The other parameters are those of `model`.
+    Both are without growth under lamps. In "patches", the bias fraction is `BIAS_FRACTION`; in "relief", the relief
+    gain is `RELIEF_GAIN`.
     """
+    no_lamps = model._replace(lamp_growth=0.0)
     return {
-        "patches": model._replace(
-            match_error_ratio=1.0, lamp_error_growth=0.0, match_bias_fraction=BIAS_FRACTION, relief_gain=0.0
+        "patches": no_lamps._replace(match_bias_fraction=BIAS_FRACTION, relief_gain=0.0),
+        "relief": no_lamps._replace(
+            match_floor_px=1e-4, efficiency=0.0, stereo_relief_gain=0.0, relief_gain=RELIEF_GAIN
         ),
-        "relief": model._replace(match_error_ratio=0.0, relief_gain=RELIEF_GAIN, common_bias_px=0.0),
     }
+
+
+def _level_values(error_m: Array, noise_m: Array) -> list[float]:
+    """Returns the robust standard deviation of errors, the median reported one, and the scatter of its logarithm."""
+    logs = np.percentile(np.log(noise_m), (50, 90))
+    return [_median_size(error_m), float(np.exp(logs[0])), float(logs[1] - logs[0]) / _UPPER_TAIL]
+
+
+def _median_size(error_m: Array) -> float:
+    return float(np.median(np.abs(error_m - np.median(error_m)))) / _NORMAL_MEDIAN
+
+
+def _p90(error_m: Array) -> float:
+    return float(np.percentile(np.abs(error_m - np.median(error_m)), 90))
 
 
 def _chi2(error: Array, cov: Array) -> float:

@@ -23,7 +23,7 @@ from twin.surrogate.error_model_file import FittedErrorModel
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.surrogate_world import surrogate_vision
 from twin.surrogate_fit.comparison import ComparisonVision
-from twin.surrogate_fit.fit import SurveyStatistics, fit_error_model, log_misfit
+from twin.surrogate_fit.fit import SurveyStatistics, fit_error_model, misfit
 from twin.world.mission import prepare
 from twin.world.rendered_world import RenderedWorld
 
@@ -35,6 +35,12 @@ _MAX_BOUND_PX = 0.5
 _NEVER_PX = 1e3  # Cramér-Rao bound that no survey has
 _BOUND = "bound_px"
 _CONDITION = "condition_"  # prefix of the names of the conditions in the statistics
+_NEEDED = (
+    "consecutive_product_images",
+    "mosaic_error_px",
+    "f2f_interval_px",
+    "match_reported_px",
+)  # of a complete survey
 
 
 def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> FittedErrorModel:
@@ -52,7 +58,8 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
         raise TwinError("fit-surrogate", f"{len(complete)} surveys are complete", f"at least {_MIN_SURVEYS}")
     fitted = fit_error_model(complete, compared)
     ranges = _fitted_range(complete, [s for s in surveys if _is_lost(s)])
-    return FittedErrorModel(fitted, len(complete), log_misfit(complete, compared, fitted), ranges)
+    largest_px = max(s.median(_BOUND) for s in complete)
+    return FittedErrorModel(fitted, len(complete), largest_px, misfit(complete, fitted, compared), ranges)
 
 
 def comparison_model(model: ErrorModel) -> ErrorModel:
@@ -60,35 +67,34 @@ def comparison_model(model: ErrorModel) -> ErrorModel:
 
     Image measurements in turbid water can then be compared with sampled measurements.
     """
-    points, matches = (law._replace(half_px=_NEVER_PX) for law in (model.point_fraction, model.match_fraction))
-    return model._replace(point_fraction=points, match_fraction=matches)
+    return model._replace(match_half_px=_NEVER_PX)
 
 
 def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveyStatistics]) -> dict[str, Range]:
     """Returns the smallest and the largest value of each condition in the complete surveys, by name of `QUANTITIES`."""
-    values = {name: [x for s in complete for x in s.get(_CONDITION + name, ())] for name in QUANTITIES}
+    values = {name: [x for s in complete for x in s.samples.get(_CONDITION + name, ())] for name in QUANTITIES}
     ranges = {name: (min(found), max(found)) for name, found in values.items() if found}
-    lost_px = [x for s in lost for x in s.get(_CONDITION + _BOUND, ())]
+    lost_px = [x for s in lost for x in s.samples.get(_CONDITION + _BOUND, ())]
     if _BOUND in ranges and max(lost_px, default=0.0) > ranges[_BOUND][1]:
         ranges[_BOUND] = (ranges[_BOUND][0], np.inf)
     return ranges
 
 
 def _is_complete(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey has links and a map, is not lost, and has the same binning as the surrogate."""
-    has_both = "consecutive_product_images" in statistics and "hole_known" in statistics
-    return has_both and _binned_alike(statistics) and not _is_lost(statistics)
+    """Returns whether a survey has links and a map, is not lost, and has the same binning as the surrogate.
+
+    The statistics of images and surrogate are in pixels of binned images.
+    """
+    if not all(name in statistics.samples for name in _NEEDED) or "known" not in statistics.classes:
+        return False
+    images, surrogate = statistics.samples["binning"]
+    return images == surrogate and not _is_lost(statistics)
 
 
 def _is_lost(statistics: SurveyStatistics) -> bool:
     """Returns whether a survey lost more than 20 % of its frames or of its links."""
-    return any(float(np.mean(statistics.get(name, 0.0))) > _MAX_LOST for name in ("frame_lost", "link_failed_images"))
-
-
-def _binned_alike(statistics: SurveyStatistics) -> bool:
-    """Returns whether images and surrogate have the same binning; their statistics are in pixels of binned images."""
-    images, surrogate = statistics["binning"]
-    return images == surrogate
+    samples = statistics.samples
+    return any(float(np.mean(samples.get(name, 0.0))) > _MAX_LOST for name in ("frame_lost", "link_failed"))
 
 
 def all_statistics(
@@ -123,7 +129,7 @@ def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStati
     except TwinError:
         return None
     same = saved["scenario_hash"] == scenario.fingerprint() and saved["model"] == repr(compared)
-    return saved["statistics"] if same else None
+    return SurveyStatistics(*saved["statistics"]) if same else None
 
 
 def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
@@ -132,7 +138,7 @@ def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatis
     matchability = Matchability(scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
     conditions = survey_conditions(mission, matchability)
     if conditions[_BOUND][1] > _MAX_BOUND_PX:
-        return {}
+        return SurveyStatistics({}, {})
     folder.mkdir(parents=True, exist_ok=True)
     with RenderedWorld(mission, stopwatch) as world:
 
@@ -148,7 +154,8 @@ def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatis
                 navigator.build_map(result, mission.grid, lambda _: None)
             except SurveyAborted:
                 pass
-    vision.statistics |= {_CONDITION + name: list(values) for name, values in conditions.items()}
-    saved = {"scenario_hash": scenario.fingerprint(), "model": repr(compared), "statistics": vision.statistics}
+    samples = vision.statistics | {_CONDITION + name: list(values) for name, values in conditions.items()}
+    statistics = SurveyStatistics(samples, vision.classes)
+    saved = {"scenario_hash": scenario.fingerprint(), "model": repr(compared), "statistics": statistics}
     (folder / _FILE).write_text(json.dumps(saved), encoding="utf-8")
-    return vision.statistics
+    return statistics

@@ -148,8 +148,8 @@ class Optics:
         self.lamp_light = [LampLight(sources, self._medium) for sources in self.light_sources]
         scatters = self._medium.scatters_repeatedly
         sunny = scatters and bool(daylight.surface_lx.any())
-        self._veil = DaylightVeil(daylight, table_range_m()) if sunny else None
-        # computed on demand, as some callers need one camera only
+        # computed on demand, as some callers need one camera, or the light of the floor only
+        self._veil = cache(lambda: DaylightVeil(daylight, table_range_m()) if sunny else None)
         self._tables_of = cache(lambda camera: _tables(rig, self._medium, self.lamp_light[camera]))
         self._forward = ForwardScatter(rig, self._medium) if scatters else None
         # working memory of each camera, as both images may be computed at the same time
@@ -217,7 +217,8 @@ class Optics:
         matt = None if floor is None else floor._replace(material=None)
         white, shape = np.full((*depth.shape, 3), 255, np.uint8), (*depth.shape, 3)
         light, loss = np.empty(shape, np.float32), self._medium.camera_loss_per_m
-        self._run((white, depth), camera, matt, surface, _Output(light, np.empty(shape, np.float32)), None, loss)
+        other, focal_px = np.empty(shape, np.float32), self._rig.focal_px  # with a focal length: without backscatter
+        self._run((white, depth), camera, matt, surface, _Output(light, other), focal_px, loss)
         with np.errstate(divide="ignore", invalid="ignore"):
             back = np.exp(-loss * range_of(depth, self._rig)[..., None])
             return np.where(back > LEAST_TRANSMISSION, np.pi * light / back, np.nan).astype(np.float32)
@@ -291,10 +292,11 @@ class Optics:
     def _backscatter(self, camera: int, surface: WaterSurface) -> NDArray[np.float32]:
         """Returns the backscatter of lamps and daylight, in the form of `_Tables.backscatter`."""
         of_lamps = self._tables_of(camera).backscatter
-        if self._veil is None:
+        veil = self._veil()
+        if veil is None:
             return of_lamps
         rays = self._grid_rays[camera] @ world_axes(surface.from_camera)
-        return self._veil.added_to(of_lamps, rays, float(surface.from_camera[2, 3]))
+        return veil.added_to(of_lamps, rays, float(surface.from_camera[2, 3]))
 
 
 def _or(value: Value | None, substitute: Value) -> Value:

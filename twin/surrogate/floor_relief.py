@@ -1,0 +1,101 @@
+"""Relief of the floor within the windows of dense matching, on the grid of a map: slope, roughness and edges."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter, uniform_filter
+
+from twin.core.geometry import Array
+from twin.core.height_field import map_slopes
+from twin.core.records import StereoRig
+
+Map = NDArray[np.float32]
+WINDOW_PX = 11  #: side of the window of dense matching in which relief causes errors
+WALL_SLOPE = 1.0  #: rise over run of the least steep wall
+_LEAST_SLOPE = 0.1  # slope below which errors near walls do not decrease
+
+
+class FloorRelief(NamedTuple):
+    """Relief of a floor, seen by a camera at a typical depth."""
+
+    slope: Map  #: (rows, cols, 2) slope in x and in y [m/m]
+    roughness_m: Map  #: (rows, cols) RMS deviation of the floor from its best-fit plane within the matching window [m]
+    #: (rows, cols) strength of the edges, converted from px of disparity to metres [m px^(-1/2)]; see `edge_strength`
+    edge_m: Map
+    window_cells: float  #: side of the matching window [cells]
+
+
+def floor_relief(height_m: Map, cell_m: float, rig: StereoRig, depth_m: float) -> FloorRelief:
+    """Returns the relief of a floor of heights (rows, cols); in images, NaN is as low as the lowest height.
+
+    Args:
+        rig: calibration of the images that are matched.
+        depth_m: typical depth of the floor along the optical axis.
+    """
+    slope = np.stack(map_slopes(np.asarray(height_m, np.float64), cell_m), axis=-1).astype(np.float32)
+    filled = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
+    window_cells = WINDOW_PX * depth_m / rig.focal_px / cell_m
+    per_m = np.float32(rig.focal_px * rig.baseline_m / depth_m**2)
+    roughness_m = roughness(filled, window_cells)
+    edge_m = edge_strength(roughness_m * per_m, step_slope(filled, cell_m), window_cells) / per_m
+    return FloorRelief(slope, roughness_m, edge_m, window_cells)
+
+
+def roughness(height_m: Array, window_cells: float) -> Map:
+    """Returns the RMS deviation (rows, cols) of the floor from its best-fit plane within a square window [m].
+
+    Its square is the variance of the heights minus the part that a linear regression on both coordinates explains.
+    """
+    side, height = _odd(window_cells), height_m - height_m.mean()
+
+    def mean(values: Array) -> Array:
+        return uniform_filter(values, side, mode="nearest")
+
+    level = mean(height)
+    variance = mean(height**2) - level**2
+    for coordinate in np.indices(height.shape, dtype=np.float64):
+        covariance = mean(height * coordinate) - level * mean(coordinate)
+        variance -= covariance**2 / ((side**2 - 1) / 12)
+    return np.sqrt(np.maximum(variance, 0.0)).astype(np.float32)
+
+
+def step_slope(height_m: Array, cell_m: float) -> Map:
+    """Returns the slope (rows, cols) of the largest steps from a cell to its neighbours in x and in y [m/m].
+
+    A central difference would halve the slope of a wall between two cells.
+    """
+    steps = []
+    for axis in (0, 1):
+        padding = [(1, 1) if k == axis else (0, 0) for k in (0, 1)]
+        step = np.pad(np.abs(np.diff(height_m, axis=axis)), padding)
+        before, after = (step[:-1], step[1:]) if axis == 0 else (step[:, :-1], step[:, 1:])
+        steps.append(np.maximum(before, after))
+    return (np.hypot(*steps) / cell_m).astype(np.float32)
+
+
+def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
+    """Returns the strength of the edges (rows, cols) [px^(1/2)], which determines the errors near walls.
+
+    It is the square root of r s, and 0 where the matching window of the cell shows no wall. The slope s of the cell, at
+    least `_LEAST_SLOPE`, counts because a lateral displacement of the matched edge causes a height error on the face of
+    the wall, and hardly any on the level floor next to the wall. r is the geometric mean of the roughness of the cell
+    and of the largest roughness of the windows that contain the cell: the error is large if the window of the cell
+    shows two surfaces, or if the cell is matched as its neighbours are. The square root is taken because dense matching
+    resolves large structures better.
+
+    Args:
+        roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
+        slope: (rows, cols) slope of the cells [m/m]; see `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
+    """
+    side = _odd(window_cells)
+    near_wall = maximum_filter(slope, side) > WALL_SLOPE
+    mean_px = np.sqrt(roughness_px * np.asarray(maximum_filter(roughness_px, side), np.float32))
+    return np.where(near_wall, np.sqrt(mean_px * np.maximum(slope, _LEAST_SLOPE)), 0).astype(np.float32)
+
+
+def _odd(window_cells: float) -> int:
+    """Returns the side of a window of cells, rounded to an odd number of cells, at least 3."""
+    return 2 * max(round((window_cells - 1) / 2), 1) + 1
