@@ -118,6 +118,7 @@ MUTANTS = [
         ("twin/world/planning.py", "(duration_s + hold_s * plan.n_tracks)", "(duration_s + hold_s)", "world_mission hostile_input"),
         ("twin/world/path_checks.py", "2 * round(side / 2 / terrain.spacing_m) + 1", "2 * round(side / terrain.spacing_m) + 1", "world_planned_surface world_planning"),
         ("twin/surrogate/sampling.py", "(normals[k] - errors.anticorrelation * previous_normals[k])", "(normals[k] + errors.anticorrelation * previous_normals[k])", "surrogate"),
+        ("twin/surrogate/height_errors.py", "/ np.sqrt(1 + gain * (cells.views - 1))", "/ np.sqrt(1 + gain * cells.views)", "surrogate_map"),
         ("twin/session/mission_actions.py", "change_per_s = (target - self._rate) / BRAKING_S", "change_per_s = (target - self._rate) * 4 / BRAKING_S", "session_mission_actions"),
         ("twin/session/survey_check.py", "MAX_OFF_COURSE * min(mission.plan.footprint_m)", "MAX_OFF_COURSE * max(mission.plan.footprint_m)", "session_survey_check"),
         ("twin/gym.py", "velocity = np.array([c * forward - s * left, s * forward + c * left, up])", "velocity = np.array([c * forward + s * left, s * forward - c * left, up])", "gym"),

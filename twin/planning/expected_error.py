@@ -13,7 +13,7 @@ from twin.core.height_field import ray_grid
 from twin.core.image_overlap import RAY_COLUMNS
 from twin.surrogate import error_model_file
 from twin.surrogate.floor_relief import floor_relief
-from twin.surrogate.height_errors import CellConditions, Views, cell_conditions, height_sigmas
+from twin.surrogate.height_errors import CellConditions, KeyframeRuns, cell_conditions, height_sigmas
 from twin.surrogate.matchability import Matchability
 from twin.world.floor_forecast import FloorForecast
 from twin.world.mission import Mission
@@ -102,5 +102,5 @@ def _floor_points(mission: Mission, forecast: FloorForecast, matching: Matchabil
     steps_m = np.linalg.norm(np.diff(keyframes[:, :3, 3], axis=0), axis=1)
     step_m = float(np.median(steps_m)) if len(steps_m) else 0.0
     given = 1 / (1 - mission.scenario.plan.overlap_along), step_m / rig.baseline_m, np.inf, 1.0
-    views = Views(depth_m, *(np.full(len(depth_m), value) for value in given))
+    views = KeyframeRuns(depth_m, *(np.full(len(depth_m), value) for value in given))
     return cell_conditions(matching, matched, relief, rows * grid.cols + cols, views)

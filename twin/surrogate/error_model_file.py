@@ -23,7 +23,8 @@ class FittedErrorModel:
     model: ErrorModel  #: fitted parameters
     n_surveys: int  #: number of rendered surveys to which the model was fitted
     largest_bound_px: float  #: largest Cramér-Rao bound of these surveys; that of a survey is its median over keyframes
-    #: root mean square of ln(measured / fitted) over the surveys, for each kind of measurement
+    #: root mean square of ln(measured / fitted) over the surveys, for each kind of measurement; of fractions, that of
+    #: measured - fitted in tenths
     misfit: Mapping[str, float]
     #: smallest and largest value of each of `coverage.QUANTITIES` in these surveys, by name. The upper end of the
     #: Cramér-Rao bound is infinite if a survey with a larger bound than all fitted ones lost too many frames or links
@@ -67,7 +68,7 @@ def save(fitted: FittedErrorModel, path: Path) -> None:
         f"n_surveys = {fitted.n_surveys}",
         f"largest_bound_px = {fitted.largest_bound_px:.4g}",
         "",
-        "[misfit]  # root mean square of ln(measured / fitted)",
+        "[misfit]  # root mean square of ln(measured / fitted), of fractions in tenths",
         *(f"{name} = {value:.4g}" for name, value in fitted.misfit.items()),
         "",
         "[fitted_range]  # smallest and largest value in the surveys of the fit",

@@ -44,7 +44,7 @@ class CellConditions(NamedTuple):
     binned: Array  #: 1 for binned images, else 0
 
 
-class Views(NamedTuple):
+class KeyframeRuns(NamedTuple):
     """Keyframes that observe n points of the floor in a row; (n,) each."""
 
     depth_m: Array  #: depth along the optical axis, in the last keyframe
@@ -56,7 +56,7 @@ class Views(NamedTuple):
 
 
 def cell_conditions(
-    matchability: Matchability, rig: StereoRig, relief: FloorRelief, index: NDArray[np.int64], views: Views
+    matchability: Matchability, rig: StereoRig, relief: FloorRelief, index: NDArray[np.int64], views: KeyframeRuns
 ) -> CellConditions:
     """Returns the conditions of n cells of a map.
 

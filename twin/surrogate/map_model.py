@@ -22,7 +22,7 @@ from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.floor_relief import Map, floor_relief
-from twin.surrogate.height_errors import CellConditions, HeightSigmas, Views, cell_conditions, height_sigmas
+from twin.surrogate.height_errors import CellConditions, HeightSigmas, KeyframeRuns, cell_conditions, height_sigmas
 from twin.surrogate.matchability import Matchability
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredView
 from twin.world.observed_cells import DEPTH_TOLERANCE
@@ -201,7 +201,7 @@ class MapModel:
         number = self._views[last]
         step = np.sqrt(self._squared_steps[last] / np.maximum(number - 1, 1))
         bound_ratio = np.sqrt(number / self._sum[last])
-        views = Views(observed.depth_m[ended], number, step, self._border_px[last], bound_ratio)
+        views = KeyframeRuns(observed.depth_m[ended], number, step, self._border_px[last], bound_ratio)
         cells = cell_conditions(self._matchability, self._rig, self.relief, last, views)
         for kept, new in zip(self.conditions, cells, strict=True):
             kept[last] = new

@@ -58,7 +58,6 @@ class MeasuredView(NamedTuple):
 
     @property
     def is_ideal(self) -> bool:
-        """Returns whether all points are measured at their true positions."""
         return not self.table.values.size
 
     def measure(self, points: Array) -> Array:
@@ -106,11 +105,7 @@ IDEAL_VIEW = MeasuredView(IDEAL_TABLE, np.zeros((0, 0, 0)), np.zeros(4))
 
 
 def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> MeasuredView:
-    """Returns the measured view of a stereo rig.
-
-    Args:
-        depths_m: (m,) ascending depths of the floor [m].
-    """
+    """Returns the measured view of a stereo rig, over a floor with ascending depths (m,) [m]."""
     if cameras.sampling is None and cameras.rendered_rig.baseline_m == rig.baseline_m:
         return IDEAL_VIEW
     axes = _axes(rig, depths_m)
@@ -174,13 +169,7 @@ def _without(right: Array, removed: Array) -> Array:
 
 
 def _flow(points: Array, baseline_m: float, image_of) -> Array:
-    """Returns the derivative (2 n, 6) of the image positions of points (n, 3) with respect to the camera's motion.
-
-    Args:
-        points: (n, 3) points (x, y, disparity).
-        baseline_m: baseline that defines their depth [m].
-        image_of: returns the image positions (n, 2) of points (n, 3).
-    """
+    """Returns the derivative (2 n, 6) of `image_of` points (n, 3), (n, 2), with respect to the camera's motion."""
     depth_m = baseline_m / points[:, 2:]
     xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * depth_m
     scale = _STEP_DEPTHS * np.append(np.ones(3), np.full(3, float(np.median(depth_m))))
@@ -238,14 +227,7 @@ _SIGNIFICANT = 2 * 1.17  # two standard errors of the noise ratio, times the roo
 
 
 class MeasuredRows:
-    """Row differences measured so far.
-
-    Args:
-        view: positions at which true points are measured.
-        rig: believed calibration.
-        patch_px: side of the matched patches.
-        rng: random generator of the noise of row differences.
-    """
+    """Row differences measured so far, of matched patches with sides of `patch_px`, with noise from `rng`."""
 
     def __init__(self, view: MeasuredView, rig: StereoRig, patch_px: int, rng: np.random.Generator):
         self._view, self._rig, self._patch_px, self._rng = view, rig, patch_px, rng
@@ -253,11 +235,7 @@ class MeasuredRows:
         self._calibration.removed = view.removed
 
     def are_matched(self, points: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the true points whose measured positions satisfy the epipolar constraint.
-
-        Args:
-            points: (n, 3) true normalised (x, y, disparity).
-        """
+        """Returns the mask (n,) of the true points (n, 3) whose measured positions satisfy the epipolar constraint."""
         left, right = self._positions_px(points)
         return stereo.satisfies_epipolar(left, right)
 
@@ -287,7 +265,6 @@ class MeasuredRows:
         return described, ratio if ratio > 1 + _SIGNIFICANT / np.sqrt(observation.n_points) else 1.0
 
     def report(self) -> EpipolarError:
-        """Returns the errors of the rectification, estimated from all row differences so far."""
         return self._calibration.report()
 
     def _add(self, points: Array, rows_px: Array, sigma_px: float) -> None:

@@ -19,13 +19,7 @@ Cells = NDArray[np.int64]  #: floor cells, each with column and row packed into 
 
 @kernel
 def floor_cells(pose, points, baseline):
-    """Returns the floor cell (n,) of each point (n, 3), given as normalised (x, y, disparity) in a camera.
-
-    Args:
-        pose: (4, 4) world_from_camera.
-        points: (n, 3) points.
-        baseline: stereo baseline [m].
-    """
+    """Returns the floor cell (n,) of each point (n, 3), normalised (x, y, disparity) in a camera at a pose (4, 4)."""
     cells = np.empty(len(points), np.int64)
     for k in range(len(points)):
         x, y, d = points[k]
@@ -53,7 +47,6 @@ class MosaicModel:
         self._estimated: dict[int, Array] = {}
 
     def clear(self) -> None:
-        """Removes all keyframes."""
         self._first_keyframe.clear()
         self._estimated.clear()
 

@@ -17,11 +17,7 @@ _MORE_ITERATIONS = 5  # further least-squares iterations of a link if points are
 
 @kernel
 def sample_f2f_motion(errors, previous_pose, pose, normals, previous_normals):
-    """Samples the frame-to-frame motion previous_from_current (4, 4) between two true poses (4, 4).
-
-    Args:
-        normals, previous_normals: (6,) standard normal random numbers for this motion and for the motion before it.
-    """
+    """Samples the motion previous_from_current (4, 4) between true poses; normals (6,) for it and the one before."""
     error = np.zeros(6)
     for i in range(6):
         for k in range(6):
@@ -44,11 +40,9 @@ def sample_link(
     Args:
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
         later_noise: (n, 3) standard normal samples of the later stereo pair's errors at these points.
-        earlier_noise: (rows, cols, 3) standard normal samples of the earlier stereo pair's biases, on a raster over its
-            image.
-        relief_noise: (f, f, 2) standard normal samples of the errors due to relief; they repeat every f floor cells.
-        normals: (n + 1, 3) standard normal samples of this link alone: n for its points, the last one for their common
-            bias.
+        earlier_noise: (rows, cols, 3) those of the earlier stereo pair's biases, on a raster over its image.
+        relief_noise: (f, f, 2) those of the errors due to relief; they repeat every f floor cells.
+        normals: (n + 1, 3) those of this link alone: n for its points, the last one for their common bias.
         earlier_pose, later_pose: (4, 4) true poses.
         camera: focal length, principal point x and y, image width and height, margin along the border [px]; baseline
             [m]; table of the measured positions of true points (`measured_view.ViewTable`).
@@ -115,12 +109,7 @@ def sample_link(
 
 @kernel
 def _robust_weights(normalised_residual, noise_share):
-    """Returns approximate weights (n,) of single matches in `two_view_motion.pair_motion`: Huber, 0 beyond a cutoff.
-
-    Args:
-        normalised_residual: (n,) residuals relative to the covariance of the points.
-        noise_share: see `sample_link`.
-    """
+    """Returns approximate weights (n,) of single matches in `two_view_motion.pair_motion`: Huber, 0 beyond a cutoff."""
     size = np.sqrt(1 + noise_share * normalised_residual**2)
     scale = np.median(size)
     return np.minimum(1.0, HUBER * scale / size) * (size < CUTOFF * scale)
@@ -136,8 +125,8 @@ def _floor_cell(pose, point, baseline, cell_m, n):
 
 
 @kernel
-def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple[Array, Array]:
-    """Returns the covariance (6, 6) of a motion estimated from flow and known depth, and its lower Cholesky factor.
+def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> Array:
+    """Returns the covariance (6, 6) of a motion estimated from flow and known depth.
 
     The motion is estimated by least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors
     of unit standard deviation. The vectors have the same distribution over image and depth as `points`.
@@ -149,8 +138,7 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> tuple
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
     normal, _ = observation_equations.normal_equations(jacobian, np.full(n, n_effective / n), np.zeros((n, 2)))
-    cov = np.ascontiguousarray(np.linalg.inv(normal))
-    return cov, np.linalg.cholesky(cov)  # pyright: ignore[reportReturnType]
+    return np.ascontiguousarray(np.linalg.inv(normal))  # pyright: ignore[reportReturnType]
 
 
 @kernel

@@ -43,14 +43,6 @@ _BLANK: NDArray[np.uint8] = np.zeros((0, 0, 3), np.uint8)  # placeholder: an ima
 class SurrogateWorld(World):
     """World whose visual measurements are sampled from an error model.
 
-    Args:
-        mission: the survey to fly.
-        stopwatch: timer of the stages.
-        fitted: error model of the measurements.
-
-    Attributes:
-        vision: source of the sampled visual measurements.
-
     Raises:
         UnmodelledError: the survey lies outside the range of the fit, and `imaging.extrapolate` is not set; or marine
             snow prevents all matches at `Matchability.medium_depth_m`.
@@ -84,7 +76,7 @@ class SurrogateWorld(World):
             self.warnings += ("The surrogate surveys the highest surface of the mesh: it simulates no overhangs.",)
 
     def close(self) -> None:
-        """Does nothing, as there are no resources to release."""
+        """Does nothing."""
 
     def capture(self, step: Step) -> CameraImages:
         pose, rig = self.world_from_camera, self.mission.rig

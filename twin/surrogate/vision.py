@@ -60,7 +60,6 @@ class KeyframeTruth(NamedTuple):
     baseline_m: float  #: stereo baseline [m]
     #: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation
     unit_cov: Array
-    unit_root: Array  #: (6, 6) lower Cholesky factor of `unit_cov`
     cells: Cells  #: (n,) floor cells of the points
     clear_share: float  #: fraction of the matches that remain in the presence of marine snow
     noise_ratio: float  #: ratio of the scatter of the row differences to that expected from noise (`MeasuredRows`)
@@ -106,11 +105,7 @@ class SurrogateVision:
 
     Args:
         rig: calibration that the estimators use, at the scale of the images that they match, which may be binned.
-        settings: settings of the estimators.
-        model: error model of the measurements.
-        scene: true scene.
         rng: random generator of all errors.
-        stopwatch: timer of the stages.
 
     Attributes:
         last_pose: (4, 4) true pose of the last frame; None before the first one.
@@ -166,7 +161,6 @@ class SurrogateVision:
 
     @property
     def binning(self) -> int:
-        """Returns the binning factor: the side [px] of the squares of pixels that are averaged into one pixel."""
         return self.scene.matchability.binning
 
     @property
@@ -206,61 +200,62 @@ class SurrogateVision:
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         self._f2f = None  # no points to track until `restart_tracking`
         with self.stopwatch("stereo"):
-            pose, model, scene = self.scene.left_camera(), self.model, self.scene
-            scene.map_model.mark_seen(pose)
-            depth_m = cast_pixels(scene.floor, pose[None], self.rig, self._true_pixels)[0]
+            pose = self.scene.left_camera()
+            self.scene.map_model.mark_seen(pose)
+            depth_m = cast_pixels(self.scene.floor, pose[None], self.rig, self._true_pixels)[0]
             hits = np.flatnonzero((depth_m > 0) & (depth_m < np.inf))  # 0: the camera is below the floor
             if len(hits) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, 0, None))
                 return None
-            mean_m = float(depth_m[hits].mean())
-            bound_px = float(scene.matchability.bound_at(mean_m))
-            n_points = len(hits) / len(self._rays) * model.point_fraction(bound_px) * self.n_corners
-            clear_share = scene.matchability.clear_share_at(mean_m)
-            matched = self._are_matched(hits, depth_m)
-            n_points *= float(matched.mean()) * clear_share
-            hits = hits[matched & self._in_both_images(hits, depth_m)]
-            if n_points < _MIN_POINTS or len(hits) < sampling.MIN_POINTS:
+            seen, n_points = self._matched_points(hits, depth_m)
+            if n_points < _MIN_POINTS or len(seen) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, int(n_points), None))
                 return None
-            points = self._true_points(hits, depth_m)
-            true_measured = scene.view.measure(points)
-            n = len(points)
-            unevenness_px = scene.matchability.unevenness_at(mean_m)
-            noise = self._rng.standard_normal((*_RASTER, 3))
-            n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, self.rig, self.settings.patch_px)
-            unit = sampling.unit_motion_cov(true_measured, self.rig.baseline_m, n_tracked)
-            cells = floor_cells(pose, points, self.rig.baseline_m)
-            observation, noise_ratio = StereoObservation(row, int(n_points), None), 1.0
-            if self._rows is not None:
-                observation, noise_ratio = self._rows.observe(observation, points, model.match_sigma_px(bound_px, 0.0))
-            self.stereo_observations.append(observation)
             self._pose_at[row] = pose
-            latest = self._latest = KeyframeTruth(
-                pose, points, hits, noise, bound_px, unevenness_px, n_points, self.rig.baseline_m, *unit, cells,
-                clear_share, noise_ratio,
-            )  # fmt: skip
-            sigma_px = model.match_sigma_px(bound_px, latest.stereo_parallax_px) * np.sqrt(n / n_points)
-            measured = true_measured + noise.reshape(-1, 3)[hits] @ (self._unit_root.T * sigma_px)
-            sigma_px *= noise_ratio
-            xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (self.rig.baseline_m / measured[:, 2:])
-            cov = np.broadcast_to(self._unit_cov * sigma_px**2, (n, 3, 3))
-            pixels, around_px = self._pixels[hits].astype(np.float32), self.rig.focal_px * measured[:, 2]
-            return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
+            return self._sample_stereo(pose, row, seen, depth_m, n_points, float(depth_m[hits].mean()))
+
+    def _matched_points(self, hits: NDArray[np.int64], depth_m: Array) -> tuple[NDArray[np.int64], float]:
+        """Returns the raster points (n,) that are matched, of those that show the floor, and the number of matches."""
+        matchability, mean_m = self.scene.matchability, float(depth_m[hits].mean())
+        share = self.model.point_fraction(float(matchability.bound_at(mean_m))) * matchability.clear_share_at(mean_m)
+        points = self._true_points(hits, depth_m)
+        matched = np.ones(len(hits), np.bool_) if self._rows is None else self._rows.are_matched(points)
+        n_points = len(hits) / len(self._rays) * share * self.n_corners * float(matched.mean())
+        return hits[matched & self._in_both_images(points)], n_points
+
+    def _sample_stereo(
+        self, pose: Array, row: int, hits: NDArray[np.int64], depth_m: Array, n_points: float, mean_m: float
+    ) -> StereoPoints:
+        """Samples the positions of the raster points `hits` in a stereo pair, and stores the keyframe's truth."""
+        points, rig, matchability = self._true_points(hits, depth_m), self.rig, self.scene.matchability
+        bound_px, n = float(matchability.bound_at(mean_m)), len(points)
+        measured = self.scene.view.measure(points)
+        noise = self._rng.standard_normal((*_RASTER, 3))
+        n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, rig, self.settings.patch_px)
+        unit_cov = sampling.unit_motion_cov(measured, rig.baseline_m, n_tracked)
+        observation, noise_ratio = StereoObservation(row, int(n_points), None), 1.0
+        if self._rows is not None:
+            level_px = self.model.match_sigma_px(bound_px, 0.0)
+            observation, noise_ratio = self._rows.observe(observation, points, level_px)
+        self.stereo_observations.append(observation)
+        latest = self._latest = KeyframeTruth(
+            pose, points, hits, noise, bound_px, matchability.unevenness_at(mean_m), n_points, rig.baseline_m, unit_cov,
+            floor_cells(pose, points, rig.baseline_m), matchability.clear_share_at(mean_m), noise_ratio,
+        )  # fmt: skip
+        sigma_px = self.model.match_sigma_px(bound_px, latest.stereo_parallax_px) * np.sqrt(n / n_points)
+        measured = measured + noise.reshape(-1, 3)[hits] @ (self._unit_root.T * sigma_px)
+        xyz = np.column_stack([measured[:, :2], np.ones(n)]) * (rig.baseline_m / measured[:, 2:])
+        cov = np.broadcast_to(self._unit_cov * (sigma_px * noise_ratio) ** 2, (n, 3, 3))
+        pixels, around_px = self._pixels[hits].astype(np.float32), rig.focal_px * measured[:, 2]
+        return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
     def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
         """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image."""
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
-    def _are_matched(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the points whose measured positions satisfy the epipolar constraint."""
-        if self._rows is None:
-            return np.ones(len(indices), np.bool_)
-        return self._rows.are_matched(self._true_points(indices, depth_m))
-
-    def _in_both_images(self, indices: NDArray[np.int64], depth_m: Array) -> NDArray[np.bool_]:
-        """Returns the mask (n,) of the points whose patches lie inside both images."""
-        measured = self.scene.view.measure(self._true_points(indices, depth_m))
+    def _in_both_images(self, points: Array) -> NDArray[np.bool_]:
+        """Returns the mask (n,) of the true points (n, 3) whose patches lie inside both images."""
+        measured = self.scene.view.measure(points)
         left_px = measured[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         right_px = left_px - np.column_stack([self.rig.focal_px * measured[:, 2], np.zeros(len(measured))])
         in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
@@ -281,8 +276,8 @@ class SurrogateVision:
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
         """Returns the lower Cholesky factor and the covariance (6, 6) of a motion estimated from flow."""
-        sigma = sigma_px / self.rig.focal_px
-        return self.latest.unit_root * sigma, self.latest.unit_cov * sigma**2
+        cov = self.latest.unit_cov * (sigma_px / self.rig.focal_px) ** 2
+        return np.asarray(np.linalg.cholesky(cov), np.float64), cov
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
         view = self._mosaic.view(self.latest.cells)
@@ -366,7 +361,6 @@ class SurrogateVision:
             return self._link_rng.standard_normal((n, 3))
 
     def left_image(self, row: int) -> Image | None:
-        """Returns None: there are no images."""
         return None
 
     def build_map(

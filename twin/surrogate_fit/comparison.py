@@ -44,11 +44,6 @@ RELIEF_GAIN, BIAS_FRACTION = 10.0, 0.8
 class ComparisonVision:
     """Implementation of `Vision` that measures in images and collects statistics of a comparison with the surrogate.
 
-    Args:
-        images: vision that measures in images; its measurements are returned.
-        surrogate: vision that samples the same measurements from an error model.
-        true_pose: returns the current true pose (4, 4) of the left camera.
-
     Attributes:
         statistics: samples by name; see `fit`.
         classes: for each class of map cells, the measured values and the medians of the conditions of its cells, by
