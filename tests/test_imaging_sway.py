@@ -7,7 +7,8 @@ import pytest
 
 from twin.core import geometry
 from twin.core.records import StereoRig
-from twin.imaging.scene import object_view, sway
+from twin.imaging.scene import sway
+from twin.imaging.scene.mesh_raster import NEAR_M, Projection, view_planes
 from twin.imaging.scene.object_view import ObjectRenderer, Objects
 from twin.imaging.scene.sway import largest_displacement_m, swayed
 from twin.terrains.objects.placed_object import PlacedObject, model_of
@@ -83,7 +84,8 @@ def test_a_plant_that_bends_into_the_view_is_drawn() -> None:
     """The bounding sphere of the upright plant lies left of the view; the current bends its tip into the view."""
     camera = geometry.pose(geometry.rotations_of_down_camera(np.array(0.0)), np.array([0.0, 0.0, 12.0]))
     current = np.array([5.0, 0.0, 0.0])
-    normal, offset = object_view.frustum(RIG)[3, :3], object_view.frustum(RIG)[3, 3]  # the edge of the image aft
+    aft = view_planes(Projection(RIG.focal_px, RIG.cx_px, RIG.cy_px, NEAR_M, True), (48, 64))[3]
+    normal, offset = aft[:3], aft[3]
     centre = geometry.inverse(camera) @ np.append(plant().centre_m, 1.0)
     outside_m = normal @ centre[:3] + offset + plant().radius_m
     item = plant(x_m=-outside_m / np.hypot(*normal[:2]) - 0.02)

@@ -160,7 +160,7 @@ def test_a_survey_without_lost_frames_is_the_same_with_and_without_actions():
         with open_world(mission(), Stopwatch()) as world:
             navigator = navigator_with(mission(), world.vision, Stopwatch())
             survey.fly(mission(), world, navigator, lambda *_: None, actions)
-            return world.truth(), np.array(navigator.log.online)
+            return world.truth(), navigator.log.online.array
 
     (plain, online), (watched, watched_online) = fly(None), fly(MissionActions(mission()))
     np.testing.assert_array_equal(plain.trajectory.world_from_camera, watched.trajectory.world_from_camera)
@@ -191,7 +191,7 @@ def fly_blind(first, end, monkeypatch, actions):
             world.vision, "observe_stereo", lambda f, row: None if first <= f.index < end else observe(f, row)
         )
         survey.fly(mission(), world, navigator, lambda *_: None, actions)
-        return world.truth(), np.array(navigator.log.online)
+        return world.truth(), navigator.log.online.array
 
 
 def test_a_survey_blind_for_three_seconds_is_flown_to_the_end(monkeypatch):
