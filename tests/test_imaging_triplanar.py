@@ -250,9 +250,10 @@ def test_a_camera_that_sees_no_floor_keeps_its_image() -> None:
     assert np.all(np.isinf(depth)) and np.all(albedo == 0)
 
 
+@pytest.mark.slow
 def test_walls_take_at_most_as_much_processor_time_as_a_coarse_floor_takes_to_render() -> None:
     """Measured 0.8, with walls in half of the pixels, over a floor of 3600 cells, which is rendered four times as fast
-    as the reef `horseshoe`. The limit is 1.3 times as large.
+    as the reef `horseshoe`. The limit is 1.3 times as large; 0.99 to 1.12 on another machine.
     """
     terrain, pose = floor(bumps), looking(np.array([0.1, 0.0, -1.0]), np.zeros(3), 1.6)
     width, height, focal_px = 640, 480, float(240 / np.tan(np.deg2rad(VFOV) / 2))
