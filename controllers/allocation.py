@@ -12,8 +12,6 @@ from twin.kernels import kernel
 
 
 class ThrustAllocation(NamedTuple):
-    """Thrust allocation: distributes a wrench [moment, force] among n thrusters."""
-
     thrusts_from_wrench: Array  # (n, 6) weighted pseudo-inverse of the thrust configuration matrix
     command_table: Array  # (k,) increasing commands, over the range in which thrust increases with the command
     thrust_table_n: Array  # (k,) steady thrust at the commands of `command_table` [N]
@@ -28,7 +26,6 @@ class ThrustAllocation(NamedTuple):
 
 @kernel
 def allocate_wrench(allocation, wrench):
-    """Compiled kernel of `ThrustAllocation.commands`."""
     thrusts, table = allocation.thrusts_from_wrench @ wrench, allocation.thrust_table_n
     load = 1.0
     for thrust in thrusts:

@@ -21,14 +21,13 @@ class CameraSurface:
     spline: RectBivariateSpline  # z [m] as a function of x and y [m]; constant beyond the outermost knots
 
     def height_at(self, x_m: Array, y_m: Array) -> Array:
-        """Returns the planned height z of the camera (n,) at points (x, y) [m]."""
         return self.spline.ev(x_m, y_m)
 
     def follow(self, level: Reference) -> Reference:
         """Lifts the references of a level path, given at n times, to the surface; returns the new references.
 
-        The horizontal motion is unchanged. With the surface z(x, y), horizontal velocity v and horizontal acceleration
-        a, the vertical velocity is grad(z)' v and the vertical acceleration grad(z)' a + v' H(z) v, with the Hessian H.
+        With the surface z(x, y), horizontal velocity v and acceleration a, the vertical velocity is grad(z)' v and the
+        vertical acceleration grad(z)' a + v' H(z) v, with the Hessian H.
         """
         x, y = level.position[:, 0], level.position[:, 1]
         slope = np.stack([self.spline.ev(x, y, dx=1), self.spline.ev(x, y, dy=1)], axis=1)
@@ -53,13 +52,12 @@ def surface_above_floor(
 ) -> CameraSurface:
     """Returns the surface that the camera follows at an altitude above the smoothed floor.
 
-    The floor is averaged twice over the footprint, along x and y (a triangular window, twice as long as the footprint),
-    and sampled at nodes about 1/8 of the shorter side of the footprint apart, but not closer than `spacing_m`. Around
-    steep parts it is raised, by as little as possible, until its slope is at most `max_slope`; a Gaussian filter with a
-    standard deviation of one node distance then rounds the edges.
+    The floor is averaged twice over the footprint, along x and y, and sampled at nodes about 1/8 of the shorter side of
+    the footprint apart, but not closer than `spacing_m`. Around steep parts it is raised, by as little as possible,
+    until its slope is at most `max_slope`; a Gaussian filter of one node distance then rounds the edges.
 
     Args:
-        height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south, at nodes `spacing_m` apart.
+        height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
         corner_m: position (x, y) of node (0, 0).
         footprint_m: extent of an image on the floor along x and y.
         max_slope: greatest slope (rise over run) of the surface along x, y and the diagonals.
@@ -81,10 +79,7 @@ def surface_above_floor(
 
 @kernel
 def _limit_slope(height_m, step_y_m, step_x_m, max_slope):
-    """Returns heights raised as little as possible, so that the slope to each of 8 neighbours is at most `max_slope`.
-
-    Two sweeps in opposite directions propagate the limit (chamfer distance transform, Borgefors 1986).
-    """
+    """Returns heights raised as little as possible to limit slopes to 8 neighbours (chamfer sweeps, Borgefors 1986)."""
     result = height_m.copy()
     rows, cols = result.shape
     for sweep in range(2):

@@ -37,13 +37,10 @@ class Forecast(NamedTuple):
 
 
 def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> Forecast:
-    """Computes the forecast of a plan (Negahdaripour & Madjidi 2003, section III-A).
-
-    With the disparity d = f b / Z, the standard deviation of depth is sigma_Z = Z^2 / (f b) sigma_d.
-    """
+    """Computes the forecast of a plan (Negahdaripour & Madjidi 2003, section III-A): sigma_Z = Z^2 / (f b) sigma_d."""
     tracks = range(1, plan.n_tracks + 1)
     keyframes = np.concatenate([plan.frames_of_track(track)[1] for track in tracks])
-    keyframe_spacing_m = plan.n_frames_per_keyframe * plan.speed_mps / plan.frame_rate_hz
+    keyframe_spacing_m = plan.n_frames_per_keyframe * plan.speed_mps / plan.request.frame_rate_hz
     return Forecast(
         n_frames_per_keyframe=plan.n_frames_per_keyframe,
         keyframes_per_swath=max(1, round(plan.swath_length_m / keyframe_spacing_m)),
@@ -53,19 +50,17 @@ def forecast(plan: SurveyPlan, baseline_m: float, disparity_sigma_px: float) -> 
         duration_s=sum(plan.track_duration_s(t) for t in tracks),
         path_m=sum(plan.track_length_m(t) for t in tracks),
         speed_mps=plan.speed_mps,
-        footprint_m=plan.footprint_m,
+        footprint_m=plan.request.footprint_m,
         keyframe_spacing_m=keyframe_spacing_m,
         swath_spacing_m=plan.swath_spacing_m,
         overlap_along=max(0.0, 1 - keyframe_spacing_m / plan.side_along_m),
         overlap_across=max(0.0, 1 - plan.swath_spacing_m / plan.side_across_m),
-        disparity_px=plan.focal_px * baseline_m / plan.altitude_m,
-        depth_sigma_m=plan.altitude_m**2 / (plan.focal_px * baseline_m) * disparity_sigma_px,
+        disparity_px=plan.request.focal_px * baseline_m / plan.request.altitude_m,
+        depth_sigma_m=plan.request.altitude_m**2 / (plan.request.focal_px * baseline_m) * disparity_sigma_px,
     )
 
 
 class Clearance(NamedTuple):
-    """Clearance of a planned path above the floor."""
-
     least_m: float  # least height of the camera above the highest floor near it; infinite if no floor was found
     #: Where the clearance is least: floor point of a level path, or camera of a path that follows the floor.
     x_m: float
@@ -76,13 +71,11 @@ class Clearance(NamedTuple):
 def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array], sample_m: float = 0.02) -> Clearance:
     """Returns the clearance of a level path above the highest floor within the image footprints and between the swaths.
 
-    Args:
-        height_at: returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain, a rectangle.
-        sample_m: least sampling distance of the heights; larger beyond `MAX_CLEARANCE_SAMPLES` samples.
+    `height_at` returns the height of the floor [m] at arrays x and y [m]; NaN outside the terrain, a rectangle.
     """
     outline = plan.outline()[:, :2]
     path = np.column_stack(plan.area.to_legs(*outline.T))
-    along_m, across_m = (side / 2 for side in plan.footprint_m[::-1])  # the image height lies along the legs
+    along_m, across_m = (side / 2 for side in plan.request.footprint_m[::-1])  # the image height lies along the legs
     south, north = path[:, 1].min() - across_m, path[:, 1].max() + across_m
     area_m2 = (north - south) * (np.ptp(path[:, 0]) + 2 * along_m)
     sample_m = max(sample_m, math.sqrt(area_m2 / MAX_CLEARANCE_SAMPLES))
@@ -97,7 +90,7 @@ def least_clearance(plan: SurveyPlan, height_at: Callable[[Array, Array], Array]
         tops.append((float(row.max()), float(x[row.argmax()]), float(y)))
     height, u, v = max(tops)
     x, y = (float(c) for c in plan.area.to_scene(u, v))
-    return Clearance(plan.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*outline.T)).all()))
+    return Clearance(plan.request.altitude_m - height, x, y, inside=bool(np.isfinite(height_at(*outline.T)).all()))
 
 
 def _without_gaps(path: Array, max_step_m: float) -> Array:

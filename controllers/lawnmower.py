@@ -13,8 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from twin.controllers.profile import SpeedProfile
-from twin.controllers.segments import Point, Segment, Turn, line
+from twin.controllers.segments import Point, Segment, SpeedProfile, Turn, line
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import (
     TURN_ACCELERATION,
@@ -22,21 +21,18 @@ from twin.controllers.survey_plan import (
     SurveyPlan,
     SurveyRequest,
     check_request,
+    frames_per_keyframe,
     n_tracks_to_fly,
-    survey_plan,
 )
 
 
 def plan(request: SurveyRequest) -> SurveyPlan:
-    """Plans a lawnmower survey of an area (Negahdaripour & Madjidi 2003, section III-A).
+    """Plans a lawnmower survey of an area; raises TwinError if a requirement is invalid or cannot be met.
 
     The legs run along the heading of the area. Their distance is at most (1 - overlap_across) ImgSize Altitude /
     FocalLength (ImgSize is the image width), times `across_scale`. The area is divided into an even number of strips of
     equal width, with a leg along the centre line of each, spanning the extent of the area within its strip; the first
     leg is the rightmost as seen along the heading. Where two legs are joined, the one that ends first is extended.
-
-    Raises:
-        TwinError: a requirement is invalid or cannot be met.
     """
     check_request(request)
     area = request.area or SurveyArea("rectangle", request.area_m)
@@ -46,25 +42,21 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     n_filling = math.ceil(width_m / max_spacing_m / 2 - 1e-9)
     n_tracks = n_tracks_to_fly(request, n_filling)
     spacing_m = width_m / (2 * n_filling)
-    legs = _leg_extents(area, spacing_m, 2 * n_filling)
+    edges = [k * spacing_m - width_m / 2 for k in range(2 * n_filling + 1)]
+    legs = [area.extent_between(south_m, north_m) for south_m, north_m in pairwise(edges)]
     corners = [_corners(area, legs, spacing_m, track, last=track == n_tracks) for track in range(1, n_tracks + 1)]
-    return survey_plan(
+    return SurveyPlan(
         request,
         paths=tuple(_track(request, area, track) for track in corners),
         area=area,
         speed_mps=request.speed_mps,
+        n_frames_per_keyframe=frames_per_keyframe(request, request.speed_mps),
         swath_length_m=float(np.mean([end - start for start, end in legs])),
         swath_spacing_m=spacing_m,
         n_tracks_to_fill=n_filling,
         side_along_m=request.footprint_m[1],
         side_across_m=request.footprint_m[0],
     )
-
-
-def _leg_extents(area: SurveyArea, spacing_m: float, n_legs: int) -> list[tuple[float, float]]:
-    """Returns the extent of the area within the strip of each leg: least and greatest coordinate along the leg [m]."""
-    south_m = -area.size_m[1] / 2
-    return [area.extent_between(south_m + k * spacing_m, south_m + (k + 1) * spacing_m) for k in range(n_legs)]
 
 
 def _corners(

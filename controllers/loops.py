@@ -12,18 +12,21 @@ import math
 
 from twin.controllers.segments import Circle, circle, max_circle_speed_mps
 from twin.controllers.survey_area import SurveyArea
-from twin.controllers.survey_plan import SurveyPlan, SurveyRequest, check_request, n_tracks_to_fly, survey_plan
+from twin.controllers.survey_plan import (
+    SurveyPlan,
+    SurveyRequest,
+    check_request,
+    frames_per_keyframe,
+    n_tracks_to_fly,
+)
 from twin.errors import TwinError
 
 
 def plan(request: SurveyRequest) -> SurveyPlan:
-    """Plans a loop survey of the disc inscribed in the area; each loop is a track.
+    """Plans a loop survey of the disc inscribed in the area; raises TwinError if a requirement cannot be met.
 
-    The distance between neighbouring loops is at most (1 - overlap_across) times the shorter side of the footprint,
-    times `across_scale`, because loops run in every direction. On small loops, acceleration limits the speed.
-
-    Raises:
-        TwinError: a requirement is invalid or cannot be met.
+    Each loop is a track. Neighbouring loops are at most (1 - overlap_across) times the shorter side of the footprint,
+    times `across_scale`, apart. On small loops, acceleration limits the speed.
     """
     check_request(request)
     area = request.area or SurveyArea("disc", request.area_m)
@@ -31,34 +34,24 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         raise TwinError("plan.turns", f"{request.turns!r} has no effect on loops", '"reverse"')
     loop_diameter_m = _disc_diameter_m(request.area_m) / 2
     shorter_m = min(request.footprint_m)
-    n_filling = n_loops_to_fill(loop_diameter_m, (1 - request.overlap_across) * shorter_m * request.across_scale)
+    max_spacing_m = (1 - request.overlap_across) * shorter_m * request.across_scale
+    # The centres of n loops lie at a / 2 from the start: neighbours are a sin(pi / n) apart.
+    # Tolerance: a spacing that exceeds the limit only by rounding must not add a loop.
+    n_filling = math.ceil(math.pi / math.asin(min(1.0, max_spacing_m / loop_diameter_m)) - 1e-9)
     n_tracks = n_tracks_to_fly(request, n_filling)
     speed_mps = min(request.speed_mps, max_circle_speed_mps(loop_diameter_m / 2, request.acceleration_mps2))
-    return survey_plan(
+    return SurveyPlan(
         request,
         paths=tuple((_loop(request, area, loop_diameter_m, 2 * math.pi * k / n_filling),) for k in range(n_tracks)),
         area=area,
         speed_mps=speed_mps,
+        n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
         swath_length_m=math.pi * loop_diameter_m,
-        swath_spacing_m=loop_spacing_m(loop_diameter_m, n_filling),
+        swath_spacing_m=loop_diameter_m * math.sin(math.pi / n_filling),
         n_tracks_to_fill=n_filling,
         side_along_m=shorter_m,
         side_across_m=shorter_m,
     )
-
-
-def loop_spacing_m(loop_diameter_m: float, n_loops: int) -> float:
-    """Returns the greatest distance between neighbouring loops [m]: a sin(pi / n) for n loops of diameter a.
-
-    This is the distance between their centres, at a / 2 from the start in directions that differ by 2 pi / n.
-    """
-    return loop_diameter_m * math.sin(math.pi / n_loops)
-
-
-def n_loops_to_fill(loop_diameter_m: float, max_spacing_m: float) -> int:
-    """Returns the least number of loops, at least two, whose spacing is at most `max_spacing_m`."""
-    # Tolerance: a spacing that exceeds the limit only by rounding must not add a loop.
-    return math.ceil(math.pi / math.asin(min(1.0, max_spacing_m / loop_diameter_m)) - 1e-9)
 
 
 def _loop(request: SurveyRequest, area: SurveyArea, diameter_m: float, angle: float) -> Circle:
@@ -73,7 +66,6 @@ def _loop(request: SurveyRequest, area: SurveyArea, diameter_m: float, angle: fl
 
 
 def _disc_diameter_m(area_m: tuple[float, float]) -> float:
-    """Returns the diameter D of the disc inscribed in the area [m]. Raises TwinError if the area is not a square."""
     length_m, width_m = area_m
     if not math.isclose(length_m, width_m):
         least = min(area_m)

@@ -25,8 +25,6 @@ _EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of roun
 
 @dataclass(frozen=True)
 class SurveyArea:
-    """Area that a survey has to cover, in the scene."""
-
     shape: Literal["rectangle", "disc", "polygon"]  # rectangle, disc or polygon
     size_m: tuple[float, float]  # extent along and across the legs; for a disc, the first value is its diameter
     centre_m: Corner = (0.0, 0.0)  # x, y of the centre of the extent
@@ -34,7 +32,6 @@ class SurveyArea:
     corners: tuple[Corner, ...] = ()  # corners (u, v) of a polygon in the axes of the legs [m]; empty for other shapes
 
     def to_scene(self, u_m: ArrayLike, v_m: ArrayLike) -> tuple[Array, Array]:
-        """Converts points from the axes of the legs to x, y in the scene [m]."""
         u, v, (c, s) = np.asarray(u_m, np.float64), np.asarray(v_m, np.float64), _cos_sin(self.heading)
         return self.centre_m[0] + (c * u - s * v), self.centre_m[1] + (s * u + c * v)
 
@@ -44,13 +41,11 @@ class SurveyArea:
         return np.stack(self.to_scene(u, v), axis=-1)
 
     def to_legs(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[Array, Array]:
-        """Converts points from the scene to the axes of the legs [m]."""
         x, y = np.asarray(x_m, np.float64) - self.centre_m[0], np.asarray(y_m, np.float64) - self.centre_m[1]
         c, s = _cos_sin(self.heading)
         return c * x + s * y, c * y - s * x
 
     def contains(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
-        """Returns whether each scene point lies in the area; its edges belong to it."""
         u, v = self.to_legs(x_m, y_m)
         if self.shape == "polygon":
             polygon = self._polygon()
@@ -76,11 +71,9 @@ class SurveyArea:
         return west_m, east_m
 
     def _polygon(self) -> shapely.Polygon:
-        """Returns a rectangle or polygon in the axes of the legs."""
         return shapely.Polygon(self._corners())
 
     def _corners(self) -> tuple[Corner, ...]:
-        """Returns the corners of a rectangle or polygon in the axes of the legs."""
         if self.shape == "polygon":
             return self.corners
         half_u, half_v = self.size_m[0] / 2, self.size_m[1] / 2
@@ -88,14 +81,11 @@ class SurveyArea:
 
 
 def polygon_area(corners_m: ArrayLike, heading: float) -> SurveyArea:
-    """Returns the area of a polygon, with legs along the heading [rad, counter-clockwise from east].
+    """Returns the area of a polygon (n, 2) in the scene [m], with legs along the heading [rad, counter-clockwise].
 
-    Args:
-        corners_m: (n, 2) corners x, y in the scene, in either sense of rotation; the first may be repeated at the end.
-
-    Raises:
-        TwinError: the polygon has fewer than three or more than MAX_CORNERS corners, a coordinate is not finite, two
-            edges intersect, or the extent along or across the legs is less than MIN_SIZE_M.
+    The heading is measured from east. The corners may run in either sense; the first may be repeated at the end. Raises
+    TwinError if there are fewer than three or more than MAX_CORNERS corners, a coordinate is not finite, two edges
+    intersect, or the extent along or across the legs is less than MIN_SIZE_M.
     """
     corners = np.asarray(corners_m, np.float64).reshape(-1, 2)
     if len(corners) > 1 and np.array_equal(corners[0], corners[-1]):

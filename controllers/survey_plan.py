@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +25,6 @@ MAX_TRACKS, MAX_FILLING, LEAST_M = 10_000, 1_000_000, 1e-3
 
 
 class SurveyRequest(NamedTuple):
-    """Requirements of a survey."""
-
     area_m: tuple[float, float]  # extent along and across the legs
     altitude_m: float  # of the left camera above the reference plane or, with `surface`, the smoothed floor
     speed_mps: float  # cruise speed
@@ -57,33 +55,23 @@ class SurveyRequest(NamedTuple):
 class SurveyPlan:
     """Planned path and heading of the left camera. The vehicle keeps station after each track."""
 
+    request: SurveyRequest  # the requirements that it meets
     paths: tuple[tuple[Segment, ...], ...]  # of each track; every segment starts and ends at rest
     area: SurveyArea  # area to cover; the legs, and the bow on the first leg, point along its heading
-    altitude_m: float  # above the reference plane z = 0 or, with `surface`, above the smoothed floor
     speed_mps: float  # cruise speed along the swaths
-    frame_rate_hz: float  # frames per second
     n_frames_per_keyframe: int  # N, frames from one keyframe to the next
     swath_length_m: float  # length of a swath: the mean over all legs that fill the area, or that of a loop
     swath_spacing_m: float  # greatest distance between neighbouring swaths
     n_tracks_to_fill: int  # number of tracks that fill the area, of which the first `n_tracks` are planned
-    footprint_m: tuple[float, float]  # of the image on the reference plane: width (across the heading) and height
     #: Sides of the footprint along which keyframes and neighbouring swaths are displaced; the shorter one for loops.
     side_along_m: float
     side_across_m: float
-    focal_px: float  # focal length of the cameras
-    acceleration_mps2: float  # greatest acceleration of the camera
-    surface: CameraSurface | None = None  # replaces z of the paths
-
-    @property
-    def area_m(self) -> tuple[float, float]:
-        """Returns the extent of the area along and across the legs [m]."""
-        return self.area.size_m
 
     def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point of the scene lies in the asked area, which the planned tracks have to cover.
 
-        This is the whole area if the planned tracks fill it; otherwise the part of it up to half of `swath_spacing_m`
-        beyond the last planned leg of a lawnmower, or within half of `swath_spacing_m` of a planned loop.
+        This is the whole area if they fill it; otherwise the part of it up to half of `swath_spacing_m` beyond the last
+        planned leg of a lawnmower, or within half of `swath_spacing_m` of a planned loop.
         """
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         inside = self.area.contains(x_m, y_m)
@@ -93,32 +81,28 @@ class SurveyPlan:
         if circles:
             return inside & self._near_loop(circles, x_m, y_m)
         _, across = self.area.to_legs(x_m, y_m)
-        return inside & (across <= 2 * self.n_tracks * self.swath_spacing_m - self.area_m[1] / 2 + _EDGE_M)
+        return inside & (across <= 2 * self.n_tracks * self.swath_spacing_m - self.area.size_m[1] / 2 + _EDGE_M)
 
     @property
     def turns_on_the_spot(self) -> bool:
-        """Returns whether the vehicle turns by 180 degrees at the ends of the legs."""
         return any(isinstance(segment, Turn) for path in self.paths for segment in path)
 
     @property
     def n_tracks(self) -> int:
-        """Returns the number of tracks L."""
         return len(self.paths)
 
     def waypoints(self, track: int) -> Array:
         """Returns the waypoints (n, 3) of a track [m]: end points of its lines and points along its circles."""
         first, *others = self.paths[track - 1]
         points = np.concatenate([first.points(), *(segment.points()[1:] for segment in others)])
-        if self.surface is not None:
-            points[:, 2] = self.surface.height_at(points[:, 0], points[:, 1])
+        if self.request.surface is not None:
+            points[:, 2] = self.request.surface.height_at(points[:, 0], points[:, 1])
         return points
 
     def outline(self) -> Array:
-        """Returns the waypoints of all tracks (n, 3) [m]."""
         return np.concatenate([self.waypoints(track) for track in range(1, self.n_tracks + 1)])
 
     def _near_loop(self, circles: list[Circle], x_m: Array, y_m: Array) -> NDArray[np.bool_]:
-        """Returns whether each point lies within half of `swath_spacing_m` of one of the circles."""
         near = np.zeros(x_m.shape, np.bool_)
         for circle in circles:
             radius_m, (x, y, _) = math.dist(circle.start, circle.centre), circle.centre
@@ -126,11 +110,10 @@ class SurveyPlan:
         return near
 
     def track_length_m(self, track: int) -> float:
-        """Returns the horizontal path length of a track [m]."""
-        return sum(segment.length_m for segment in self.paths[track - 1])
+        path = self.paths[track - 1]
+        return sum(segment.profile.length_m for segment in path if not isinstance(segment, Turn))
 
     def track_duration_s(self, track: int) -> float:
-        """Returns the duration of a track [s], without the station keeping after it."""
         return sum(segment.profile.duration_s for segment in self.paths[track - 1])
 
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
@@ -138,16 +121,15 @@ class SurveyPlan:
 
         These are every N-th frame and the last one, and more while the vehicle turns (`TURN_PER_KEYFRAME`).
         """
-        frames = np.arange(round(self.track_duration_s(track) * self.frame_rate_hz) + 1)
-        times_s, n = frames / self.frame_rate_hz, self.n_frames_per_keyframe
+        frames = np.arange(round(self.track_duration_s(track) * self.request.frame_rate_hz) + 1)
+        times_s, n = frames / self.request.frame_rate_hz, self.n_frames_per_keyframe
         keyframe = (frames % n == 0) | (frames == frames[-1])
         if self.turns_on_the_spot:
-            n_turning = max(1, int(TURN_PER_KEYFRAME / TURN_RATE * self.frame_rate_hz))
+            n_turning = max(1, int(TURN_PER_KEYFRAME / TURN_RATE * self.request.frame_rate_hz))
             keyframe |= self._turning(track, times_s) & (frames % min(n, n_turning) == 0)
         return times_s, keyframe
 
     def _turning(self, track: int, times_s: Array) -> NDArray[np.bool_]:
-        """Returns whether the vehicle turns on the spot at times (n,) since the start of a track [s]."""
         path = self.paths[track - 1]
         ends_s = np.cumsum([segment.profile.duration_s for segment in path])
         current = np.minimum(np.searchsorted(ends_s, times_s), len(path) - 1)
@@ -158,38 +140,27 @@ class SurveyPlan:
         return self.references(track, np.array([time_s])).row(0)
 
     def references(self, track: int, times_s: Array) -> Reference:
-        """Returns the references of the left camera at increasing times (n,) since the start of a track [s]."""
         *others, last = self.paths[track - 1]
         parts, remaining_s = [], times_s
         for segment in others:
             n = int(np.searchsorted(remaining_s, segment.profile.duration_s))
             parts.append(segment.at(remaining_s[:n]))
             remaining_s = remaining_s[n:] - segment.profile.duration_s
-        level = Reference(*map(np.concatenate, zip(*parts, last.at(remaining_s), strict=True)))
-        return level if self.surface is None else self.surface.follow(level)
+        level = _joined([*parts, last.at(remaining_s)])
+        return level if self.request.surface is None else self.request.surface.follow(level)
+
+    def all_references(self) -> Reference:
+        """Returns the references of the left camera at all frames, without station keeping."""
+        tracks = range(1, self.n_tracks + 1)
+        return _joined([self.references(track, self.frames_of_track(track)[0]) for track in tracks])
 
     def camera_height_at(self, x_m: Array, y_m: Array) -> Array:
-        """Returns the planned height z of the camera (n,) at points (x, y) of the path [m]."""
-        return np.full(len(x_m), self.altitude_m) if self.surface is None else self.surface.height_at(x_m, y_m)
+        surface = self.request.surface
+        return np.full(len(x_m), self.request.altitude_m) if surface is None else surface.height_at(x_m, y_m)
 
 
-def survey_plan(request: SurveyRequest, *, speed_mps: float, **pattern: Any) -> SurveyPlan:
-    """Returns the plan of a pattern at a speed, with all that the request states; raises TwinError if that is too fast.
-
-    Args:
-        pattern: paths, area and distances of the pattern: fields of `SurveyPlan` by name.
-    """
-    return SurveyPlan(
-        altitude_m=request.altitude_m,
-        speed_mps=speed_mps,
-        frame_rate_hz=request.frame_rate_hz,
-        n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
-        footprint_m=request.footprint_m,
-        focal_px=float(request.focal_px),
-        acceleration_mps2=request.acceleration_mps2,
-        surface=request.surface,
-        **pattern,
-    )
+def _joined(parts: list[Reference]) -> Reference:
+    return Reference(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
@@ -211,11 +182,7 @@ def frames_per_keyframe(request: SurveyRequest, speed_mps: float) -> int:
 
 
 def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
-    """Returns the number of tracks to fly, of `n_filling` that fill the area.
-
-    Raises:
-        TwinError: more tracks are requested than fill the area, or a number exceeds `MAX_TRACKS` or `MAX_FILLING`.
-    """
+    """Returns the number of tracks to fly, of `n_filling` that fill the area; raises TwinError if too many."""
     n_flown = request.tracks or n_filling
     if n_flown > MAX_TRACKS or n_filling > MAX_FILLING:
         problem = f"{n_flown:.4g} tracks are too many, of {n_filling:.4g} that fill the area"
@@ -228,7 +195,7 @@ def n_tracks_to_fly(request: SurveyRequest, n_filling: int) -> int:
 
 
 def check_request(request: SurveyRequest) -> None:
-    """Raises TwinError if a requirement is invalid; does not check requirements that depend on the survey pattern."""
+    """Raises TwinError if a requirement is invalid, whatever the pattern."""
     positive = {
         "plan.altitude_m": request.altitude_m,
         "plan.speed_mps": request.speed_mps,

@@ -29,8 +29,7 @@ class HullModel(NamedTuple):
 def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
     """Returns the wrench (6,) that sustains a body velocity (3,) in still water against drag and the Munk moment.
 
-    The Munk moment -v x M_A v (v body velocity, M_A added mass) turns a hull broadside to the flow. Above 0.33 m/s it
-    exceeds the righting moment of the BlueROV2 in pitch.
+    The Munk moment -v x M_A v (M_A added mass) exceeds the BlueROV2's righting moment in pitch above 0.33 m/s.
     """
     u, v, w = velocity
     x, y, z = hull.added_mass
@@ -39,7 +38,7 @@ def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
 
 
 class Gains(NamedTuple):
-    """Proportional, derivative and integral gains of the pose controller, each (6,) [1/s2, 1/s, 1/s3]."""
+    """Gains of the pose controller, each (6,) [1/s2, 1/s, 1/s3]."""
 
     proportional: Array
     derivative: Array
@@ -58,14 +57,12 @@ def pole_placement_gains(natural_frequency_radps: float) -> Gains:
 
 @kernel
 def rotate_lever_arm(yaw: float, lever_arm_m: Array) -> Array:
-    """Rotates a lever arm (3,) [m] from a level body at the given yaw [rad] to the world."""
     c, s = np.cos(yaw), np.sin(yaw)
     forward, left, up = lever_arm_m
     return np.array([c * forward - s * left, s * forward + c * left, up])
 
 
 def commanded_velocity(position: Array, reference: Reference, natural_frequency_radps: float) -> Array:
-    """Returns the velocity command (3,) [m/s]: reference velocity plus w (reference position - estimated position)."""
     return reference.velocity + natural_frequency_radps * (reference.position - position)
 
 
@@ -81,28 +78,16 @@ class ControllerState(NamedTuple):
     integral: Array
 
 
-class PoseController:
-    """PID controller of position and level attitude, with feed-forward of drag and acceleration."""
-
-    def __init__(self, hull: HullModel, allocation: ThrustAllocation, natural_frequency_radps: float, period_s: float):
-        gains = pole_placement_gains(natural_frequency_radps)
-        self.state = ControllerState(hull, allocation, gains, period_s, np.zeros(6))
-
-    def command(self, world_from_body: Array, twist_body: Array, reference: Reference) -> Array:
-        """Returns the thruster commands (n,) in [-1, 1] for one period.
-
-        Pose (4, 4) and [angular, linear] velocity (6,) in the body [rad/s, m/s] are estimated; the reference is that
-        of the body in the world.
-        """
-        return control_thrusters(
-            self.state, world_from_body, twist_body, reference.position, reference.velocity,
-            reference.acceleration, float(reference.yaw),
-        )  # fmt: skip
-
-
 @kernel
 def control_thrusters(controller, pose, twist, position, velocity, acceleration, yaw):
-    """Compiled kernel of `PoseController.command`; position, velocity, acceleration and yaw are the reference."""
+    """Returns the thruster commands (n,) in [-1, 1] for one period, and updates the integral action in place.
+
+    PID control of position and level attitude, with feed-forward of drag and acceleration.
+
+    Args:
+        pose, twist: estimated pose world_from_body (4, 4), and [angular, linear] velocity (6,) in the body.
+        position, velocity, acceleration, yaw: `Reference` of the body in the world.
+    """
     wrench, error = _wrench(
         pose, twist, position, velocity, acceleration, yaw, controller.hull, controller.gains, controller.integral
     )
@@ -142,7 +127,6 @@ def _integrate(integral, gain, error, saturated):
 
 @kernel
 def _rotate_to_body(pose, vector):
-    """Rotates a vector (3,) from the world to the body."""
     result = np.zeros(3)
     for i in range(3):
         for k in range(3):

@@ -16,7 +16,6 @@ from twin.core.geometry import Array
 
 
 def _array(*rows: object) -> Array:
-    """Returns the numbers or rows as a read-only array."""
     values = np.array(rows, dtype=np.float64)
     values.setflags(write=False)
     return values
@@ -39,8 +38,7 @@ class VehicleParameters(NamedTuple):
         thruster_positions_m, thruster_directions: (8, 3) positions and unit vectors in the body: four horizontal
             thrusters (front right, front left, rear right, rear left), then four vertical ones in the same order.
             Positive thrust pushes the vehicle along the direction.
-        thrust_coefficients: polynomial coefficients of u^9, u^7, u^5, u^3, u for the thrust [N] of a T200 thruster at
-            command u in [-1, 1].
+        thrust_coefficients: coefficients of u^9, u^7, u^5, u^3, u for the thrust [N] of a T200 at command u in [-1, 1].
         thruster_lag: numerator (s, 1) and denominator (s^3, s^2, s, 1) coefficients of the transfer function from
             steady to actual thrust.
         size_m: (3,) length, width, height of the hull.
@@ -68,10 +66,7 @@ class VehicleParameters(NamedTuple):
 
     @property
     def thrust_configuration(self) -> Array:
-        """Returns the thrust configuration matrix (6, 8) (Fossen 2011, section 12.3).
-
-        Column k is the wrench [force, moment] about the centre of gravity per newton of thruster k [-, m].
-        """
+        """Returns the wrenches [force, moment] (6, 8) about the centre of gravity per newton of thrust [-, m]."""
         torque = np.cross(self.thruster_positions_m, self.thruster_directions)
         return np.vstack([self.thruster_directions.T, torque.T])
 

@@ -1,7 +1,4 @@
-"""MuJoCo, configured for offscreen rendering. All modules import it from here: ``from twin.scenes.gl import mujoco``.
-
-MuJoCo imports PyOpenGL, so the OpenGL backend must be chosen before MuJoCo is imported. Both happen at the first use.
-"""
+"""MuJoCo for offscreen rendering, imported from here only: OpenGL's backend must be chosen before the import."""
 
 from __future__ import annotations
 
@@ -17,9 +14,9 @@ INSTALL_LINE = "apt-get install -y libegl1 libgl1 libgl1-mesa-dri"
 
 
 def _configure_egl() -> str:
-    """Selects EGL on Linux unless MUJOCO_GL is set, and patches old PyOpenGL versions; does nothing on other systems.
+    """Selects EGL on Linux unless MUJOCO_GL is set; returns why it does not work, or "".
 
-    MuJoCo needs the type EGLDeviceEXT, an opaque pointer. PyOpenGL 3.1.0, which pyrender pins, lacks this type.
+    PyOpenGL 3.1.0, which pyrender pins, lacks the type EGLDeviceEXT, an opaque pointer.
     """
     if sys.platform != "linux" or os.environ.setdefault("MUJOCO_GL", "egl").strip().lower() != "egl":
         return ""
@@ -36,7 +33,6 @@ def _configure_egl() -> str:
 
 @cache
 def _loaded() -> tuple[Any, str]:
-    """Returns the module of MuJoCo, imported after the configuration, and the result of `_configure_egl`."""
     reason = _configure_egl()
     import mujoco
 
@@ -51,7 +47,6 @@ class _MuJoCo:
 
 
 mujoco: Any = _MuJoCo()  #: Any: type checkers cannot read the compiled modules of MuJoCo
-#: Type aliases for signatures: compiled model, model specification, body of a specification, renderable scene.
 MjModel: TypeAlias = Any
 MjSpec: TypeAlias = Any
 MjsBody: TypeAlias = Any
@@ -61,8 +56,7 @@ MjvScene: TypeAlias = Any
 def offscreen_context(width_px: int, height_px: int) -> Any:
     """Returns a current OpenGL context without a window; the caller must call its ``free()``.
 
-    Raises:
-        TwinError: OpenGL is missing; the message contains the command that installs it.
+    Raises TwinError, with the command that installs it, if OpenGL is missing.
     """
     if reason := _loaded()[1]:
         raise _opengl_missing(reason)
@@ -79,6 +73,5 @@ def offscreen_context(width_px: int, height_px: int) -> Any:
 
 
 def _opengl_missing(reason: str) -> TwinError:
-    """Returns the error that reports missing OpenGL and the command that installs it."""
     allowed = f"a working EGL; on Debian or Ubuntu, install it with: {INSTALL_LINE}"
     return TwinError("rendering", f"no OpenGL on this machine: {reason}", allowed)

@@ -14,7 +14,7 @@ from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
 
 from twin.core.georeference import Georeference
-from twin.core.raster_files import open_raster
+from twin.core.user_files import open_raster
 from twin.errors import TwinError
 from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits
 
@@ -31,17 +31,15 @@ _MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than th
 def lay_orthophoto(
     texture: Image, file: Path, extent_m: tuple[float, float], georeference: Georeference | None
 ) -> NDArray[np.bool_]:
-    """Replaces the texture of a floor by an orthophoto wherever the orthophoto has valid pixels.
+    """Replaces the texture of a floor by an orthophoto where it has valid pixels; returns whether it covers each texel.
 
-    The orthophoto is transformed to the CRS of the DEM. An orthophoto without a CRS is taken to be in that of the DEM.
-    If more than 1.5 of its pixels fit along the side of a texel, they are averaged over the texel, else interpolated.
+    It is transformed to the CRS of the DEM; without a CRS, it is taken to be in that one. If more than 1.5 of its
+    pixels fit along the side of a texel, they are averaged over the texel, else interpolated.
 
     Args:
         texture: (rows, cols, 3) uint8 RGB, row 0 = north, changed in place.
         extent_m: extent of the floor along x and y; its centre is the origin of the scene.
         georeference: position of the scene in the CRS of the DEM; None if the DEM has no coordinates.
-    Returns:
-        Whether the orthophoto covers each texel (rows, cols).
     Raises:
         TwinError: the DEM has no coordinates, or no CRS although the orthophoto has one; or the orthophoto is missing,
             invalid or too large, has no coordinates, or does not overlap the DEM.
@@ -71,7 +69,6 @@ def _error(file: Path, problem: str, allowed: str) -> TwinError:
 def _read(
     source: rasterio.DatasetReader, file: Path, grid: Affine, shape: tuple[int, int], georeference: Georeference
 ) -> tuple[Image, NDArray[np.bool_]]:
-    """Returns the colours (rows, cols, 3) of an orthophoto at the texels, and whether it covers each texel."""
     bands = _colour_bands(source, file)
     floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
     if source.crs is not None and floor_crs is None:
@@ -105,10 +102,7 @@ def _brightest(source: rasterio.DatasetReader, bands: list[int]) -> int:
 
 
 def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:
-    """Returns the number of the grey band, or the numbers of the bands of red, green and blue, from 1.
-
-    Three bands that are not marked as red, green and blue are taken to be red, green and blue in the order of the file.
-    """
+    """Returns the number of the grey band, or those of red, green and blue (in file order if not marked), from 1."""
     if ColorInterp.palette in source.colorinterp:
         raise _error(file, "has a palette in place of colours", _NO_PALETTE)
     kind_of = {k: interp for k, interp in enumerate(source.colorinterp, 1) if interp != ColorInterp.alpha}
@@ -122,7 +116,6 @@ def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:
 
 
 def _check_overlap(file: Path, bounds: Bounds, floor: Bounds) -> None:
-    """Raises TwinError if an orthophoto does not overlap the floor."""
     west, south, east, north = bounds
     if not (west < floor[2] and east > floor[0] and south < floor[3] and north > floor[1]):
         raise _error(

@@ -15,7 +15,7 @@ from rasterio.enums import ColorInterp
 from rasterio.warp import transform
 
 from twin.core.georeference import Georeference
-from twin.core.raster_files import open_raster
+from twin.core.user_files import open_raster
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, height_error
 from twin.terrains.holes import check_no_undeclared_holes
 from twin.terrains.vertical_axis import VerticalAxis, cf_direction, unit_length_m
@@ -37,12 +37,10 @@ def read_geotiff(
     """Reads a GeoTIFF with one band of heights, and possibly an alpha band, which is 0 where there is no height.
 
     Returns:
-        Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m], `height_spacing_m` if the
-        file has no coordinates; vertical axis; position of the centre of the raster in its CRS, None without
-        coordinates.
+        Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m], `height_spacing_m` without
+        coordinates; vertical axis; position of the centre of the raster in its CRS, None without coordinates.
     Raises:
-        TwinError: the file cannot be read, is an image or too large, or its grid or the unit of its heights is not
-            supported.
+        TwinError: the file cannot be read, is an image or too large, or its grid or unit of height is not supported.
     """
     with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS) as source:
         if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
@@ -78,7 +76,6 @@ def _values(source: rasterio.DatasetReader, file: Path) -> NDArray[np.float64]:
 
 
 def _crs_parts(crs: CRS | None) -> tuple[Part, Part]:
-    """Returns the horizontal and the vertical part of a CRS."""
     if crs is None:
         return None, None
     tree = crs.to_dict(projjson=True)
@@ -95,10 +92,7 @@ def _axis_unit_m(crs: Part) -> float:
 
 
 def _vertical_axis(source: rasterio.DatasetReader, horizontal: Part, vertical: Part, file: Path) -> VerticalAxis:
-    """Returns the vertical axis that the vertical CRS, the band's unit and the tags describe.
-
-    The unit of the band takes precedence over that of the vertical CRS; without either, heights are in metres.
-    """
+    """Returns the vertical axis that the vertical CRS, the unit of the band (it comes first) and the tags describe."""
     tags, file_tags = source.tags(1), source.tags()
     names = [source.descriptions[0] or "", *(tags.get(key, "") for key in _BAND_TAGS)]
     direction = vertical["coordinate_system"]["axis"][0]["direction"] if vertical is not None else None
@@ -119,8 +113,7 @@ def _vertical_axis(source: rasterio.DatasetReader, horizontal: Part, vertical: P
 def _output_crs(crs: CRS | None, horizontal: Part, vertical: Part) -> str | None:
     """Returns the CRS of the output rasters as WKT; None if the file has no horizontal CRS.
 
-    Output elevations are in metres, positive upwards. The CRS is that of the file; its vertical part is dropped if it
-    has another unit or is positive downwards.
+    The vertical part is dropped if it has another unit than metres or is positive downwards.
     """
     if crs is None or horizontal is None:
         return None
@@ -130,7 +123,6 @@ def _output_crs(crs: CRS | None, horizontal: Part, vertical: Part) -> str | None
 
 
 def _check_grid(source: rasterio.DatasetReader, file: Path) -> None:
-    """Raises TwinError if the grid is in degrees, is not north up, or its cells are not square."""
     t = source.transform
     if _in_degrees(source):
         remedy = f"gdalwarp -t_srs EPSG:{_utm_epsg(*_centre(source))} -tr CELL_M CELL_M {file.name} projected.tif"
@@ -161,9 +153,9 @@ def _check_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: Pat
 
 
 def _ground_scale(source: rasterio.DatasetReader, unit_m: float) -> tuple[NDArray[np.float64], float, float]:
-    """Returns distances on the ellipsoid / distances in the CRS at the centre, along easting and northing (2,).
+    """Returns distances on the ellipsoid / distances in the CRS at the centre, along easting and northing (2,), or 1.
 
-    They are 1 if the centre is outside the domain of the CRS. Also returns longitude and latitude of the centre [deg].
+    Also returns longitude and latitude of the centre [deg].
     """
     east, north = _centre(source)
     step = 100.0 / unit_m
@@ -178,12 +170,10 @@ def _ground_scale(source: rasterio.DatasetReader, unit_m: float) -> tuple[NDArra
 
 
 def _centre(source: rasterio.DatasetReader) -> tuple[float, float]:
-    """Returns the coordinates of the centre of a raster that is north up, in its CRS."""
     t = source.transform
     return float(t.c + t.a * source.width / 2), float(t.f + t.e * source.height / 2)
 
 
 def _utm_epsg(longitude_deg: float, latitude_deg: float) -> int:
-    """Returns the EPSG code of the UTM zone (WGS 84) of a position."""
     zone = min(max(math.floor((longitude_deg + 180) / 6) + 1, 1), 60)
     return (32600 if latitude_deg >= 0 else 32700) + zone

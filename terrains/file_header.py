@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.raster_files import IMAGE_DRIVERS, open_raster
-from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes, reading
+from twin.core.user_files import IMAGE_DRIVERS, MOST_IMAGE_BYTES, open_raster, read_bytes, reading
 from twin.errors import TwinError
 from twin.terrains.terrain import MAX_NODES, MAX_TEXELS
 
@@ -24,23 +23,17 @@ _MOST = dict.fromkeys((TEXTURE_FIELD, ORTHOPHOTO_FIELD), (MAX_TEXELS, "pixels"))
 
 
 def height_error(file: Path, problem: str, allowed: str = HEIGHT_FORMATS) -> TwinError:
-    """Returns the error that a height file has a problem."""
     return TwinError(HEIGHT_FIELD, f"{file.name!r} {problem}", allowed)
 
 
 def check_count(cols: int, rows: int, file: Path, field: str) -> None:
-    """Raises TwinError if the file that the key `field` names has more than MAX_NODES heights or MAX_TEXELS pixels."""
     most, values = _MOST[field]
     if cols * rows > most:
         raise TwinError(field, f"{file.name!r} has {cols} x {rows} {values}", f"at most {most} {values}")
 
 
 def decoded(file: Path, field: str, allowed: str, flags: int) -> NDArray[np.generic] | None:
-    """Returns the pixels of an image file (PNG, JPEG, TIFF, BMP, WebP), read by OpenCV; None if it cannot be read.
-
-    Raises:
-        TwinError: the file is missing, not such an image or has too many pixels.
-    """
+    """Returns the pixels of an image file; None if unreadable, TwinError if missing, of another type or too large."""
     with open_raster(file, field, allowed, IMAGE_DRIVERS) as source:
         check_count(source.width, source.height, file, field)
     data = read_bytes(file, field, allowed, MOST_IMAGE_BYTES)
@@ -51,7 +44,7 @@ def decoded(file: Path, field: str, allowed: str, flags: int) -> NDArray[np.gene
 def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
     """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower 8, 10, 12 or 14 only.
 
-    White is the greatest value of the fewest bits that contain `brightest`, the greatest value of the whole image.
+    White is the greatest value of the fewest bits that contain `brightest`.
     """
     white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
     return np.clip(np.rint(values * (255.0 / white)), 0, 255).astype(np.uint8)

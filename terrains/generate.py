@@ -23,13 +23,10 @@ def generate(
     kind: str, size_m: tuple[float, float], relief_m: float, base_m: float, grid_m: float, texture: TextureSource,
     seed: int | np.random.SeedSequence,
 ) -> Terrain:  # fmt: skip
-    """Returns a terrain of a kind of KINDS, centred at the origin, with heights from base_m to base_m + relief_m.
+    """Returns a terrain of one of KINDS, centred at the origin, with heights from base_m to base_m + relief_m.
 
-    A terrain of kind "flat", or without relief, has the height base_m everywhere. The arguments are those of
-    `generate_from`.
-
-    Raises:
-        TwinError: the kind or the cover is unknown, or the terrain is too large for memory.
+    Without relief, the height is base_m everywhere. The arguments are those of `generate_from`. Raises TwinError if the
+    kind or the cover is unknown, or the terrain is too large for memory.
     """
     if kind not in KINDS:
         raise TwinError("terrain.kind", f"unknown kind {kind!r}", ", ".join(KINDS))
@@ -49,8 +46,7 @@ def generate_from(
     """Returns a terrain centred at the origin, with heights from a function and a generated texture.
 
     Args:
-        heights: function that returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the grid nodes [m], given
-            a random generator.
+        heights: returns the heights (ny, nx) [m] at x (nx,) and y (ny,) of the nodes [m], given a random generator.
         size_m: extent along x and y; rounded up to whole cells.
         texture: side of a texel and texture of walls; its files are not used.
         cover: a key of `ground_cover.COVERS`.

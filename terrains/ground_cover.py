@@ -1,8 +1,4 @@
-"""Materials of generated floors, such as sand, reef rock, algae, coral and seagrass, with their structure.
-
-A material is a ramp of colours from dark to bright, and a structure that moves each texel along this ramp: grains,
-stones with dark gaps, cracks, polyps, blades, burrows or shells.
-"""
+"""Materials of generated floors: ramps of colours from dark to bright, and structures that move texels along them."""
 
 from __future__ import annotations
 
@@ -19,8 +15,6 @@ Colour = tuple[int, int, int]
 
 
 class Cover(NamedTuple):
-    """Material of a floor."""
-
     dark: Colour  #: albedo as 8-bit RGB at the ends and in the middle of the ramp
     medium: Colour
     bright: Colour
@@ -50,7 +44,6 @@ COVERS = {
     "seagrass": (SAND, SEAGRASS, SEAGRASS, SEAGRASS),
     "mud": (MUD, MUD, MUD, RUBBLE),
 }
-#: Cover of each kind of floor if the scenario does not choose one.
 DEFAULT_COVERS = {
     "flat": "sand", "ripples": "sand", "fractal": "rock", "reef": "reef", "cliffs": "reef", "file": "reef",
 }  # fmt: skip
@@ -62,10 +55,7 @@ def paint(
 ) -> NDArray[np.uint8]:
     """Returns the colours (rows, cols, 3) uint8 of a floor with the materials of `cover`, a key of COVERS.
 
-    Args:
-        material: (rows, cols) level that selects the material: its quarters belong to the four materials of the cover,
-            with gradual transitions between them.
-        tone: (rows, cols) pink noise with mean 128, see `noise.pink_noise`.
+    Quarters of the levels `material` belong to its four materials, with transitions; `tone` (rows, cols) is pink noise.
     """
     covers = COVERS[cover]
     bands = [np.array([c.dark, c.medium, c.bright]).T for c in covers]
@@ -142,10 +132,7 @@ def _structure(kind, x, y, size, table):
 
 @kernel
 def _blades(x, y, table):
-    """Returns the change along the ramp at (x, y) due to crossing blades of seagrass in three layers, dark in between.
-
-    x and y are in units of the width of a blade.
-    """
+    """Returns the change along the ramp due to crossing blades of seagrass in three layers; x, y in their widths."""
     x += 12.0 * fractal_noise(x / 45.0, y / 45.0, 2, table, 0)
     y += 12.0 * fractal_noise(x / 45.0, y / 45.0, 2, table, 1)
     tone = -1.0
@@ -160,5 +147,4 @@ def _blades(x, y, table):
 
 @kernel
 def _soft(inside, width):
-    """Returns 0 outside and 1 inside a spot, from the distance `inside` its edge and the `width` of the soft edge."""
     return min(max(inside / width + 0.5, 0.0), 1.0)

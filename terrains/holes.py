@@ -10,7 +10,6 @@ from scipy import ndimage
 
 from twin.terrains.file_header import height_error
 
-#: Values that programs write in cells without a height.
 _NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 65535.0)
 #: Holes are small if they are enclosed, and no node in them is farther from a height than this many grid spacings.
 _SMALL = 2.0
@@ -19,10 +18,7 @@ _LEAST_GAP, _MOST_RANGES = 100.0, 10.0
 
 
 def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> None:
-    """Raises TwinError if the least or the greatest value is so far from all others that it can only mark holes.
-
-    Values are NaN or infinite in the holes that the file declares; `remedy` says how to declare the value "{}".
-    """
+    """Raises TwinError if the least or greatest value can only mark holes; `remedy` says how to declare "{}"."""
     finite = values[np.isfinite(values)]
     for value in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
         heights = finite[(finite != value) & ~np.isin(finite, _NODATA)]
@@ -37,7 +33,7 @@ def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: s
 
 
 def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Replaces NaN and infinite values by the nearest height; returns the heights and the number of replaced values."""
+    """Replaces values that are not finite by the nearest height; returns the heights and the number of these."""
     holes = ~np.isfinite(height_m)
     if not holes.any():
         return height_m, 0

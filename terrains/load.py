@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -25,15 +24,6 @@ Heights = NDArray[np.float64]
 _MOST_HEIGHT_M = 20_000.0
 
 
-class HeightGrid(NamedTuple):
-    """Heights as read from a file."""
-
-    values: Heights  #: (ny, nx) elevations or depths in the unit of `axis`, row 0 = north, not finite in holes
-    spacing_m: float  #: grid spacing
-    axis: VerticalAxis  #: vertical axis as the file describes it
-    georeference: Georeference | None = None  #: of the centre of the raster at elevation 0; None without coordinates
-
-
 def load(
     height_file: str | Path, texture: TextureSource, height_spacing_m: float, height_range_m: float,
     seed: int | np.random.SeedSequence, z: Direction | None = None,
@@ -48,20 +38,19 @@ def load(
         seed: seed of the texture if it is generated.
         z: direction in which the values of the file increase; None: determined from the file.
     Raises:
-        TwinError: a file is missing, invalid or too large, the direction of the heights is not clear, or the cover is
-            unknown.
+        TwinError: a file is missing, invalid or too large, the direction of heights unclear, or the cover unknown.
     """
     file = Path(height_file)
-    read = _read_heights(file, height_spacing_m, height_range_m)
-    _check(read.values, file)
-    upward_m = upward_sign(read.values, read.axis, z, file) * read.axis.metres_per_unit
-    values = read.values[::-1] * upward_m
+    given, spacing_m, axis, georeference = _read_heights(file, height_spacing_m, height_range_m)
+    _check(given, file)
+    upward_m = upward_sign(given, axis, z, file) * axis.metres_per_unit
+    values = given[::-1] * upward_m
     (raw, n_filled), known = fill_holes(values), known_nodes(np.isfinite(values))
     if (most_m := float(np.abs(raw).max())) > _MOST_HEIGHT_M:  # larger than any on Earth
         raise height_error(file, f"has a height of {most_m:g} m", f"heights within {_MOST_HEIGHT_M:g} m of zero")
-    lowest_m, spacing_m = raw.min(), read.spacing_m
+    lowest_m = raw.min()
     height_m = (raw - lowest_m).astype(np.float32)
-    georeference = read.georeference and replace(read.georeference, elevation_m=float(lowest_m))
+    georeference = georeference and replace(georeference, elevation_m=float(lowest_m))
     ny, nx = height_m.shape
     extent_m = ((nx - 1) * spacing_m, (ny - 1) * spacing_m)
     shape = texture_shape((ny, nx), spacing_m, texture.texel_m(extent_m) if texture.in_images else spacing_m)
@@ -83,24 +72,26 @@ def load(
     return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share, walls, known)
 
 
-def _read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightGrid:
-    """Returns the heights of a file, whose number in the header is checked before they are read."""
+def _read_heights(
+    file: Path, height_spacing_m: float, height_range_m: float
+) -> tuple[Heights, float, VerticalAxis, Georeference | None]:
+    """Returns what `elevation_model.read_geotiff` returns of a GeoTIFF, of any file of heights."""
     suffix, named = file.suffix.lower(), VerticalAxis(texts=(file.stem,))
     if suffix in (".tif", ".tiff"):
         from twin.terrains.elevation_model import read_geotiff  # imported here: it imports rasterio
 
-        return HeightGrid(*read_geotiff(file, height_spacing_m))
+        return read_geotiff(file, height_spacing_m)
     if suffix == ".png":
-        return HeightGrid(_read_png(file) * height_range_m, height_spacing_m, named._replace(band_name="height"))
+        return _read_png(file) * height_range_m, height_spacing_m, named._replace(band_name="height"), None
     if suffix == ".npy":
         values = _read_npy(file)
         check_no_undeclared_holes(values, file, "NaN in place of {}")
-        return HeightGrid(values, height_spacing_m, named)
+        return values, height_spacing_m, named, None
     raise height_error(file, "is not a height file")
 
 
 def _read_png(file: Path) -> Heights:
-    """Returns the heights of a 16-bit PNG as fractions of the height range, 0 to 1."""
+    """Returns the heights of a 16-bit PNG as fractions of the height range."""
     image = decoded(file, HEIGHT_FIELD, HEIGHT_FORMATS, cv2.IMREAD_UNCHANGED)
     if image is None:
         raise height_error(file, "cannot be read as PNG")
@@ -111,7 +102,6 @@ def _read_png(file: Path) -> Heights:
 
 
 def _read_npy(file: Path) -> Heights:
-    """Returns the heights (rows, cols) of a .npy file [m]."""
     with reading(file, HEIGHT_FIELD, HEIGHT_FORMATS):
         array = np.load(file, mmap_mode="r", allow_pickle=False)  # only the header is read
     if not isinstance(array, np.ndarray) or array.ndim != 2 or array.dtype.kind not in "fiu" or array.dtype == np.uint8:
@@ -122,7 +112,6 @@ def _read_npy(file: Path) -> Heights:
 
 
 def _check(values: Heights, file: Path) -> None:
-    """Raises TwinError if there are fewer than 2 x 2 heights, or none is finite."""
     rows, cols = values.shape
     if rows < 2 or cols < 2:
         raise height_error(file, f"has {rows} row(s) and {cols} column(s)", "at least 2 x 2 heights")

@@ -21,8 +21,8 @@ def fractal_field(
 ) -> NDArray[np.float32]:
     """Returns an approximate fractional Brownian surface (rows, cols), with zero mean and unit standard deviation.
 
-    It is a sum of octaves of interpolated random values. Those of octave k are coarsest_px / 2^k cells apart, between 1
-    and at least 2 cells; the amplitude of the octave is gain^k, with the gain 2^-H for a Hurst exponent H.
+    The random values of octave k are coarsest_px / 2^k cells apart, between 1 and at least 2 cells; its amplitude is
+    gain^k, with the gain 2^-H for a Hurst exponent H.
     """
     total = np.zeros(shape, np.float32)
     amplitude, scale_px = 1.0, float(max(coarsest_px, 2.0))
@@ -35,7 +35,6 @@ def fractal_field(
 
 
 def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: float) -> NDArray[np.float32]:
-    """Upsamples noise by the factor scale_px with cubic interpolation; returns a field of the given shape."""
     affine = np.array([[1 / scale_px, 0, 1], [0, 1 / scale_px, 1]])
     flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
     upsampled = cv2.warpAffine(noise, affine, shape[::-1], flags=flags, borderMode=cv2.BORDER_REFLECT)
@@ -43,11 +42,7 @@ def _upsample(noise: NDArray[np.float32], shape: tuple[int, int], scale_px: floa
 
 
 def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Returns 8-bit pink noise (rows, cols) with a mean of about 128.
-
-    The random values of every octave have the standard deviation `contrast` [grey levels] before interpolation, so an
-    image of a floor with this texture shows detail at any distance; the finest octave has one value per cell.
-    """
+    """Returns 8-bit pink noise (rows, cols), mean 128, of octaves of standard deviation `contrast` [grey levels]."""
     sizes = [tuple(-(-n // 2**k) for n in shape) for k in range(octaves)][::-1]
     value = np.full(sizes[0], 128, np.uint8)
     weight = contrast * np.sqrt(12) / 255  # uniform noise from 0 to 255 has the standard deviation 255 / sqrt(12)
@@ -59,7 +54,6 @@ def pink_noise(shape: tuple[int, int], octaves: int, contrast: float, rng: np.ra
 
 
 def lattice_table(rng: np.random.Generator) -> NDArray[np.float32]:
-    """Returns the random numbers (LATTICE, LATTICE), 0 to 1, of a lattice for `value_noise` and what is based on it."""
     return rng.random((LATTICE, LATTICE), np.float32)
 
 
@@ -78,17 +72,13 @@ def value_noise(x, y, table, layer):
 
 @kernel(inline="always")
 def fractal_noise(x, y, octaves, table, layer):
-    """Returns a sum of octaves of value noise, about -1 to 1 with a mean of about 0.
-
-    Each octave has half the amplitude and wavelength of the one before; (x, y) are in lattice spacings of the first.
-    """
+    """Returns a sum of octaves of value noise, about -1 to 1; amplitude and wavelength halve with each octave."""
     # numba compiles a function once for each value of an `int` constant in a call, but not of an `np.int64`
     return _octaves(x, y, np.int64(octaves), table, np.int64(layer))  # pyright: ignore[reportArgumentType]
 
 
 @kernel
 def _octaves(x, y, octaves, table, layer):
-    """Compiled loop of `fractal_noise`."""
     total, amplitude = 0.0, 1.0
     for octave in range(octaves):
         total += amplitude * (2.0 * value_noise(x, y, table, layer + 7 * octave) - 1.0)
@@ -98,10 +88,9 @@ def _octaves(x, y, octaves, table, layer):
 
 @kernel
 def cells(x, y, table, layer):
-    """Returns the distances to the nearest and second nearest point of cellular noise, and the nearest's own number.
+    """Returns the distances to the nearest two points of cellular noise, and the nearest's own number, 0 to 1.
 
-    Each square of the lattice contains one point, at a random place; distances are in lattice spacings, the random
-    number of a point is 0 to 1.
+    Each square of the lattice contains one point, at a random place; distances are in lattice spacings.
     """
     nearest, second, row, col = 9.0, 9.0, 0, 0
     i0, j0 = int(np.floor(x)) - 1, int(np.floor(y)) - 1

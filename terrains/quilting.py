@@ -26,9 +26,8 @@ MIN_BLOCK_PX = 8  #: a photo whose blocks would be smaller is repeated as tiles
 def even_lighting(photo: Image) -> Image:
     """Returns a photo (h, w, 3) of a floor without slow variations of its brightness, the mean of R, G and B.
 
-    A polynomial of degree 2 in row and column is fitted to the brightness of about LIGHTING_SAMPLES pixels. The photo
-    is multiplied by the mean brightness and divided by this polynomial, or by 5 % of the mean where it is less. A
-    black photo is returned unchanged.
+    It is divided by a polynomial of degree 2 in row and column, fitted to about LIGHTING_SAMPLES pixels, or by 5 % of
+    the mean where that is less. A black photo is returned unchanged.
     """
     step = max(1, round(np.sqrt(photo.shape[0] * photo.shape[1] / LIGHTING_SAMPLES)))
     v, u = (np.linspace(-1.0, 1.0, n, dtype=np.float32) for n in photo.shape[:2])
@@ -48,15 +47,14 @@ def even_lighting(photo: Image) -> Image:
 
 
 def _terms(v: NDArray[np.float32], u: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
-    """Returns the terms of a polynomial of degree 2 at row positions v (h, 1) and column positions u (1, w)."""
     return np.ones((1, 1), np.float32), u, v, u * u, u * v, v * v
 
 
 def quilt(photo: Image, shape: tuple[int, int], rng: np.random.Generator) -> Image:
     """Returns a texture (rows, cols, 3) made of blocks of a photo (h, w, 3), with the scale of the photo.
 
-    A texture that has at most the rows and columns of the photo is its upper left part. The photo has at least
-    BLOCK_FRACTION * MIN_BLOCK_PX rows and columns.
+    A texture that fits into the photo is its upper left part. The photo has at least BLOCK_FRACTION * MIN_BLOCK_PX rows
+    and columns.
     """
     rows, cols = shape
     if rows <= photo.shape[0] and cols <= photo.shape[1]:
@@ -80,10 +78,7 @@ def quilt(photo: Image, shape: tuple[int, int], rng: np.random.Generator) -> Ima
 
 @kernel
 def _differences(target, photo, places, overlap, above, left):
-    """Returns the sums of squared differences of target and blocks in the overlaps with the blocks above and left.
-
-    Only every second pixel of every second row is used.
-    """
+    """Returns the sums of squared differences in the overlaps with the blocks above and left, of every second pixel."""
     side, totals = target.shape[0], np.zeros(len(places))
     for k in range(len(places)):
         block, total = photo[places[k, 0] : places[k, 0] + side, places[k, 1] : places[k, 1] + side], 0.0
@@ -99,7 +94,6 @@ def _differences(target, photo, places, overlap, above, left):
 
 @kernel
 def _squared(a, b):
-    """Returns the squared distance of two colours."""
     d0, d1, d2 = float(a[0]) - b[0], float(a[1]) - b[1], float(a[2]) - b[2]
     return d0 * d0 + d1 * d1 + d2 * d2
 
@@ -108,8 +102,7 @@ def _squared(a, b):
 def _join(target, block, overlap, above, left):
     """Copies the part of a block (side, side, 3) below and right of the cuts through its overlaps onto the target.
 
-    A cut is the path of least difference through the overlap with the block above or to the left. Block and target are
-    blended over a width of 3 px across the cuts.
+    Cuts are paths of least difference; block and target are blended over a width of 3 px across them.
     """
     side = target.shape[0]
     upper, west, cost = np.full(side, -2.0), np.full(side, -2.0), np.empty((side, overlap))

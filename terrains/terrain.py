@@ -22,10 +22,9 @@ MAX_TEXELS = 250_000_000
 class Walls(NamedTuple):
     """Texture of the walls of a floor, and its weights (module `walls`).
 
-    A weight belongs to a corner of a cell of the height grid and is interpolated bilinearly within the cell. Its sign
-    is that of the normal, so that opposite walls differ: where it is positive, the columns of the texture run along +y
-    (projection along x) or +x (projection along y) from the south-west corner of the floor; where it is negative, they
-    run in the same direction from right to left.
+    A weight belongs to a corner of a cell and is interpolated bilinearly. Its sign is that of the normal, so that
+    opposite walls differ: where it is positive, the columns of the texture run along +y (projection along x) or +x
+    (projection along y) from the south-west corner of the floor; where it is negative, they run from right to left.
     """
 
     #: (ny - 1, nx - 1) int32 index in `weights` of each cell, row 0 = south; -1 where all weights are 0
@@ -74,7 +73,6 @@ class Terrain:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Returns the extent along x and y [m]."""
         ny, nx = self.height_m.shape
         return (nx - 1) * self.spacing_m, (ny - 1) * self.spacing_m
 
@@ -95,8 +93,12 @@ class Terrain:
         return float(self.height_m.max())
 
     @property
+    def extent(self) -> str:
+        """Returns the extent as text, for errors."""
+        return f"x {self.west_m:.2f} to {self.east_m:.2f}, y {self.south_m:.2f} to {self.north_m:.2f} m"
+
+    @property
     def hole_notes(self) -> list[str]:
-        """Returns the sentences about the nodes without a height in the source."""
         n, n_unknown = self.height_m.size, 0 if self.known is None else int((~self.known).sum())
         n_small = self.n_filled - n_unknown
         unknown = (
@@ -107,7 +109,7 @@ class Terrain:
         return [note for note, count in ((unknown, n_unknown), (small, n_small)) if count]
 
     def in_hole(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
-        """Returns whether each point (x, y) lies in a cell with an unknown node; false outside the terrain."""
+        """Returns whether each point lies in a cell with an unknown node; false outside the terrain."""
         r, c, _, _, inside = self._cells(x_m, y_m)
         if self.known is None:
             return np.zeros(inside.shape, np.bool_)
@@ -133,11 +135,7 @@ class Terrain:
 
 
 def texture_shape(height_shape: tuple[int, ...], spacing_m: float, texture_px_m: float) -> tuple[int, int]:
-    """Returns the rows and columns of a texture that covers a height grid (ny, nx); at least 2 x 2.
-
-    Raises:
-        TwinError: more than MAX_NODES nodes or MAX_TEXELS texels.
-    """
+    """Returns rows and columns, at least 2, of a texture of a grid (ny, nx); TwinError above MAX_NODES, MAX_TEXELS."""
     ny, nx = height_shape
     if nx * ny > MAX_NODES:
         raise TwinError("terrain.grid_m", f"{nx} x {ny} height nodes", f"at most {MAX_NODES} nodes")

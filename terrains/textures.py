@@ -40,7 +40,6 @@ class TextureSource:
     walls: bool = False  #: whether steep parts of the floor have a texture of their own, see `Walls`
 
     def texel_m(self, size_m: tuple[float, float]) -> float:
-        """Returns the side of the texels of a floor of the given extent along x and y [m]."""
         least_m = float(np.sqrt(size_m[0] * size_m[1] / COARSEN_TEXELS))
         return max(self.px_m, least_m) if self.coarsen else self.px_m
 
@@ -51,10 +50,7 @@ def generate_texture(
     """Returns a texture (rows, cols, 3) uint8 RGB, row 0 = north, of a height grid (ny, nx), row 0 = south.
 
     Height, slope and noise, in patches of up to 1 m, determine the material of a texel, one of those of `cover`, a key
-    of `COVERS`. The structure of the material and pink noise down to single texels determine its tone.
-
-    Raises:
-        TwinError: the cover is unknown.
+    of `COVERS`; its structure and pink noise down to single texels determine the tone. TwinError for an unknown cover.
     """
     if cover not in COVERS:
         raise TwinError("terrain.cover", f"unknown cover {cover!r}", ", ".join(COVERS))
@@ -70,10 +66,7 @@ def generate_texture(
 def generate_wall_texture(
     cover: str, shape: tuple[int, int], extent_m: tuple[float, float], spacing_m: float, rng: np.random.Generator
 ) -> Image:
-    """Returns a texture (rows, cols, 3) of steep parts with the materials that `generate_texture` gives them.
-
-    Rows run down from the highest to the lowest point of the floor, whose nodes are `spacing_m` apart.
-    """
+    """Returns a texture (rows, cols, 3) of steep parts; rows run down from the floor's highest to its lowest point."""
     tone = _tone(shape, rng)
     cols, rows = (max(2, round(extent / spacing_m) + 1) for extent in extent_m)
     patches = fractal_field((rows, cols), 1.0 / spacing_m, 0.6, rng)
@@ -82,7 +75,6 @@ def generate_wall_texture(
 
 
 def _tone(shape: tuple[int, int], rng: np.random.Generator) -> Image:
-    """Returns the pink noise (rows, cols) of a generated texture, mean 128."""
     return pink_noise(shape, int(np.clip(np.log2(max(shape)), 3, 11)), 20.0, rng)
 
 
@@ -97,11 +89,7 @@ def _material(
 
 
 def read_image(file: Path) -> Image:
-    """Returns an image file as (rows, cols, 3) uint8 RGB.
-
-    Raises:
-        TwinError: the file does not exist, is not an image, or has more than MAX_TEXELS pixels.
-    """
+    """Returns an image file as (rows, cols, 3) uint8 RGB; raises TwinError if it is none or too large."""
     image = decoded(file, TEXTURE_FIELD, _PHOTOS, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
     if image is not None and image.dtype == np.uint16:
         image = eight_bits(np.asarray(image, np.uint16), int(image.max()))
@@ -113,12 +101,8 @@ def read_image(file: Path) -> Image:
 def texture_from_photo(source: TextureSource, shape: tuple[int, int], extent_m: tuple[float, float]) -> Image:
     """Returns a texture (rows, cols, 3) uint8 RGB made from the photo of `source`, whose features keep their size.
 
-    With the tiling "stochastic", slow variations of the brightness are removed, and the texture is quilted from pieces
-    of the resampled photo. With "repeat", or if the shorter side of the photo is less than BLOCK_FRACTION *
-    MIN_BLOCK_PX before or after the resampling, the photo is repeated as tiles.
-
-    Raises:
-        TwinError: the photo is missing, not an image or too large.
+    It is quilted from the evenly lit, resampled photo or, with the tiling "repeat" or a photo with less than
+    BLOCK_FRACTION * MIN_BLOCK_PX along a side, made of repeated tiles. Raises TwinError like `read_image`.
     """
     assert source.photo_file is not None
     photo = read_image(Path(source.photo_file))
@@ -132,7 +116,6 @@ def texture_from_photo(source: TextureSource, shape: tuple[int, int], extent_m: 
 
 
 def _scaled(photo: Image, factor: float) -> Image:
-    """Returns a photo (h, w, 3) resampled so that its numbers of rows and columns are multiplied by a factor."""
     rows, cols = (max(1, round(n * factor)) for n in photo.shape[:2])
     if (rows, cols) == photo.shape[:2]:
         return photo
@@ -141,7 +124,6 @@ def _scaled(photo: Image, factor: float) -> Image:
 
 
 def tile_image(image: Image, image_px_m: float, shape: tuple[int, int], extent_m: tuple[float, float]) -> Image:
-    """Returns a texture of copies of an image from the north-west corner, by nearest-neighbour sampling."""
     rows, cols = (
         np.floor((np.arange(n) + 0.5) * (extent / n) / image_px_m).astype(np.int64) % period
         for n, extent, period in zip(shape, extent_m[::-1], image.shape, strict=False)

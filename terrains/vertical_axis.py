@@ -27,7 +27,6 @@ UNITS_M = {
 _DEPTH_WORD = re.compile(r"depth|sounding", re.IGNORECASE)
 #: Band names that state depths. If the band has no negative value, its values increase downwards.
 _DEPTH_BAND = re.compile(r"^\s*(water |sea ?floor |bottom )?depths?\b", re.IGNORECASE)
-#: Band names that state heights.
 _HEIGHT_BAND = re.compile(r"elevation|height|altitude", re.IGNORECASE)
 #: Beginnings of standard names that the CF conventions define as positive downwards.
 _CF_DEPTHS = ("depth", "sea_floor_depth")
@@ -45,7 +44,6 @@ class VerticalAxis(NamedTuple):
 
 
 def unit_length_m(name: str, file: Path) -> float:
-    """Returns the length [m] of a unit by its name. Raises TwinError if the unit is unknown."""
     length_m = UNITS_M.get(name.strip().lower().replace("_", " "), UNITS_M.get(name.strip().lower()))
     if length_m is None:
         raise height_error(file, f"has heights in the unknown unit {name!r}", "metres, feet or fathoms")
@@ -53,7 +51,7 @@ def unit_length_m(name: str, file: Path) -> float:
 
 
 def cf_direction(tags: dict[str, str]) -> Direction | None:
-    """Returns the direction given by the CF attributes `positive` and `standard_name` of a band; None if not given."""
+    """Returns the direction given by the CF attributes of a band; None if not given."""
     positive = tags.get("positive", "").lower()
     if positive == "up" or positive == "down":
         return positive
@@ -61,13 +59,10 @@ def cf_direction(tags: dict[str, str]) -> Direction | None:
 
 
 def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Direction | None, file: Path) -> float:
-    """Returns +1 if the values increase upwards, -1 if they are depths, which increase downwards.
+    """Returns +1 if the values (rows, cols), not finite in holes, increase upwards, -1 if they are depths.
 
-    Args:
-        values: (rows, cols) values of the file, NaN or infinite in holes, but not everywhere.
-        asked: `terrain.z` of the scenario, which takes precedence; None: determined from the file.
-    Raises:
-        TwinError: the file does not make clear which way its values increase.
+    `asked` is `terrain.z` of the scenario, which takes precedence; None: determined from the file. Raises TwinError if
+    the file does not make clear which way its values increase.
     """
     if asked is not None:
         return 1.0 if asked == "up" else -1.0
@@ -89,5 +84,4 @@ def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Directio
 
 
 def _ambiguous(problem: str) -> TwinError:
-    """Returns the error for an ambiguous vertical axis, whose message names `terrain.z`."""
     return TwinError("terrain.z", f"missing: {problem}", '"up" for elevations, "down" for depths')

@@ -33,10 +33,8 @@ def walls_of(
     Args:
         height_m: (ny, nx) heights, row 0 = south.
         cover: a key of `ground_cover.COVERS`, for a floor without photo.
-        texel_m: side of the texels of the floor; those of the walls have the same side, or a larger one if there would
-            be more than WALL_TEXELS.
-        draped: (rows, cols) texels, row 0 = north, that an orthophoto covers. It shows no walls, and the scene has its
-            colours wherever it has any: there are no walls here.
+        texel_m: side of the texels of the floor and, within WALL_TEXELS, of the walls.
+        draped: (rows, cols) texels, row 0 = north, that an orthophoto covers, where there are no walls.
     """
     found = wall_weights(height_m, spacing_m, draped) if source.walls else None
     if found is None:
@@ -57,8 +55,8 @@ def wall_weights(
 ) -> tuple[NDArray[np.int32], NDArray[np.float32]] | None:
     """Returns `number` and `weights` of `Walls` for heights (ny, nx); None if no cell is steep.
 
-    The normal at a corner is the mean over the adjacent cells whose normals differ little from that of the cell itself
-    (see CREASE_COSINE), so that weights vary smoothly, except at edges. Cells that overlap `draped` have no weights.
+    The normal at a corner is the mean over adjacent cells with normals near that of the cell itself (CREASE_COSINE), so
+    that weights vary smoothly, except at edges. Cells that overlap `draped` have no weights.
     """
     normals = _cell_normals(height_m, spacing_m)
     steep = normals[..., 2] <= STEEP_COSINE
@@ -88,7 +86,6 @@ def _cells_with(texels: Mask, shape: tuple[int, ...]) -> Mask:
 
 
 def _cell_normals(height_m: NDArray[np.float32], spacing_m: float) -> NDArray[np.float32]:
-    """Returns the unit normals (ny - 1, nx - 1, 3) of the cells of a height grid (ny, nx): means of both triangles."""
     east, north = np.diff(height_m, axis=1), np.diff(height_m, axis=0)
     sides = -(east[1:] + east[:-1]) / 2, -(north[:, 1:] + north[:, :-1]) / 2
     normals = np.stack([*sides, np.full(sides[0].shape, spacing_m, np.float32)], axis=2)

@@ -12,7 +12,7 @@ from study_surveys import SerialEngine, study_of
 
 from twin.app import study_command
 from twin.errors import ScenarioError
-from twin.studies import runner, wording
+from twin.studies import runner, sentences
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
 
@@ -99,7 +99,7 @@ def answer_of(name, folder):
         result = run(name, folder)
     except ScenarioError as error:
         return 2, [line.replace(f"{folder}/", "") for line in error.lines]
-    text = [wording.headline(result.analysis), *wording.answer_lines(result.analysis)]
+    text = [sentences.headline(result.analysis), *sentences.answer_lines(result.analysis)]
     return study_command.exit_status(result), [line.replace(f"{folder}/", "") for line in text]
 
 

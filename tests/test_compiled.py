@@ -52,7 +52,7 @@ def test_fastmath_functions_that_others_call_are_inlined():
     assert not wrong, f"called by others, so forceinline=True is required: {', '.join(wrong)}"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_run_that_compiles_and_one_that_loads_the_cache_write_identical_files(tmp_path):
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "MUJOCO_GL": "egl"}
     small = ["--set", "plan.tracks=1", "--set", "plan.area_m=[2.4, 1.2]"]

@@ -10,7 +10,7 @@ from twin.controllers.allocation import pseudo_inverse_allocation
 from twin.controllers.lawnmower import plan
 from twin.controllers.segments import Reference
 from twin.controllers.survey_plan import SurveyRequest
-from twin.controllers.tracking import commanded_velocity, rotate_lever_arm
+from twin.controllers.tracking import commanded_velocity, control_thrusters, rotate_lever_arm
 from twin.core import geometry
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
@@ -38,6 +38,12 @@ def body_reference(camera):
     return camera._replace(position=camera.position - rotate_lever_arm(float(camera.yaw), LEVER_M))
 
 
+def command(controller, pose, twist, reference):
+    """Returns the thruster commands of a pose controller for a reference of the body."""
+    position, velocity, yaw, acceleration = reference
+    return control_thrusters(controller, pose, twist, position, velocity, acceleration, float(yaw))
+
+
 def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors):
     """Flies a small survey with noisy state estimates; returns RMS position errors [m] and greatest tilts [deg]."""
     rng = np.random.default_rng(seed)
@@ -63,7 +69,7 @@ def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors
             )
             estimate = pose @ geometry.exp(np.concatenate([rng.normal(0, 0.002, 3), rng.normal(0, 0.003, 3)]))
             twist = rov.twist_body + np.concatenate([rng.normal(0, 0.01, 3), rng.normal(0, 0.02, 3)])
-            rov.step(controller.command(estimate, twist, reference), 1 / RATE_HZ)
+            rov.step(command(controller, estimate, twist, reference), 1 / RATE_HZ)
     table = np.array(rows)
     cruising, holding, settled = (table[:, k].astype(bool) for k in (6, 7, 8))
     return SimpleNamespace(
@@ -164,8 +170,8 @@ def test_the_integral_does_not_wind_up_while_thrusters_saturate():
     controller = nominal_controller(1.2, RATE_HZ)
     far = Reference(np.array([50.0, 0.0, 0.0]), np.zeros(3), 0.0, np.zeros(3))
     for _ in range(300):
-        controller.command(np.eye(4), np.zeros(6), far)
-    commands = controller.command(np.eye(4), np.zeros(6), far._replace(position=np.zeros(3)))
+        command(controller, np.eye(4), np.zeros(6), far)
+    commands = command(controller, np.eye(4), np.zeros(6), far._replace(position=np.zeros(3)))
     np.testing.assert_allclose(commands, 0, atol=1e-6)
 
 
@@ -176,6 +182,6 @@ def test_station_keeping_in_a_current_works_at_any_heading(yaw):
     rov = MujocoVehicle(bare_model(), VehicleConfig(), np.array([0.1, 0.05, 0.0]), start)
     controller = nominal_controller(1.2, RATE_HZ)
     for _ in range(20 * 30):
-        rov.step(controller.command(rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)
+        rov.step(command(controller, rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)
     np.testing.assert_allclose(rov.world_from_body[:3, 3], 0, atol=0.005)
     np.testing.assert_allclose(rov.world_from_body[:3, :3], geometry.rotation_from_rpy(0.0, 0.0, yaw), atol=0.005)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.core.height_field import cast_pixels, height_field, map_height_field, ray_grid
-from twin.core.image_overlap import image_overlap
+from twin.core.height_field import cast_pixels, height_field, image_overlap, map_height_field, ray_grid
 from twin.core.records import MapGrid, StereoRig
 from twin.terrains import Terrain
 

@@ -182,8 +182,8 @@ def test_principal_points_that_differ_in_their_columns_shift_the_right_image_onl
     cameras = [RecordedCamera((RIG.width_px, RIG.height_px), matrix, np.zeros(4)) for matrix in (RIG.matrix, shifted)]
     found = rectification(StereoCalibration(*cameras, geometry.inverse(RIG.left_from_right), Path("c")), 1.0)
     image = np.repeat(GRAY[..., None], 3, axis=2)
-    assert found.left(image) is image
-    np.testing.assert_array_equal(found.right(image)[:, :-7], image[:, 7:])
+    assert found.rectified(image, "left") is image
+    np.testing.assert_array_equal(found.rectified(image, "right")[:, :-7], image[:, 7:])
 
 
 def test_grey_colour_raw_and_deep_images_become_rgb(tmp_path):

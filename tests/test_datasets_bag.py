@@ -293,11 +293,11 @@ def test_a_bag_without_a_clear_pair_is_one_line_with_its_topics(topics, message)
 
 
 def test_named_topics_are_read_and_unknown_ones_listed(bag, frames, tmp_path):
-    swapped = BagTopics("/right/image_rect", "/left/image_rect")
+    swapped = BagTopics(("/right/image_rect", "/left/image_rect"))
     with pytest.raises(TwinError, match="negative"):
         read(bag, swapped)
     with pytest.raises(TwinError, match=r"--topics: '/c' is not an image topic .*/left/image_rect, /right/image_rect"):
-        read(bag, BagTopics("/left/image_rect", "/c"))
+        read(bag, BagTopics(("/left/image_rect", "/c")))
     with pytest.raises(TwinError, match=r"--truth: '/c' is not a topic of poses .*/truth"):
         read(bag, BagTopics(truth="/c"))
 

@@ -300,10 +300,10 @@ def outliers():
 
 def fused_with(pose_filter, readings):
     """Fuses the readings of one frame at rest; returns those that were used."""
-    before, gates = pose_filter.rejected, pose_filter.gates
+    before, aiding = pose_filter.rejected, pose_filter.aiding(0.1)
     height, angles, _ = readings_as_arrays(readings)
     pose_filter.world_from_camera, pose_filter.cov = fuse_pressure_ahrs(
-        pose_filter.world_from_camera, pose_filter.cov, pose_filter.pressure_ahrs, height, angles, gates
+        pose_filter.world_from_camera, pose_filter.cov, aiding, height, angles
     )
     pose_filter.fuse_vertical(readings)
     return pose_filter.fuse_position_fixes(pose_filter.without_rejected(readings, before))

@@ -62,10 +62,11 @@ def test_a_slanted_plane_is_propagated_exactly(shift, turn):
     second = down_camera(shift[0], shift[1], 2.0 + shift[2], turn)
     old, new = (depth_of_plane(0.5, -0.3, pose) for pose in (first, second))
     # new stereo has an error of 3 mm and a large variance, so the result is the propagated depth
-    result = propagate(depth_map(old, 1e-8), depth_map(new + 0.003, 1e-2), geometry.inverse(second) @ first, EXACT, RIG)
-    assert result.inherited.mean() > 0.6
+    newer = depth_map(new + 0.003, 1e-2)
+    fused, inherited = propagate(depth_map(old, 1e-8), newer, geometry.inverse(second) @ first, EXACT, RIG)
+    assert inherited.mean() > 0.6
     # tolerance: change of the slope over 3 mm of linearisation error, and float32
-    assert np.abs(result.fused.depth_m - new)[result.inherited].max() < 1e-4
+    assert np.abs(fused.depth_m - new)[inherited].max() < 1e-4
 
 
 def test_pixels_without_new_stereo_depth_have_the_propagated_depth():
@@ -73,7 +74,7 @@ def test_pixels_without_new_stereo_depth_have_the_propagated_depth():
     old, new = (depth_of_plane(0.3, 0.2, pose) for pose in (first, second))
     hole = new.copy()
     hole[40:80, 60:100] = np.nan
-    fused = propagate(depth_map(old, 1e-6), depth_map(hole, 1e-6), geometry.inverse(second) @ first, EXACT, RIG).fused
+    fused = propagate(depth_map(old, 1e-6), depth_map(hole, 1e-6), geometry.inverse(second) @ first, EXACT, RIG)[0]
     # linearised at the old depth of the nearest pixel, which is half a pixel of slope off
     assert np.isfinite(fused.depth_m[42:78, 62:98]).all()
     assert np.nanmax(np.abs(fused.depth_m - new)[40:80, 60:100]) < 2e-3
@@ -84,7 +85,7 @@ def test_depth_is_not_interpolated_across_a_step():
     old[:, 80:] = 1.5
     first, second = down_camera(0, 0, 2.0), down_camera(0.004, 0.003, 2.0)
     blank = np.full_like(old, np.nan)
-    fused = propagate(depth_map(old, 1e-6), depth_map(blank, 1e-6), geometry.inverse(second) @ first, EXACT, RIG).fused
+    fused = propagate(depth_map(old, 1e-6), depth_map(blank, 1e-6), geometry.inverse(second) @ first, EXACT, RIG)[0]
     known = fused.depth_m[np.isfinite(fused.depth_m)]
     assert np.minimum(np.abs(known - 2.0), np.abs(known - 1.5)).max() < 1e-5
 
@@ -93,7 +94,7 @@ def test_propagation_adds_the_variance_of_the_relative_pose():
     depth = np.full((120, 160), 2.0, np.float32)
     cov = np.zeros((6, 6))
     cov[5, 5] = 0.01**2  # along the optical axis
-    fused = propagate(depth_map(depth, 1e-4), depth_map(depth * np.nan, 1e-4), np.eye(4), cov, RIG).fused
+    fused = propagate(depth_map(depth, 1e-4), depth_map(depth * np.nan, 1e-4), np.eye(4), cov, RIG)[0]
     np.testing.assert_allclose(fused.variance_m2[5:-5, 5:-5], 2e-4, rtol=1e-4)
 
 

@@ -176,4 +176,5 @@ def test_a_disparity_that_the_last_iteration_makes_negative_is_unknown():
     start = np.full((60, 90), 0.2, np.float32)
     found = epipolar.refine(texture, moved, start, epipolar.STEREO, iterations=1)
     assert np.isnan(found.disparity_px[10:-10, 10:-10]).mean() > 0.9
-    assert not (found.disparity_px < 0).any() and np.isnan(found.sigma_px[np.isnan(found.disparity_px)]).all()
+    assert not (found.disparity_px < 0).any()
+    assert np.isnan(found.measurement_sigma_px[np.isnan(found.disparity_px)]).all()

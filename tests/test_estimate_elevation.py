@@ -8,10 +8,10 @@ from twin.core import geometry
 from twin.core.records import MapGrid
 from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap
-from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map
-from twin.estimate.mapping.mean_illumination import MeanIllumination
+from twin.estimate.mapping.map_builder import KeyframePath, build_map
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.vision import disparity
+from twin.estimate.vision.light_pattern import MeanIllumination
 
 RIG = small_rig(160, 120)
 GRID = MapGrid(-2.0, 1.6, 0.02, 160, 200)
@@ -266,8 +266,8 @@ def bumpy():
     pairs = []
     for pose in poses:
         left, right, _ = stereo_pair(floor, RIG, pose, rng)
-        pairs.append(KeyframeImages(*(np.repeat(gray[..., None], 3, 2) for gray in (left, right))))
-    return floor, poses, build_map(iter(pairs), KeyframePath(poses, np.zeros((6, 6, 6))), RIG, GRID), pairs
+        pairs.append(tuple(np.repeat(gray[..., None], 3, 2) for gray in (left, right)))
+    return floor, poses, build_map(iter(pairs), KeyframePath(poses, *np.zeros((2, 6, 6, 6))), RIG, GRID), pairs
 
 
 def test_a_bumpy_floor_is_mapped_to_millimetres_with_a_consistent_sigma(bumpy):
@@ -290,14 +290,14 @@ def test_the_mosaic_shows_the_texture_of_known_cells(bumpy):
 
 def test_the_map_is_reproducible_to_the_bit(bumpy):
     _, poses, elevation_map, pairs = bumpy
-    again = build_map(iter(pairs), KeyframePath(poses, np.zeros((6, 6, 6))), RIG, GRID)
+    again = build_map(iter(pairs), KeyframePath(poses, *np.zeros((2, 6, 6, 6))), RIG, GRID)
     assert again.height_m.tobytes() == elevation_map.height_m.tobytes()
 
 
 def test_a_pair_without_texture_is_skipped(bumpy):
     _, poses, _, pairs = bumpy
-    blank = KeyframeImages(*(np.full((120, 160, 3), 90, np.uint8),) * 2)
-    elevation_map = build_map([pairs[0], blank, pairs[2]], KeyframePath(poses[:3], np.zeros((3, 6, 6))), RIG, GRID)
+    blank = (np.full((120, 160, 3), 90, np.uint8),) * 2
+    elevation_map = build_map([pairs[0], blank, pairs[2]], KeyframePath(poses[:3], *np.zeros((2, 3, 6, 6))), RIG, GRID)
     assert np.isfinite(elevation_map.height_m).sum() > 2000
 
 
@@ -308,15 +308,14 @@ def test_a_depth_with_a_relative_sigma_above_20_percent_does_not_enter_the_map(s
     sigma = np.full_like(px, 0.1)
     px[45:75, 65:95], sigma[45:75, 65:95] = 1.6, sigma_px
     monkeypatch.setattr(disparity, "dense_disparity", lambda *_: disparity.Disparity(px, sigma))
-    blank = KeyframeImages(*(np.full((120, 160, 3), 90, np.uint8),) * 2)
-    path = KeyframePath(down_camera(0, 0, 2.0)[None], np.zeros((1, 6, 6)))
-    elevation_map = build_map([blank], path, RIG, GRID)
+    blank = (np.full((120, 160, 3), 90, np.uint8),) * 2
+    elevation_map = build_map([blank], KeyframePath(down_camera(0, 0, 2.0)[None], *np.zeros((2, 1, 6, 6))), RIG, GRID)
     assert bool((elevation_map.height_m < -10).any()) == known
     assert (np.abs(elevation_map.height_m) < 0.01).sum() > 2000
 
 
 def test_without_keyframes_the_map_is_empty():
-    elevation_map = build_map([], KeyframePath(np.zeros((0, 4, 4)), np.zeros((0, 6, 6))), RIG, GRID)
+    elevation_map = build_map([], KeyframePath(np.zeros((0, 4, 4)), *np.zeros((2, 0, 6, 6))), RIG, GRID)
     assert (
         np.isnan(elevation_map.height_m).all()
         and np.isnan(elevation_map.sigma_m).all()

@@ -117,7 +117,8 @@ def test_coarse_texture_is_matched_as_accurately_at_the_border_as_in_the_centre(
     dense_px = np.full(left.shape, disparity_px, np.float32)
 
     def largest_error_px(left_image, right_image):
-        points = stereo.match_stereo_points(left_image, right_image, dense_px, rig, 500, 15)
+        settings = EstimatorSettings(points=500, patch_px=15)
+        points = stereo.match_stereo_points(left_image, right_image, dense_px, rig, settings)
         return np.abs(points.measured[:, 2] * rig.focal_px - disparity_px).max()
 
     assert largest_error_px(left, right) < 0.002

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from twin.core.records import Frame, SensorNoise, StereoRig
-from twin.core.timing import Stopwatch
 from twin.estimate import EstimatorSettings, Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.plugin.navigator import PluginNavigator
@@ -48,7 +47,7 @@ def test_a_plug_in_does_not_get_a_frame_of_another_size(tmp_path):
     setup, settings = EstimatorSetup(RIG, np.eye(4), SensorNoise()), EstimatorSettings()
     with (
         StereoVision(RIG, settings, tmp_path) as vision,
-        PluginNavigator(f"{__name__}:CountsFrames", setup, settings, vision, Stopwatch()) as navigator,
+        PluginNavigator(f"{__name__}:CountsFrames", setup, settings, vision) as navigator,
     ):
         for left, right in ((SMALL, None), (GOOD, SMALL)):
             with pytest.raises(ValueError, match="the image has 160 x 100 px"):

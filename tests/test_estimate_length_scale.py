@@ -9,7 +9,7 @@ from twin.core import geometry
 from twin.core.links import Link, Links
 from twin.core.quality import EstimationQuality, LengthScale
 from twin.core.records import Displacement, Readings, SensorNoise, StereoRig
-from twin.estimate.length_scale import length_scales
+from twin.estimate.calibration_errors import length_scales
 from twin.estimate.self_check import MAX_SCALE_ERROR, _scale
 from twin.estimate.vision.stereo import Keyframe
 

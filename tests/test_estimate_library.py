@@ -155,7 +155,7 @@ def test_cropped_depth_maps_with_their_principal_point_give_the_crop_of_the_resu
     whole = depth_filter.DepthMap(depth.astype(np.float32), np.full(depth.shape, 1e-4, np.float32))
     step, cov = geometry.exp(np.array([0.03, -0.02, 0.3, 0.02, 0.01, 0.03])), np.eye(6) * 1e-6
     part = depth_filter.DepthMap(whole.depth_m[rows, cols].copy(), whole.variance_m2[rows, cols].copy())
-    ends = [depth_filter.propagate(one, one, step, cov, rig).fused for one, rig in ((whole, full), (part, cropped))]
+    ends = [depth_filter.propagate(one, one, step, cov, rig)[0] for one, rig in ((whole, full), (part, cropped))]
     inner = np.s_[25:45, 30:50]
     for a, b in zip(ends[0], ends[1], strict=True):
         np.testing.assert_allclose(b[inner], a[rows, cols][inner], rtol=1e-5)

@@ -5,7 +5,7 @@ import pytest
 from seafloor_scene import digitise, down_camera, plane, render_view, small_rig
 
 from twin.core.records import MapGrid
-from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
+from twin.estimate.mapping.map_builder import KeyframePath, build_map, gray_levels
 from twin.estimate.vision import disparity
 from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
 
@@ -59,8 +59,8 @@ def test_the_map_of_a_faintly_textured_floor_is_right_without_the_light_pattern(
     rng = np.random.default_rng(2)
     x_m = np.arange(12) * 0.3
     grays = [faint_pair(x, 2.2, rng, lamps=60.0, contrast=0.06)[0] for x in x_m]
-    pairs = [KeyframeImages(*(np.repeat(g[..., None], 3, 2).astype(np.uint8) for g in pair)) for pair in grays]
-    path = KeyframePath(np.array([down_camera(x, 0.3 * x, 2.2) for x in x_m]), np.zeros((len(x_m), 6, 6)))
+    pairs = [tuple(np.repeat(g[..., None], 3, 2).astype(np.uint8) for g in pair) for pair in grays]
+    path = KeyframePath(np.array([down_camera(x, 0.3 * x, 2.2) for x in x_m]), *np.zeros((2, len(x_m), 6, 6)))
     pattern = light_pattern([pattern_fit(gray_levels(pair)) for pair in pairs], (60, 80))
     grid = MapGrid(-1.0, 2.0, 0.1, 30, 52)
     median, median_before = (

@@ -6,9 +6,16 @@ import seafloor_scene as scene
 
 from twin.core import geometry
 from twin.core.records import Readings
+from twin.core.settings import EstimatorSettings
 from twin.estimate.vision import matching, patches, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.observation_equations import PairMeasurements, PixelLocking, transfer
+from twin.estimate.vision.observation_equations import (
+    PairMeasurements,
+    PixelLocking,
+    linearise,
+    motion_normal_equations,
+    transfer,
+)
 from twin.estimate.vision.pair_matching import PairMatcher
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import PairMotionSettings
@@ -47,7 +54,7 @@ def locking_of(a, b):
     return PixelLocking(*derivatives)
 
 
-def nees_of(make, trials, settings=lambda locking: PairMotionSettings(locking=locking, measured_scatter=True)):
+def nees_of(make, trials, settings=lambda locking: PairMotionSettings(locking=locking)):
     """Returns the NEES (trials,) of motions measured from the points that `make(rng)` returns, and their RMSE [m]."""
     rng, nees, square = np.random.default_rng(7), [], []
     for _ in range(trials):
@@ -115,7 +122,7 @@ def test_pixel_locking_is_estimated_along_and_the_covariance_stays_consistent():
         return with_noise(rng, amplitude_px=0.012)
 
     nees, rmse_m = nees_of(biased, 80)
-    old_nees, old_rmse_m = nees_of(biased, 80, lambda _: PairMotionSettings(measured_scatter=True))
+    old_nees, old_rmse_m = nees_of(biased, 80, lambda _: PairMotionSettings())
     assert nees.mean() == pytest.approx(6, abs=1.6)
     assert old_nees.mean() > 9
     assert rmse_m < 0.9 * old_rmse_m
@@ -127,19 +134,15 @@ def test_the_covariance_follows_the_scatter_of_single_points():
     def growing(rng):
         return with_noise(rng, growth=lambda b: 1 + 2 * (np.abs(b[:, :1]) > 0.3))
 
-    nees, _ = nees_of(growing, 80, lambda _: PairMotionSettings(measured_scatter=True))
-    old_nees, _ = nees_of(growing, 80, lambda _: PairMotionSettings())
+    nees, _ = nees_of(growing, 80, lambda _: PairMotionSettings())
     assert nees.mean() == pytest.approx(6, abs=1.6)
-    assert old_nees.mean() > 9
 
 
-@pytest.mark.parametrize(
-    ("growth", "measured_scatter", "low", "high"), [(1.0, True, 4, 8), (6.0, True, 4, 8), (6.0, False, 12, np.inf)]
-)
-def test_the_covariance_follows_the_scatter_of_points_without_disparity(growth, measured_scatter, low, high):
+@pytest.mark.parametrize("growth", [1.0, 6.0])
+def test_the_covariance_follows_the_scatter_of_points_without_disparity(growth):
     """As frames between keyframes are matched: two coordinates per point; NEES of six, standard error of 40 is 0.55."""
     rng, nees = np.random.default_rng(11), []
-    settings = PairMotionSettings(n_measured=2, measured_scatter=measured_scatter)
+    settings = PairMotionSettings(n_measured=2)
     for _ in range(40):
         b = smooth_floor(rng)
         a, _, _ = transfer(b, TRUE, RIG.baseline_m)
@@ -151,7 +154,7 @@ def test_the_covariance_follows_the_scatter_of_points_without_disparity(growth, 
         assert motion is not None
         error = geometry.log(geometry.inverse(TRUE) @ motion.a_from_b)
         nees.append(error @ np.linalg.solve(motion.cov, error))
-    assert low < np.mean(nees) < high
+    assert 4 < np.mean(nees) < 8
 
 
 def test_the_scatter_of_noise_as_reported_gives_the_reported_covariance():
@@ -161,13 +164,11 @@ def test_the_scatter_of_noise_as_reported_gives_the_reported_covariance():
     for _ in range(10):
         a, b, _ = with_noise(rng)
         measured = PairMeasurements(a, b, covs(len(a)), covs(len(b)))
-        scatter, reported = (
-            two_view_motion.pair_motion(measured, RIG.baseline_m, TRUE, PairMotionSettings(measured_scatter=flag))
-            for flag in (True, False)
-        )
-        assert scatter is not None and reported is not None
-        np.testing.assert_array_equal(scatter.a_from_b, reported.a_from_b)
-        log_ratios.append((np.linalg.slogdet(scatter.cov)[1] - np.linalg.slogdet(reported.cov)[1]) / 12)
+        scatter = two_view_motion.pair_motion(measured, RIG.baseline_m, TRUE)
+        assert scatter is not None
+        observations = linearise(measured, measured.b, scatter.a_from_b, RIG.baseline_m)
+        information = motion_normal_equations(observations, np.ones(len(a)))[0]
+        log_ratios.append((np.linalg.slogdet(scatter.cov)[1] + np.linalg.slogdet(information)[1]) / 12)
     assert np.exp(np.mean(log_ratios)) == pytest.approx(1, abs=0.06)
 
 
@@ -193,7 +194,8 @@ def relief_nees(tmp_path_factory):
         images = [np.repeat(scene.digitise(image, rng, 2.0)[..., None], 3, axis=2) for image, _ in pair]
         gray = matching.gray(images[0]), matching.gray(images[1])
         dense_px = (RELIEF_RIG.focal_px * RELIEF_RIG.baseline_m / pair[0][1]).astype(np.float32)
-        points = stereo.match_stereo_points(*gray, dense_px, RELIEF_RIG, 300, PATCH_PX)
+        settings = EstimatorSettings(points=300, patch_px=PATCH_PX)
+        points = stereo.match_stereo_points(*gray, dense_px, RELIEF_RIG, settings)
         row = int(rng.integers(2**31))
         spool.put(row, *images, gray)
         return Keyframe(row, row, 1, believed, points, Readings())
@@ -204,7 +206,6 @@ def relief_nees(tmp_path_factory):
         motion = geometry.exp(np.concatenate([turn, [0.35 * np.cos(bearing), 0.35 * np.sin(bearing), 0.0]]))
         earlier, node = keyframe(pose, pose), keyframe(pose @ motion, pose @ motion)
         matched = matcher.match(node, [earlier])[0]
-        assert matched is not None
         found = matcher.motion(node, earlier, matched)
         assert found is not None
         error = geometry.log(geometry.inverse(motion) @ found.a_from_b)
@@ -234,7 +235,7 @@ def test_over_a_level_floor_the_noise_is_not_taken_for_pixel_locking():
     rng, nees = np.random.default_rng(5), []
     for _ in range(20):
         a, b, locking = make(rng)
-        cov, settings = covs(300), PairMotionSettings(locking=locking, measured_scatter=True)
+        cov, settings = covs(300), PairMotionSettings(locking=locking)
         found = two_view_motion.pair_motion(PairMeasurements(a, b, cov, cov), RIG.baseline_m, motion, settings)
         assert found is not None
         error = geometry.log(geometry.inverse(motion) @ found.a_from_b)

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import seafloor_scene
 
+from twin.core.settings import EstimatorSettings
 from twin.estimate.vision import disparity, matching, patches, stereo
 
 PATCH_PX, HALF = 11, 5
@@ -74,7 +75,7 @@ def slopes_over_uneven_floor(seed):
     *pair, depth = seafloor_scene.stereo_pair(floor, rig, seafloor_scene.down_camera(0, 0, 3.35), rng)
     left, right = (cv2.GaussianBlur(image.astype(np.float32), (3, 3), 0.5) for image in pair)
     dense = disparity.search(matching.normalise(left), matching.normalise(right), 48)
-    points = stereo.match_stereo_points(left, right, dense, rig, 1000, 15)
+    points = stereo.match_stereo_points(left, right, dense, rig, EstimatorSettings(points=1000, patch_px=15))
     true_px = (rig.focal_px * rig.baseline_m / depth).astype(np.float32)
     return points.disparity_slope, patches.disparity_slope(true_px, points.pixels, 15)
 

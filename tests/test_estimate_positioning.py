@@ -31,6 +31,7 @@ from twin.estimate.vision.two_view_motion import Motion
 from twin.judge.survey_quality import self_check_metrics
 
 PATCH_PX = 11
+MATCHING = EstimatorSettings(points=300, patch_px=PATCH_PX)
 RIG = scene.small_rig(320, 240, 50.0, 0.3048)
 ALTITUDE_M = 3.353
 
@@ -63,7 +64,7 @@ class Diver:
         (left, depth), (right, _) = self.frame(pose), self.frame(pose @ RIG.left_from_right)
         pair = matching.gray(left), matching.gray(right)
         dense_px = (RIG.focal_px * RIG.baseline_m / depth).astype(np.float32)
-        points = stereo.match_stereo_points(*pair, dense_px, RIG, 300, PATCH_PX)
+        points = stereo.match_stereo_points(*pair, dense_px, RIG, MATCHING)
         self.spool.put(self.count, left, right, pair)
         key = Keyframe(self.count, self.count, 1, pose if believed is None else believed, points, Readings())
         self.count += 1
@@ -122,7 +123,7 @@ def test_the_same_left_image_again_is_no_motion_even_if_the_rows_of_the_right_im
     left, right = diver.spool.gray(key.row)
     moved = 0.75 * right + 0.25 * np.roll(right, 1, axis=0)
     dense_px = np.full(left.shape, np.median(key.points.measured[:, 2]) * RIG.focal_px, np.float32)
-    points = stereo.match_stereo_points(left, moved, dense_px, RIG, 300, PATCH_PX)
+    points = stereo.match_stereo_points(left, moved, dense_px, RIG, MATCHING)
     assert np.median(points.row_difference_px) == pytest.approx(0.25, abs=0.03)
     tracker = FrameToFrame(RIG, PATCH_PX)
     tracker.step(image)
@@ -167,7 +168,7 @@ def test_stereo_errors_on_a_slope_agree_with_their_covariance():
     left, right, depth = scene.stereo_pair(scene.plane(0.5, 0.2), rig, pose, rng)
     true_px = (rig.focal_px * rig.baseline_m / depth).astype(np.float32)
     pair = (matching.gray(colour(image)) for image in (left, right))
-    points = stereo.match_stereo_points(*pair, true_px, rig, 300, PATCH_PX)
+    points = stereo.match_stereo_points(*pair, true_px, rig, MATCHING)
     columns, rows = points.pixels.astype(int).T
     error_px = points.measured[:, 2] * rig.focal_px - true_px[rows, columns]
     assert np.median(np.abs(error_px)) < 0.015
@@ -353,7 +354,6 @@ def test_pair_motion_is_accurate_to_millimetres_from_a_start_one_centimetre_off(
     node, _, _ = diver.keyframe(pose @ true, believed=pose @ true @ geometry.exp(start))
     matcher = PairMatcher(RIG, diver.spool, PATCH_PX)
     matched = matcher.match(node, [earlier])[0]
-    assert matched is not None
     found = matcher.motion(node, earlier, matched)
     assert found is not None
     assert np.linalg.norm(error_of(true, found.a_from_b)[3:]) < 6e-3
@@ -468,7 +468,7 @@ def test_pressure_corrects_height_only_weighted_by_its_noise():
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([1.0, 2.0, 3.0]))
     believed = PoseFilter(pose, RIG, SensorNoise(0.01, 0.003, 0.01))
     believed.cov = np.diag([1e-8] * 3 + [1e-4] * 3)
-    after, _ = fuse_pressure_ahrs(pose, believed.cov, believed.pressure_ahrs, 3.02, np.full(3, np.nan), believed.gates)
+    after, _ = fuse_pressure_ahrs(pose, believed.cov, believed.aiding(0.1), 3.02, np.full(3, np.nan))
     np.testing.assert_allclose(after[:3, 3], [1.0, 2.0, 3.01], atol=1e-6)  # equal variances: half way
 
 
@@ -603,7 +603,7 @@ class Stumbling(Script):
         wrong = geometry.exp(np.array([0.0, 0.0, np.deg2rad(30), 0.1, 0.0, 0.0]))
         if self.row != self.lost:
             return measured, status
-        return constant_velocity_motion(motion.a_from_b @ wrong, "too few points matched")
+        return constant_velocity_motion(motion.a_from_b @ wrong), "too few points matched"
 
     def measure_motions(self, node, others):
         return [Motion(geometry.inverse(self.poses[k.row]) @ self.poses[node.row], LINK_COV, 200, 1.0) for k in others]

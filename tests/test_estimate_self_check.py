@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from twin.core import geometry
 from twin.core.quality import DisparityOffset, EpipolarError, EstimationQuality
 from twin.core.records import StereoObservation, StereoRig
-from twin.estimate.disparity_offset import combine, mean_views
+from twin.estimate.calibration_errors import disparity_offset, mean_views
 from twin.estimate.self_check import check_survey
 from twin.estimate.vision import matching
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
@@ -184,13 +184,13 @@ def test_offsets_of_links_that_share_a_node_count_as_one():
     rng, errors, sigma = np.random.default_rng(3), [], 0.0
     for _ in range(300):
         shared = np.repeat(rng.normal(size=10), 4) * 1e-3
-        combined = combine([DisparityOffset(value, 1e-3) for value in shared], 10, 1.0, 277.0)
+        combined = disparity_offset([DisparityOffset(value, 1e-3) for value in shared], 10, 1.0, 277.0)
         errors.append(combined.estimate)
         sigma = combined.sigma
     assert np.std(errors) == pytest.approx(1e-3 / np.sqrt(10), rel=0.1)
     assert sigma == pytest.approx(1e-3 / np.sqrt(10), rel=0.4)
-    assert combine([], 10, 1.0, 277.0) is None
-    assert combine([DisparityOffset(0.02, 0.002)] * 40, 10, 1.0, 277.0) is None  # 0.55 px: a level floor
+    assert disparity_offset([], 10, 1.0, 277.0) is None
+    assert disparity_offset([DisparityOffset(0.02, 0.002)] * 40, 10, 1.0, 277.0) is None  # 0.55 px: a level floor
 
 
 def test_the_variance_grows_with_the_views_of_the_same_floor():
@@ -198,14 +198,14 @@ def test_the_variance_grows_with_the_views_of_the_same_floor():
     poses = np.tile(np.eye(4), (200, 1, 1))
     poses[:, 0, 3] = np.arange(200) * 0.25 * RIG.width_px / RIG.fx_px * 2.0
     assert mean_views(poses, np.full(200, 2.0), RIG) == pytest.approx(4.0, rel=0.01)
-    once, often = (combine([DisparityOffset(1e-3, 1e-4)] * 40, 10, views, 277.0) for views in (1.0, 5.0))
+    once, often = (disparity_offset([DisparityOffset(1e-3, 1e-4)] * 40, 10, views, 277.0) for views in (1.0, 5.0))
     assert often.sigma == pytest.approx(once.sigma * (1 + 0.25 * 4) ** 0.5)
     assert mean_views(poses[:0], np.zeros(0), RIG) == 1.0
 
 
 def test_offsets_that_contradict_each_other_are_uncertain():
-    agreeing = combine([DisparityOffset(2e-3, 1e-3)] * 20, 20, 1.0, 277.0)
-    contrary = combine([DisparityOffset(2e-3 + 0.02 * (-1) ** k, 1e-3) for k in range(20)], 20, 1.0, 277.0)
+    agreeing = disparity_offset([DisparityOffset(2e-3, 1e-3)] * 20, 20, 1.0, 277.0)
+    contrary = disparity_offset([DisparityOffset(2e-3 + 0.02 * (-1) ** k, 1e-3) for k in range(20)], 20, 1.0, 277.0)
     assert agreeing.estimate == pytest.approx(contrary.estimate)
     assert contrary.sigma == pytest.approx(20 * agreeing.sigma)
 

@@ -202,7 +202,7 @@ def test_our_reader_reads_the_exported_bag_back(run, tmp_path):
     np.testing.assert_allclose(dataset.truth.world_from_camera, truth, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_replay_of_the_bag_equals_the_replay_of_the_same_run_as_a_euroc_folder(tmp_path):
     run = made.flown(tmp_path / "run", 8)
     (bag,) = bag_writer.export(run, tmp_path)

@@ -8,11 +8,11 @@ import pytest
 
 from twin.core import geometry
 from twin.errors import TwinError
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light import caustics as caustics_module
 from twin.imaging.light.caustics import CELLS, TILE_DEPTHS, Caustics, scattering_blur
 from twin.imaging.light.illumination import Daylight, Illumination, daylight_at, illumination_of
-from twin.imaging.light.phase_function import petzold, tabulate
+from twin.imaging.light.phase_function import BandWater, Scatterer, table_of
 from twin.imaging.light.sun_sky import SunSky
 from twin.imaging.light.water import Medium, medium
 from twin.imaging.light.waves import GRAVITY_MPS2, curvature_spectrum, directionality, slope_variance
@@ -31,6 +31,11 @@ def scenario(**sun):
     return Scenario.model_validate({"rig": rig, "sun": keys, "water": {"jerlov": "clear"}})
 
 
+def pattern(caustics, time_s):
+    """Returns the illuminance (CELLS, CELLS) divided by its mean."""
+    return caustics.closed_pattern(time_s)[:-1, :-1]
+
+
 def caustics_at(depth_m, focused_share, water, seed):
     sun = SunConfig(illuminance_lx=1000.0, depth_m=depth_m, caustics=focused_share)
     return Caustics(Illumination(water, daylight_at(sun, water, 0.0)), WIND_MPS, seed)
@@ -43,7 +48,7 @@ def contrast_in_channel(depth_m, wind_mps, direct_share):
     water = Medium(absorption, scattering)
     daylight = Daylight(dark, dark, dark, depth_m, depth_m, direct_share, SunSky(), water, absorption)
     here = Caustics(Illumination(water, daylight), wind_mps, 1)
-    return np.mean([here.pattern(time_s).std() for time_s in (0.0, 5.0)])
+    return np.mean([pattern(here, time_s).std() for time_s in (0.0, 5.0)])
 
 
 def image_formation(here):
@@ -54,7 +59,7 @@ def image_formation(here):
 def test_waves_conserve_light(depth_m, jerlov):
     caustics = caustics_at(depth_m, 1.0, medium(WaterConfig(jerlov=jerlov)), 3)
     for time_s in (0.0, 1.7):
-        light = caustics.pattern(time_s)
+        light = pattern(caustics, time_s)
         assert light.mean(dtype=np.float64) == pytest.approx(1.0, abs=1e-5)
         assert light.min() > -1e-3
 
@@ -118,16 +123,16 @@ def test_the_waves_of_the_tile_and_the_unresolved_ones_have_the_slopes_of_the_sp
 
 def test_waves_that_the_cells_do_not_resolve_act_as_a_blur(monkeypatch):
     """With cells of half the size, which resolve shorter waves, the contrast is the same."""
-    coarse = caustics_at(3.0, 1.0, medium(WaterConfig(jerlov="IB")), 1).pattern(0.0).std()
+    coarse = pattern(caustics_at(3.0, 1.0, medium(WaterConfig(jerlov="IB")), 1), 0.0).std()
     monkeypatch.setattr(caustics_module, "CELLS", 2 * CELLS)
-    fine = caustics_at(3.0, 1.0, medium(WaterConfig(jerlov="IB")), 1).pattern(0.0).std()
+    fine = pattern(caustics_at(3.0, 1.0, medium(WaterConfig(jerlov="IB")), 1), 0.0).std()
     assert coarse == pytest.approx(fine, rel=0.08)
 
 
 def test_fluctuations_are_as_fast_as_at_sea():
     """The strongest fluctuations at 1 to 3 m have 1 to 3 Hz (1.1 s at 3 m: Gernez & Antoine 2009, fig. 8a)."""
     here, rate_hz, n = caustics_at(2.0, 1.0, medium(WaterConfig(jerlov="IB")), 1), 16.0, 160
-    at_points = np.array([here.pattern(i / rate_hz)[::8, ::8].ravel() for i in range(n)])
+    at_points = np.array([pattern(here, i / rate_hz)[::8, ::8].ravel() for i in range(n)])
     power = (np.abs(np.fft.rfft((at_points - 1) * np.hanning(n)[:, None], axis=0)) ** 2).mean(1)
     assert 1.0 <= np.fft.rfftfreq(n, 1 / rate_hz)[power.argmax()] <= 3.0
 
@@ -147,7 +152,7 @@ def test_in_shallow_water_caustics_follow_the_curvature_of_the_surface():
     det = (1 - per_slope_m * gradient(east, 1)) * (1 - per_slope_m * gradient(north, 0))
     det -= per_slope_m**2 * gradient(east, 0) * gradient(north, 1)
     assert det.min() > 0.5
-    light = caustics.pattern(0.4)
+    light = pattern(caustics, 0.4)
     # the formula holds at the surface, a few cells away from the floor point; that and the cell size reduce contrast
     assert np.corrcoef(light.ravel(), (1 / det).ravel())[0, 1] > 0.97
     assert light.std() == pytest.approx((1 / det).std(), rel=0.1)
@@ -170,7 +175,7 @@ def test_blur_by_the_water_agrees_with_a_monte_carlo_simulation():
     20000 walks give a standard error of the transform of 0.006; the small-angle theory differs by up to 5 %.
     """
     rng, depth_m, (absorption, scattering) = np.random.default_rng(1), 3.78, CHANNEL_PER_M
-    phase, n = tabulate(petzold), 20000
+    phase, n = table_of(Scatterer()), 20000
     at, to = np.zeros((n, 3)), np.tile([0.0, 0.0, 1.0], (n, 1))
     weight, east, light = np.ones(n), [], []
     for _ in range(40):
@@ -185,7 +190,7 @@ def test_blur_by_the_water_agrees_with_a_monte_carlo_simulation():
         at, weight, to = after[alive], weight[alive], _scattered(to[alive], phase, rng)
     k, east, light = np.array([0.3, 1.0, 3.0, 10.0, 100.0]), np.concatenate(east), np.concatenate(light)
     simulated = (light * np.cos(k[:, None] * east)).sum(1) / light.sum()
-    np.testing.assert_allclose(scattering_blur(k, depth_m, CHANNEL_PER_M, phase), simulated, rtol=0.05, atol=0.018)
+    np.testing.assert_allclose(scattering_blur(k, depth_m, BandWater(*CHANNEL_PER_M)), simulated, rtol=0.05, atol=0.018)
 
 
 def _scattered(to, phase, rng):
@@ -199,28 +204,28 @@ def _scattered(to, phase, rng):
 
 
 def test_blur_by_the_water_has_its_limits():
-    k, phase = np.array([0.0, 1e-3, 2e3]), tabulate(petzold)
-    np.testing.assert_array_equal(scattering_blur(k, 5.0, (0.1, 0.0), phase), 1.0)
-    fine = scattering_blur(k, 5.0, (0.0, 0.3), phase)
+    k = np.array([0.0, 1e-3, 2e3])
+    np.testing.assert_array_equal(scattering_blur(k, 5.0, BandWater(0.1, 0.0)), 1.0)
+    fine = scattering_blur(k, 5.0, BandWater(0.0, 0.3))
     assert fine[0] == 1.0 and fine[1] == pytest.approx(1.0, abs=1e-3)
     # the finest pattern is that of the light that is not scattered; 1.9 % of the light is scattered upwards
     assert fine[2] == pytest.approx(np.exp(-0.3 * 5.0 * 0.981), rel=0.06)
 
 
 def test_contrast_decreases_with_depth_turbidity_and_diffuse_light():
-    contrast = [caustics_at(d, 1.0, medium(WaterConfig(jerlov="IB")), 1).pattern(0.0).std() for d in (5.0, 20.0, 60.0)]
+    contrast = [pattern(caustics_at(d, 1.0, medium(WaterConfig(jerlov="IB")), 1), 0.0).std() for d in (5.0, 20.0, 60.0)]
     assert contrast[0] > 1.5 * contrast[1] > 3 * contrast[2] > 0
-    murky = caustics_at(5.0, 1.0, medium(WaterConfig(jerlov="II")), 1).pattern(0.0).std()
+    murky = pattern(caustics_at(5.0, 1.0, medium(WaterConfig(jerlov="II")), 1), 0.0).std()
     assert murky < 0.6 * contrast[0]
-    half = caustics_at(5.0, 0.5, medium(WaterConfig(jerlov="IB")), 1).pattern(0.0)
+    half = pattern(caustics_at(5.0, 0.5, medium(WaterConfig(jerlov="IB")), 1), 0.0)
     np.testing.assert_allclose(half.std(), contrast[0] / 2, rtol=1e-4)
 
 
 def test_the_pattern_depends_on_the_seed_and_changes_with_time():
     one, same, other = (caustics_at(4.0, 1.0, CLEAR, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.pattern(0.3), same.pattern(0.3))
-    assert np.corrcoef(one.pattern(0.0).ravel(), other.pattern(0.0).ravel())[0, 1] < 0.3
-    moved = [np.corrcoef(one.pattern(0.0).ravel(), one.pattern(t).ravel())[0, 1] for t in (1 / 30, 2.0)]
+    np.testing.assert_array_equal(pattern(one, 0.3), pattern(same, 0.3))
+    assert np.corrcoef(pattern(one, 0.0).ravel(), pattern(other, 0.0).ravel())[0, 1] < 0.3
+    moved = [np.corrcoef(pattern(one, 0.0).ravel(), pattern(one, t).ravel())[0, 1] for t in (1 / 30, 2.0)]
     assert moved[0] > 0.6 and moved[1] < 0.3
 
 
@@ -230,7 +235,9 @@ def test_both_cameras_see_the_same_caustics_on_the_floor():
     light, rig = image_formation(here), here.believed_rig()
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.37, -1.2, 2.0]))
     white, depth = np.full((120, 160, 3), 255, np.uint8), np.full((120, 160), 2.0, np.float32)
-    left, right = (light.radiance(white, depth, camera, StampedPose(pose, 0.5))[..., 1] for camera in (0, 1))
+    left, right = (
+        light.radiance(RenderedView(white, depth, camera, StampedPose(pose, 0.5)))[..., 1] for camera in (0, 1)
+    )
     pixel_m = 2.0 / rig.focal_px
     shift = rig.baseline_m / pixel_m
     column = np.arange(30, 150)
@@ -239,14 +246,14 @@ def test_both_cameras_see_the_same_caustics_on_the_floor():
     assert np.abs(shifted - moved).mean() < 0.02 * left.mean() and left.std() > 0.2 * left.mean()
     # each pixel shows the pattern at the intersection of its ray with the floor
     caustics = caustics_at(4.0, 1.0, CLEAR, here.seed)
-    pattern = caustics.pattern(0.5)
+    lines = pattern(caustics, 0.5)
     for v, u in [(0, 0), (60, 80), (101, 17)]:
         east = 0.37 + (u - rig.cx_px) * pixel_m * pose[0, 0] + (v - rig.cy_px) * pixel_m * pose[0, 1]
         north = -1.2 + (u - rig.cx_px) * pixel_m * pose[1, 0] + (v - rig.cy_px) * pixel_m * pose[1, 1]
         col, row = east * caustics.cells_per_m, north * caustics.cells_per_m
         j, i = int(np.floor(col)), int(np.floor(row))
         w, h = col - j, row - i
-        at = lambda r, c: pattern[r % CELLS, c % CELLS]  # noqa: E731
+        at = lambda r, c: lines[r % CELLS, c % CELLS]  # noqa: E731
         expected = (1 - h) * ((1 - w) * at(i, j) + w * at(i, j + 1)) + h * (
             (1 - w) * at(i + 1, j) + w * at(i + 1, j + 1)
         )
@@ -257,7 +264,9 @@ def test_without_caustics_daylight_is_uniform():
     light = image_formation(scenario(caustics=0.0))
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     white, depth = np.full((120, 160, 3), 255, np.uint8), np.full((120, 160), 2.0, np.float32)
-    np.testing.assert_allclose(light.radiance(white, depth, 0, StampedPose(pose, 0.0)), 1000 / np.pi, rtol=1e-5)
+    np.testing.assert_allclose(
+        light.radiance(RenderedView(white, depth, 0, StampedPose(pose, 0.0))), 1000 / np.pi, rtol=1e-5
+    )
 
 
 @pytest.mark.parametrize(

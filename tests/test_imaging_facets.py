@@ -11,7 +11,7 @@ import pytest
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.height_field import cast_pixels, height_field
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.scene.facets import UNIT, Facets
 from twin.scenario.model import Scenario
@@ -67,7 +67,9 @@ def shading(floor: Terrain, pose: Array, side: int) -> Shading:
     depth = cast_pixels(field, pose[None], RIG, at)[0]
     image = depth.reshape(len(pixels), -1)[:, 0].reshape(RIG.height_px, RIG.width_px).astype(np.float32)
     formation = ImageFormation(SCENARIO, illumination_of(SCENARIO), floor, np.random.default_rng(0))
-    light = formation.radiance(np.full((*image.shape, 3), 255, np.uint8), image, 0, StampedPose(pose, 0.0))[..., 1]
+    light = formation.radiance(
+        RenderedView(np.full((*image.shape, 3), 255, np.uint8), image, 0, StampedPose(pose, 0.0))
+    )[..., 1]
     points = geometry.transform(pose, np.column_stack([RIG.normalised(at), np.ones(len(at))]) * depth[:, None])
     lamp = pose @ geometry.inverse(RIG.body_from_camera) @ [*SCENARIO.lamps[0].position_m, 1.0]
     to = lamp[:3] - points

@@ -9,9 +9,9 @@ from twin.imaging.light.forward_scatter import ForwardScatter, _add_upsampled, l
 from twin.imaging.light.illumination import Illumination, daylight_at
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.lamps import light_sources_in_camera
-from twin.imaging.light.optics import FloorView, Optics
-from twin.imaging.light.phase_function import Scatterer, phase_of, table_of
-from twin.imaging.light.spread import LAMP_SIGMA_RAD, Absorbed, camera_mixture, lamp_mixture
+from twin.imaging.light.optics import Optics, SceneView
+from twin.imaging.light.phase_function import BandWater, Scatterer, phase_of, table_of
+from twin.imaging.light.spread import LAMP_SIGMA_RAD, camera_mixture, lamp_mixture
 from twin.imaging.light.water import Medium, medium
 from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
 
@@ -39,7 +39,7 @@ def test_light_of_an_even_floor_is_lost_only_by_scattering_backwards(scatterer):
     backwards = backscatter_fraction(scatterer)
     for b in (0.05, 1.0):
         thickness = b * np.array(ranges_m)
-        arrives = np.exp(-thickness) + camera_mixture(Absorbed(0.0, b, scatterer), ranges_m, sigmas).sum(1)
+        arrives = np.exp(-thickness) + camera_mixture(BandWater(0.0, b, scatterer), ranges_m, sigmas).sum(1)
         np.testing.assert_allclose(arrives, np.exp(-backwards * thickness), rtol=3e-3)
 
 
@@ -47,14 +47,14 @@ def test_light_of_an_even_floor_is_lost_only_by_scattering_backwards(scatterer):
 @pytest.mark.parametrize("scatterer", [HG, PETZOLD])
 def test_light_scattered_once_from_an_even_lamp_agrees_with_quadrature(scatterer):
     """On a floor, light scattered by t adds the integral of cos(alpha) for alpha below t and 90 deg: sin(t), then 1."""
-    phase, thickness = phase_of(scatterer), 1e-3
+    thickness = 1e-3
     cuts = np.deg2rad([1e-6, 1e-4, 1e-2, 1, 10, 90, 180])
-    density = lambda t: 2 * np.pi * float(phase(np.array(t)))  # noqa: E731
+    density = lambda t: 2 * np.pi * float(phase_of(scatterer, np.array(t)))  # noqa: E731
     pieces = [(low, high) for low, high in zip(cuts, cuts[1:], strict=False)]
     floor = sum(quad(lambda t: density(t) * np.sin(min(t, np.pi / 2)), *piece)[0] for piece in pieces)
     # on a particle: the integral of 1 over alpha below t
     particle = sum(quad(lambda t: density(t) * t, *piece)[0] for piece in pieces)
-    water = Absorbed(0.0, thickness, scatterer)
+    water = BandWater(0.0, thickness, scatterer)
     for receiver, expected in (("floor", floor), ("particle", particle)):
         found = lamp_mixture(water, (1.0,), receiver).sum() / thickness
         assert found == pytest.approx(expected, rel=5e-3)
@@ -82,7 +82,7 @@ def test_the_kernel_has_the_core_and_the_tail_of_a_random_walk(scatterer, thickn
     away = walk_px(scatterer, thickness, 277.0)
     levels = range(9)
     weights = camera_mixture(
-        Absorbed(0.0, thickness, scatterer), (1.0,), tuple(level_sigma_px(k) / 277 for k in levels)
+        BandWater(0.0, thickness, scatterer), (1.0,), tuple(level_sigma_px(k) / 277 for k in levels)
     )
     for radius in (2.0, 8.0, 40.0):
         within = [1 - np.exp(-(radius**2) / (2 * level_sigma_px(k) ** 2)) if k else 1.0 for k in levels]
@@ -174,12 +174,12 @@ def test_radiance_is_the_sum_of_its_parts_also_without_floor_and_in_shadow():
     lit = np.ones((1, *SHAPE), np.uint8)
     lit[0, 20:60, 20:60] = 0
     model = optics(medium(WaterConfig(jerlov="III")))
-    for shadow in (None, FloorView(lit=lit)):
+    for shadow in (SceneView(), SceneView(lit=lit)):
         direct, forward, backscatter = model.parts(albedo, depth, 0, shadow)
         np.testing.assert_allclose(model.radiance(albedo, depth, 0, shadow), direct + forward + backscatter, rtol=2e-3)
         assert not direct[80:, 100:].any() and (forward[80:, 100:] > 0).all()
     open_sky, shaded = (
-        model.parts(albedo, depth, 0, shadow).direct[20:60, 20:60] for shadow in (None, FloorView(lit=lit))
+        model.parts(albedo, depth, 0, shadow).direct[20:60, 20:60] for shadow in (SceneView(), SceneView(lit=lit))
     )
     assert (shaded <= open_sky).all() and (shaded[open_sky > 0] > 0).all()  # scattered light reaches the shadow
 
@@ -197,7 +197,7 @@ def test_a_softened_beam_lights_beyond_its_edge_and_loses_on_its_axis():
 
 def test_mixtures_are_narrow_and_wide_enough_for_the_kernels():
     """The light within the narrowest and beyond half of the widest Gaussian of a lamp is below 10 %."""
-    weights = lamp_mixture(Absorbed(0.06, 1.0, PETZOLD), (2.0,), "floor")[0]
+    weights = lamp_mixture(BandWater(0.06, 1.0, PETZOLD), (2.0,), "floor")[0]
     assert weights[0] < 0.1 * weights.sum() and weights[LAMP_SIGMA_RAD > 0.6].sum() < 0.2 * weights.sum()
 
 

@@ -7,7 +7,7 @@ import pytest
 from numba import njit
 
 from twin.core import geometry
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.scene.materials import material_of, reflectance
 from twin.scenario.model import Scenario, TerrainConfig
@@ -132,7 +132,7 @@ def light_of(**terrain: object) -> np.ndarray:
     formation = ImageFormation(scenario, illumination_of(scenario), floor, np.random.default_rng(0))
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     albedo, depth = np.full((120, 160, 3), 128, np.uint8), np.full((120, 160), 2.0, np.float32)
-    parts = formation.components(albedo, depth, 0, StampedPose(pose, 0.0))
+    parts = formation.components(RenderedView(albedo, depth, 0, StampedPose(pose, 0.0)))
     np.testing.assert_allclose(parts.total, parts.direct + parts.backscatter, rtol=1e-6)
     return parts.total[..., 1]
 

@@ -10,7 +10,7 @@ from twin.imaging.scene import mesh_raster
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
 from twin.imaging.scene.sway import swayed
 from twin.terrains.objects.coloured_mesh import Mesh, mesh_of
-from twin.terrains.objects.parts import PART_FACES, UNKNOWN, Parts, parts_of
+from twin.terrains.objects.detail import PART_FACES, UNKNOWN, Parts, parts_of
 from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import box
 from twin.terrains.objects.shapes import SHAPES, build_shape

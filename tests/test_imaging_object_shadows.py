@@ -10,7 +10,7 @@ from twin.core.records import StereoRig
 from twin.imaging.light.shadows import Shadows
 from twin.imaging.scene.mesh_raster import ObjectView
 from twin.imaging.scene.object_shadows import ObjectShadows
-from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.terrains.objects.coloured_mesh import mesh_of
 from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import sphere
@@ -31,7 +31,7 @@ def ball() -> Objects:
 def image() -> tuple[np.ndarray, ObjectView, np.ndarray]:
     """Returns depth, view and points (H, W, 3) in the world of the ball above the floor z = 0."""
     albedo, depth = np.zeros((H, W, 3), np.uint8), np.full((H, W), HEIGHT_M, np.float32)
-    view = ObjectRenderer(ball(), RIG).draw(albedo, depth, POSE, 0.0)
+    view = draw_over_floor(ball(), RIG, albedo, depth, POSE, 0.0)
     u, v = np.meshgrid(np.arange(W) - RIG.cx_px, np.arange(H) - RIG.cy_px)
     points = np.stack([u * depth / FOCAL, v * depth / FOCAL, depth], axis=-1).reshape(-1, 3)
     return depth, view, geometry.transform(POSE, points).reshape(H, W, 3)

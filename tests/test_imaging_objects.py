@@ -9,7 +9,7 @@ from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.imaging.scene import object_view
 from twin.imaging.scene.mesh_raster import DrawnMesh, ObjectView, Projection, Target, draw_meshes
-from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.scenes.gl import mujoco
 from twin.terrains.objects.coloured_mesh import Mesh, mesh_of
 from twin.terrains.objects.placed_object import PlacedObject, model_of
@@ -33,7 +33,7 @@ def placed(mesh: Mesh, x=0.0, y=0.0, z=0.0, scale=1.0) -> PlacedObject:
 def drawn(items: list[PlacedObject], pose: np.ndarray, floor_m: float = np.inf):
     """Returns albedo, depth and view of objects over a background at a constant depth."""
     albedo, depth = np.zeros((H, W, 3), np.uint8), np.full((H, W), floor_m, np.float32)
-    view = ObjectRenderer(Objects(items), RIG).draw(albedo, depth, pose, 0.0)
+    view = draw_over_floor(Objects(items), RIG, albedo, depth, pose, 0.0)
     return albedo, depth, view
 
 

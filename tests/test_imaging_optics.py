@@ -11,8 +11,8 @@ from twin.imaging.light.backscatter import backscatter_per_m
 from twin.imaging.light.illumination import Illumination, daylight_at
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.lamps import LED_BEAM, beam_share, colour, light_sources_in_camera
-from twin.imaging.light.optics import FloorView, Optics, WaterSurface
-from twin.imaging.light.phase_function import henyey_greenstein
+from twin.imaging.light.optics import Optics, SceneView, WaterSurface
+from twin.imaging.light.phase_function import Scatterer, phase_of
 from twin.imaging.light.spectra import CENTRE_NM, NM, WIDTH_NM, band_weights, spectrum_of
 from twin.imaging.light.water import (
     downwelling_per_m,
@@ -191,7 +191,7 @@ def test_a_shadow_removes_the_unscattered_light_of_a_lamp(jerlov, beam):
     for depth_m in (0.8, 2.0, 4.0):
         scene = floor(depth_m)
         shape = scene[1].shape
-        views = [FloorView(lit=np.full((1, *shape), lit, np.uint8)) for lit in (1, 0)]
+        views = [SceneView(lit=np.full((1, *shape), lit, np.uint8)) for lit in (1, 0)]
         lit, dark = (optics.parts(*scene, 0, view).direct for view in views)
         points = rays() * (depth_m / rays()[..., 2:])
         from_lamp = points - source.position_m[0]
@@ -209,7 +209,7 @@ def test_daylight_is_attenuated_by_kd_and_depth_below_the_surface():
     np.testing.assert_allclose(per_m, medium(water).absorption_per_m)  # no scattering, sun in the zenith
     np.testing.assert_allclose(optics.floor_lx(floor(2.0)[1], 0)[CENTRE], 1e4 * np.exp(-6 * per_m), rtol=1e-3)
     tilted = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, np.sin(0.3), np.cos(0.3), 4.0]])
-    illuminance_lx = optics.floor_lx(floor(2.0)[1], 0, None, WaterSurface(None, tilted))
+    illuminance_lx = optics.floor_lx(floor(2.0)[1], 0, SceneView(surface=WaterSurface(None, tilted)))
     below = 4.0 + 2.0 * (np.cos(0.3) + np.sin(0.3) * (rays()[..., 1] / rays()[..., 2]))
     expected = np.cos(0.3) * 1e4 * np.exp(-below[..., None] * per_m)  # the floor is at right angles to the axis
     np.testing.assert_allclose(illuminance_lx, expected, rtol=1e-3)
@@ -273,7 +273,7 @@ def test_the_backscatter_of_one_lamp_agrees_with_the_formula():
     got = backscatter_per_m(LampLight(sources, water), water, np.array([0.0, 0.0, 1.0]), np.array([range_m]))[0]
     b, c = water.scattering_per_m, water.attenuation_per_m
     np.testing.assert_allclose(b, 2.0 * medium(WaterConfig(jerlov="II")).scattering_per_m)
-    straight_back = float(henyey_greenstein(0.9)(np.array(np.pi)))
+    straight_back = float(phase_of(Scatterer("henyey_greenstein", 0.0, (0.9,)), np.array(np.pi)))
     # the phase table has finite cells
     np.testing.assert_allclose(got, b * straight_back * 1000 / range_m**2 * np.exp(-2 * c * range_m), rtol=1e-3)
 

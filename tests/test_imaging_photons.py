@@ -10,7 +10,7 @@ from twin.imaging.camera import photo_sensor
 from twin.imaging.camera.photo_sensor import PhotoSensor
 from twin.imaging.camera.photons import electrons_per_cd, photons_per_lux, vignetting
 from twin.imaging.camera.sensor import ExposureSetting
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.spectra import NM, sensitivity
 from twin.scenario.model import Scenario
@@ -45,7 +45,7 @@ def rendered(sun_lx):
     shape = here.rig.image_height_px, here.rig.image_width_px
     white, depth = np.full((*shape, 3), 255, np.uint8), np.full(shape, 2.0, np.float32)
     light = ImageFormation(here, illumination_of(here), FLAT, np.random.default_rng(0))
-    return light.radiance(white, depth, 0, StampedPose(np.diag([1.0, -1.0, -1.0, 1.0]), 0.0))
+    return light.radiance(RenderedView(white, depth, 0, StampedPose(np.diag([1.0, -1.0, -1.0, 1.0]), 0.0)))
 
 
 def test_photons_per_lux_agree_with_the_literature():

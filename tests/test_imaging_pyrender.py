@@ -14,7 +14,7 @@ from twin import terrains
 from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.imaging.scene import object_view
-from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.imaging.scene.renderer import Renderer
 from twin.scenes.builder import build
 from twin.terrains import TextureSource
@@ -106,10 +106,10 @@ def test_depth_of_objects_agrees_with_pyrender(poses: np.ndarray, tmp_path: Path
     vertices = [geometry.transform(item.world_from_object, item.model.levels[0].mesh.vertices_m) for item in items]
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts[:-1], strict=True)]
     focal_px = H / 2 / np.tan(np.deg2rad(VFOV / 2))
-    renderer = ObjectRenderer(Objects(items), StereoRig(W, H, focal_px, 0.15, 30.0, np.eye(4)))
+    objects, rig = Objects(items), StereoRig(W, H, focal_px, 0.15, 30.0, np.eye(4))
     ours = np.full((len(poses), H, W), np.inf, np.float32)
     for depth, pose in zip(ours, poses, strict=True):
-        renderer.draw(np.zeros((H, W, 3), np.uint8), depth, pose, 0.0)
+        draw_over_floor(objects, rig, np.zeros((H, W, 3), np.uint8), depth, pose, 0.0)
     theirs = pyrender_depths(np.concatenate(vertices), np.concatenate(faces), poses, tmp_path)
     theirs[theirs == 0] = np.inf
     assert np.isfinite(theirs).mean() > 0.1

@@ -8,21 +8,20 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from twin.core.height_field import height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
 from twin.imaging.light.lamps import LED_BEAM, beam_share
-from twin.imaging.light.phase_function import henyey_greenstein, molecular, petzold
+from twin.imaging.light.phase_function import BandWater, Scatterer, phase_of
 from twin.imaging.reference.pixel_light import (
-    BandWater,
     Effort,
     PixelRay,
     ReferenceScene,
     Sunlight,
+    batch_mean,
     pixel_light,
-    ratio,
     refined,
 )
+from twin.imaging.reference.walk import LAMP_SCATTERED
 
 RIG = StereoRig(320, 240, 277.0, 0.1)
 EVEN_BEAM, LED = np.array([[0.0, 1.0], [90.0, 1.0]]), np.array(LED_BEAM)
@@ -30,8 +29,11 @@ LAMPS = np.array([[0.2, 0.35, 1.95, 0.0, -0.14, -0.99, 1500.0], [0.2, -0.35, 1.9
 LAMPS[:, 3:6] /= np.linalg.norm(LAMPS[:, 3:6], axis=1, keepdims=True)
 
 
-def isotropic(angle):
-    return np.full_like(angle, 1 / (4 * np.pi))
+def henyey_greenstein(mean_cosine):
+    return Scatterer("henyey_greenstein", 0.0, (mean_cosine,))
+
+
+ISOTROPIC = henyey_greenstein(0.0)
 
 
 def looking_down(height_m, tilt_rad=0.0, azimuth_rad=0.0):
@@ -49,8 +51,8 @@ def central(pose, pixel=None):
     return PixelRay(pose, RIG, pixel or (RIG.cx_px, RIG.cy_px))
 
 
-def lit(water, albedo=0.5, relief=None):
-    return ReferenceScene(water, LAMPS, (LED, LED), albedo, relief)
+def lit(water, albedo=0.5):
+    return ReferenceScene(water, LAMPS, (LED, LED), albedo)
 
 
 def under_sun(water, mu0, albedo, surface_m):
@@ -78,7 +80,7 @@ def test_light_in_absorbing_water_is_exact():
     assert found.total == found.direct and found.total.standard_error == 0
 
 
-@pytest.mark.parametrize("phase", [petzold, molecular, henyey_greenstein(0.8)])
+@pytest.mark.parametrize("phase", [Scatterer(), Scatterer(molecular_share=1.0), henyey_greenstein(0.8)])
 def test_light_scattered_once_into_a_pixel_is_that_of_quadrature(phase):
     """b integral p I f/d^2 exp(-c (d + s)) ds over the ray of the pixel."""
     a, b = 0.06, 0.4
@@ -91,7 +93,7 @@ def test_light_scattered_once_into_a_pixel_is_that_of_quadrature(phase):
             d = np.linalg.norm(to_lamp)
             angle = np.arccos(-to_lamp[2] / d)
             strength = lamp[6] * beam_share(-(to_lamp / d) @ lamp[3:6], LED) / d**2
-            total += b * float(phase(np.array(angle))) * strength * np.exp(-(a + b) * (d + s))
+            total += b * float(phase_of(phase, np.array(angle))) * strength * np.exp(-(a + b) * (d + s))
         return total
 
     expected = quad(integrand, 0, 2.0, limit=60, epsrel=1e-4)[0]
@@ -107,10 +109,10 @@ def test_floor_light_scattered_once_from_a_lamp_above_has_its_closed_form():
     """
     b, height = 1e-3, 2.0
     lamp = np.array([[0, 0, height, 0, 0, -1.0, 1000.0]])
-    scene = ReferenceScene(BandWater(0.0, b, isotropic), lamp, (EVEN_BEAM,), 1e-3, lamp_radius_m=1e-6)
+    scene = ReferenceScene(BandWater(0.0, b, ISOTROPIC), lamp, (EVEN_BEAM,), 1e-3, lamp_radius_m=1e-6)
     found = pixel_light(scene, central(looking_down(height + 0.5)), Effort(8000, 20))
     expected = found.direct.value * np.pi * b * height / 4
-    assert_near(found.lamp_scattered, expected, rel=3 * b * height)
+    assert_near(batch_mean(found.sums[:, LAMP_SCATTERED]), expected, rel=3 * b * height)
 
 
 def h_function(albedo, n=64):
@@ -134,7 +136,7 @@ def test_the_h_function_is_the_tabulated_one():
 def test_a_half_space_with_isotropic_scattering_reflects_as_chandrasekhar_computed(albedo):
     """I(mu) = w E0 / (4 pi) mu0 / (mu + mu0) H(mu) H(mu0)."""
     nodes, h = h_function(albedo)
-    scene = under_sun(BandWater(1 - albedo, albedo, isotropic), 0.6, 0.0, 60.0)
+    scene = under_sun(BandWater(1 - albedo, albedo, ISOTROPIC), 0.6, 0.0, 60.0)
     for mu in (1.0, 0.4):
         found = pixel_light(scene, central(looking_down(60 - 1e-9, np.arccos(mu))), Effort(10000, 20))
         product = np.prod(np.interp([mu, 0.6], nodes, h))
@@ -150,7 +152,7 @@ def test_a_conservative_slab_transmits_diffuse_light_as_tabulated():
     mu, w = (x + 1) / 2, w / 2
     reflected, variance = 0.0, 0.0
     for mu0, w0 in zip(mu, w, strict=True):
-        scene = under_sun(BandWater(0.0, 1.0, isotropic), mu0, 0.0, 1.0)
+        scene = under_sun(BandWater(0.0, 1.0, ISOTROPIC), mu0, 0.0, 1.0)
         for k, (mu1, w1) in enumerate(zip(mu, w, strict=True)):
             ray = central(looking_down(1 - 1e-9, np.arccos(mu1)))
             light = pixel_light(scene, ray, Effort(2000, 10, seed=k)).veil
@@ -176,11 +178,12 @@ def test_what_neither_water_nor_floor_absorbs_comes_back():
 
 def components(light):
     """Returns means of components of the light; the third is blurred light that had reached the floor straight."""
-    straight = light.blurred_by_bin[:, 0].sum(1)
-    return light.lamp_scattered, light.blurred, ratio(straight, np.ones(len(straight))), light.veil, light.total
+    scattered, blurred = light.sums[:, LAMP_SCATTERED], light.blurred_by_bin.sum(2)
+    means = [batch_mean(part) for part in (scattered, blurred.sum(1), blurred[:, 0])]
+    return *means, light.veil, light.total
 
 
-@pytest.mark.parametrize("phase", [isotropic, henyey_greenstein(0.7)])
+@pytest.mark.parametrize("phase", [ISOTROPIC, henyey_greenstein(0.7)])
 def test_both_estimators_agree(phase):
     """The textbook estimator shares neither guided directions nor connections with the other."""
     scene, ray = lit(BandWater(0.1, 0.5, phase)), central(looking_down(2.0), (60.0, 60.0))
@@ -191,28 +194,6 @@ def test_both_estimators_agree(phase):
         assert abs(one.value - other.value) < limit < 0.6 * one.value
 
 
-def test_a_level_height_field_is_the_plane():
-    water, ray = BandWater(0.1, 0.3, henyey_greenstein(0.8)), central(looking_down(2.0))
-    field = height_field(np.zeros((201, 201)), 0.2, -20.0, -20.0)
-    plane, grid = (pixel_light(lit(water, relief=relief), ray, Effort(2000, 20)) for relief in (None, field))
-    assert grid.direct.value == pytest.approx(plane.direct.value, rel=1e-4)
-    for name in ("lamp_scattered", "blurred", "veil"):
-        assert_near(getattr(grid, name), getattr(plane, name).value, rel=4 * 0.03)
-
-
-def test_a_wall_throws_a_shadow_that_scattering_fills():
-    height = np.zeros((81, 81))
-    height[:, 45:] = 1.0  # a terrace east of x = 0.25 m hides a lamp behind its edge
-    field = height_field(height, 0.05, -2.0, -2.0)
-    lamp = np.array([[1.4, 0, 1.3, 0, 0, -1.0, 1000.0]])
-    light = {}
-    for b in (0.0, 0.5):
-        scene = ReferenceScene(BandWater(0.05, b, henyey_greenstein(0.5)), lamp, (EVEN_BEAM,), 0.5, field)
-        light[b] = pixel_light(scene, central(looking_down(2.0)), Effort(2000, 10))
-    assert light[0.0].total.value == 0 and light[0.5].direct.value == 0
-    assert light[0.5].lamp_scattered.value > 2 * light[0.5].lamp_scattered.standard_error > 0
-
-
 def test_the_blur_of_a_pixel_keeps_the_light_and_falls_off_with_distance():
     """Light within 0.5 px per area is far denser than beyond 40 px: the kernel has a cusp and a long tail."""
     found = pixel_light(lit(BandWater(0.06, 0.3)), central(looking_down(2.0)), Effort(4000, 20))
@@ -221,7 +202,8 @@ def test_the_blur_of_a_pixel_keeps_the_light_and_falls_off_with_distance():
     assert sum(shares) == pytest.approx(1)
     assert inner.value / (np.pi * 4) > 100 * (shares[1] / (np.pi * 1600))
     assert outer.value > 0.1
-    assert found.total.value == pytest.approx(found.sharp.value + found.blurred.value + found.veil.value)
+    scattered, blurred, _, veil, total = components(found)
+    assert total.value == pytest.approx(found.direct.value + scattered.value + blurred.value + veil.value)
     with pytest.raises(ValueError, match="not among the edges"):
         found.blurred_share(3.0)
 

@@ -92,7 +92,7 @@ def test_rendered_points_are_on_the_terrain(world: SceneModel, renderer: Rendere
 def test_tile_borders_are_invisible(monkeypatch: pytest.MonkeyPatch, world: SceneModel, renderer: Renderer) -> None:
     """A floor of 12 tiles is rendered like a floor of one tile."""
     tiled = [renderer.render(pose) for pose in POSES]
-    monkeypatch.setattr(scenes.floor, "TILE_CELLS", 1000)
+    monkeypatch.setattr(scenes.builder, "TILE_CELLS", 1000)
     with Renderer(world_of(world.terrain), W, H, VFOV) as untiled:
         for (albedo, depth), pose in zip(tiled, POSES, strict=True):
             single_albedo, single_depth = untiled.render(pose)

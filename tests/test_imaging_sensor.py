@@ -9,7 +9,7 @@ from twin.core import geometry, threads
 from twin.core.timing import Stopwatch
 from twin.imaging.camera.photo_sensor import sensor_of
 from twin.imaging.camera.sensor import AutoExposure, ExposureSetting, _mean, expose
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.stereo_camera import AT_REST, StereoCamera
 from twin.scenario.model import ImagingConfig, Scenario
@@ -175,7 +175,7 @@ def test_the_plain_sensor_ignores_motion():
     rng = np.random.default_rng(7).spawn(2)[0]
     for k, capture in enumerate(captures([False] * 5, None, MOVING)):
         pose = StampedPose(DOWN + np.array([[0, 0, 0, 0.01 * k]] + [[0] * 4] * 3), k / 30)
-        radiance = light.radiance(*renderer.render(pose.world_from_left), 0, pose)
+        radiance = light.radiance(RenderedView(*renderer.render(pose.world_from_left), 0, pose))
         np.testing.assert_array_equal(capture.left, expose(radiance, exposure.gain(radiance), scenario.imaging, rng))
 
 

@@ -11,14 +11,13 @@ import pytest
 from twin import terrains
 from twin.core import geometry
 from twin.core.height_field import cast_pixels, height_field
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light import shadows
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.shadows import BLOCK_CELLS, Shadows
 from twin.imaging.scene.renderer import Renderer
 from twin.scenario.model import LampConfig, Scenario
-from twin.scenes.builder import SceneModel, build
-from twin.scenes.floor import FLOOR_GROUP
+from twin.scenes.builder import FLOOR_GROUP, SceneModel, build
 from twin.scenes.gl import mujoco
 from twin.terrains import TextureSource
 
@@ -179,7 +178,7 @@ def test_a_shadow_removes_the_light_of_its_lamp_only() -> None:
         }
         here = SCENARIO.model_copy(update=changes)
         light = ImageFormation(here, illumination_of(here), high, np.random.default_rng(0))
-        return light.radiance(white, depth, 0, stamped_pose)
+        return light.radiance(RenderedView(white, depth, 0, stamped_pose))
 
     both, port, starboard = (light_of(lamps, True) for lamps in (LAMPS, LAMPS[:1], LAMPS[1:]))
     np.testing.assert_allclose(both, port + starboard, rtol=1e-5)

@@ -4,12 +4,20 @@ import numpy as np
 import pytest
 
 from twin.core import geometry
-from twin.imaging.camera.shutter import apply_rolling_shutter, blur_by_motion
+from twin.imaging.camera.shutter import ExposureMotion, integrate
 
 H, W, FOCAL = 90, 120, 110.0
 V, U = np.mgrid[:H, :W].astype(float)
 X, Y = (U - (W - 1) / 2) / FOCAL, (V - (H - 1) / 2) / FOCAL
 FLOOR = np.full((H, W), 2.0, np.float32)
+
+
+def blur_by_motion(light, depth, focal_px, twist, exposure_s):
+    return integrate(light, depth, focal_px, ExposureMotion(twist, exposure_s, 0.0))
+
+
+def apply_rolling_shutter(light, depth, focal_px, twist, readout_s):
+    return integrate(light, depth, focal_px, ExposureMotion(twist, 0.0, readout_s))
 
 
 def bands(light):

@@ -9,7 +9,7 @@ from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.imaging.scene import sway
 from twin.imaging.scene.mesh_raster import NEAR_M, Projection, view_planes
-from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.imaging.scene.sway import largest_displacement_m, swayed
 from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.shapes import build_shape
@@ -94,7 +94,7 @@ def test_a_plant_that_bends_into_the_view_is_drawn() -> None:
 
     def drawn(current_mps: np.ndarray) -> int:
         albedo, depth = np.zeros((48, 64, 3), np.uint8), np.full((48, 64), 12.0, np.float32)
-        view = ObjectRenderer(Objects([item], current_mps), RIG).draw(albedo, depth, camera, time_s)
+        view = draw_over_floor(Objects([item], current_mps), RIG, albedo, depth, camera, time_s)
         return int((view.label > 0).sum())
 
     assert drawn(np.zeros(3)) == 0 and drawn(current) > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from twin.core import geometry, threads
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.scenario.model import Scenario
 
@@ -55,7 +55,7 @@ def test_radiance_is_the_same_with_one_and_two_threads(monkeypatch):
     for processors in (1, 2):
         monkeypatch.setattr(threads, "_n_processors", lambda n=processors: n)
         light = ImageFormation(SCENARIO, illumination_of(SCENARIO), SPIKES, np.random.default_rng(0))
-        images += [light.radiance(albedo, depth, camera, StampedPose(pose, 0.0)) for camera in (0, 1)]
+        images += [light.radiance(RenderedView(albedo, depth, camera, StampedPose(pose, 0.0))) for camera in (0, 1)]
     np.testing.assert_array_equal(images[0], images[2])
     np.testing.assert_array_equal(images[1], images[3])
 

@@ -18,7 +18,7 @@ from twin.imaging.scene.triplanar import paint_walls, wall_surface
 from twin.scenes.builder import build
 from twin.terrains import Terrain, TextureSource
 from twin.terrains.walls import wall_weights
-from twin.world.true_albedo import true_albedo
+from twin.world.top_surface import true_albedo
 
 W, H, VFOV = 320, 240, 45.0
 FOCAL_PX = H / 2 / np.tan(np.deg2rad(VFOV) / 2)

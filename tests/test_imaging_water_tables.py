@@ -58,27 +58,27 @@ def test_spectra_agree_with_their_source_at_the_band_centres(source, name):
     water, found = jerlov.water(name, source=source), water_spectrum(name, source)
     given = np.isfinite(water.a(np.array(CENTRE_NM)))
     assert given.all() or (source, name) == ("solonenko2015", "5C")  # no absorption at 600 nm in print
-    np.testing.assert_allclose(at(CENTRE_NM, found.absorption_per_m)[given], water.a(np.array(CENTRE_NM))[given], 1e-9)
-    np.testing.assert_allclose(at(CENTRE_NM, found.scattering_per_m), water.b(np.array(CENTRE_NM)), 1e-9)
+    np.testing.assert_allclose(at(CENTRE_NM, found[0])[given], water.a(np.array(CENTRE_NM))[given], 1e-9)
+    np.testing.assert_allclose(at(CENTRE_NM, found[1]), water.b(np.array(CENTRE_NM)), 1e-9)
 
 
 @pytest.mark.parametrize("name", STONEFISH_PER_M)
 def test_the_tables_agree_with_another_transcription(name):
     water = water_spectrum(name)
     absorption, scattering = STONEFISH_PER_M[name]
-    np.testing.assert_allclose(at((680, 550, 441), water.absorption_per_m), absorption, rtol=0.015)
-    np.testing.assert_allclose(at((680, 550, 441), water.scattering_per_m), scattering, rtol=0.05)
+    np.testing.assert_allclose(at((680, 550, 441), water[0]), absorption, rtol=0.015)
+    np.testing.assert_allclose(at((680, 550, 441), water[1]), scattering, rtol=0.05)
 
 
 @pytest.mark.parametrize(("name", "first_nm"), [("3C", 675.0), ("5C", 600.0)])
 def test_missing_absorption_lies_between_neighbouring_types_and_near_the_other_source(name, first_nm):
     end = first_nm <= NM
-    found, clearer, murkier = (water_spectrum(other).absorption_per_m[end] for other in (name, "1C", "7C"))
+    found, clearer, murkier = (water_spectrum(other)[0][end] for other in (name, "1C", "7C"))
     assert (clearer < found).all() and (found < murkier).all()
-    last, below, above = (at(first_nm - 25, water_spectrum(other).absorption_per_m) for other in (name, "1C", "7C"))
+    last, below, above = (at(first_nm - 25, water_spectrum(other)[0]) for other in (name, "1C", "7C"))
     np.testing.assert_allclose((found - clearer) / (murkier - clearer), (last - below) / (above - below), rtol=1e-9)
     assert (found > jerlov.pure_water_absorption(NM[end])).all()
-    np.testing.assert_allclose(found, water_spectrum(name, "williamson2022").absorption_per_m[end], rtol=0.16)
+    np.testing.assert_allclose(found, water_spectrum(name, "williamson2022")[0][end], rtol=0.16)
 
 
 def test_the_rule_for_missing_absorption_predicts_the_printed_values_of_3c():
@@ -93,12 +93,12 @@ def test_absorption_is_not_below_that_of_pure_water(source, name):
     """Within 3 %: the sources use other values for pure water at 575 nm, and 25 nm apart."""
     centres = np.array(CENTRE_NM)
     pure = jerlov.pure_water_absorption(centres)
-    assert (at(centres, water_spectrum(name, source).absorption_per_m) > 0.97 * pure).all()
+    assert (at(centres, water_spectrum(name, source)[0]) > 0.97 * pure).all()
 
 
 def test_scattering_of_the_sources_differs_as_documented():
     names = WATER_SOURCES["williamson2022"].types
-    first, second = ([at(550, water_spectrum(name, s).scattering_per_m) for name in names] for s in WATER_SOURCES)
+    first, second = ([at(550, water_spectrum(name, s)[1]) for name in names] for s in WATER_SOURCES)
     np.testing.assert_allclose(np.divide(second, first), [2.3, 0.49, 0.29, 1.2, 0.61, 0.89], rtol=0.03)
 
 
@@ -135,20 +135,20 @@ def test_bands_are_gaussians_between_400_and_700_nm():
 
 def test_the_effective_absorption_of_a_wide_band_falls_with_the_path():
     """Light at the strongly absorbed wavelengths is lost first; the limit of a short path is the mean."""
-    per_m, weights = water_spectrum("II").absorption_per_m, band_weights(spectrum_of("led"))
+    per_m, weights = water_spectrum("II")[0], band_weights(spectrum_of("led"))
     paths = (0.0, 1e-4, 1.0, 4.0, 16.0, 1e4)
     red = [effective_per_m(per_m, weights, path)[0] for path in paths]
     assert red[1] == pytest.approx(red[0], rel=1e-4) and (np.diff(red[1:]) < 0).all()
     assert np.exp(-4.0 * red[3]) == pytest.approx(weights[0] @ np.exp(-4.0 * per_m))
     assert red[5] == pytest.approx(per_m.min(), rel=0.1)
-    assert medium(WaterConfig(jerlov="II"), path_m=4.0).absorption_per_m[0] == pytest.approx(red[3])
+    assert medium(WaterConfig(jerlov="II"), path_m=4.0)[0][0] == pytest.approx(red[3])
 
 
 def test_a_scenario_takes_absorption_over_twice_the_altitude_under_its_light():
     lit = load_scenario("reef", ["plan.altitude_m=1.5", "water.jerlov=II"])
     sunny = load_scenario("reef", ["plan.altitude_m=1.5", "water.jerlov=II", "lamps=[]", "sun.illuminance_lx=9"])
     for scenario, light in ((lit, "led"), (sunny, "daylight")):
-        want = medium(scenario.water, path_m=3.0, light=light).absorption_per_m
+        want = medium(scenario.water, path_m=3.0, light=light)[0]
         np.testing.assert_array_equal(illumination_of(scenario).water.absorption_per_m, want)
     deep = load_scenario("reef", ["water.jerlov=II", "sun.illuminance_lx=9", "sun.depth_m=20.0"])
     daylight = illumination_of(deep).daylight

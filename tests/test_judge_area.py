@@ -9,7 +9,7 @@ from judge_synthetic import survey
 from twin.core.records import ElevationMap, MapGrid, Truth
 from twin.judge.map_error import completeness_metric, map_metrics, percentile_with_holes
 from twin.judge.metrics import EvaluationInput, evaluate
-from twin.judge.require import more_is_better
+from twin.judge.verdict import more_is_better
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
 N = 100  # rows and columns of the test maps

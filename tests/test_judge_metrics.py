@@ -13,11 +13,10 @@ from twin.core.links import Links
 from twin.core.records import ElevationMap, MapGrid, Trajectory, Truth
 from twin.errors import TwinError
 from twin.judge.consistency import consistency_metrics, nees, nees_interval
-from twin.judge.flown_path import control_metrics, leg_numbers, travel_direction
 from twin.judge.map_error import map_metrics
 from twin.judge.metrics import EvaluationInput, check_require, empty_metrics, evaluate
-from twin.judge.overlap import overlap_metrics
-from twin.judge.require import meets_limit, more_is_better, numbers_of
+from twin.judge.swaths import control_metrics, leg_numbers, overlap_metrics, travel_direction
+from twin.judge.verdict import meets_limit, more_is_better, numbers_of
 
 RESULT, ELEVATION, TRUTH, RIG = survey()
 PLANNED = {"overlap_along": 0.9, "overlap_across": 0.8, "along_median": 0.86, "across_median": 0.79}

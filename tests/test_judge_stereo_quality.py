@@ -11,8 +11,8 @@ from twin.core.records import StereoObservation
 from twin.estimate.vision.image_quality import contrast, saturated_fraction
 from twin.estimate.vision.matching import gray
 from twin.judge.survey_quality import stereo_quality
-from twin.report.figures import stereo_quality_curves
 from twin.report.run_folder import load_run
+from twin.report.survey_figures import stereo_quality_curves
 
 RESULT = survey()[0]
 CHECKS = np.tile(np.kron([[1.0, -1.0], [-1.0, 1.0]], np.ones((5, 5))), (24, 32))

@@ -5,7 +5,7 @@ import pytest
 
 from twin.core import geometry
 from twin.core.records import ElevationMap, MapGrid
-from twin.judge.true_map import TrueMap, recorded_map_metrics, true_heights
+from twin.judge.recorded import TrueMap, recorded_map_metrics, true_heights
 
 GRID = MapGrid(-1.0, 1.2, 0.04, 55, 50)
 

@@ -49,7 +49,7 @@ def test_light_below_single_precision_is_reported_as_undefined():
 def test_the_view_is_reproducible_and_its_left_image_is_the_noise_free_image_plus_noise(view):
     again = render_view(mission("water.jerlov=3C"))
     np.testing.assert_array_equal(view.stereo_pair.left, again.stereo_pair.left)
-    signal = np.clip(view.decomposed.components.total * view.decomposed.gain * 255 + 0.5, 0, 255).astype(int)
+    signal = np.clip(view.decomposed.components.total * view.decomposed.setting.gain * 255 + 0.5, 0, 255).astype(int)
     assert np.abs(signal - view.decomposed.noise_free).max() <= 1
     imaging = mission().scenario.imaging
     level = signal[..., 1].mean() / 255

@@ -19,7 +19,7 @@ from twin.estimate.mapping import orthomosaic as estimate
 from twin.estimate.mapping.orthomosaic import Views, heights_of, ortho_grid
 from twin.estimate.mapping.orthophoto import footprint
 from twin.exchange.geotiff import OrthomosaicFile
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.optics import Optics
 from twin.imaging.restoration import Restoration, estimated_floor, linear_signal
@@ -27,7 +27,7 @@ from twin.judge.colour_difference import ciede2000, lab_of
 from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.report.run_folder import read_mosaic
 from twin.scenario.model import LampConfig, MapConfig, Scenario, SensorConfig, WaterConfig
-from twin.world.true_albedo import true_albedo
+from twin.world.top_surface import true_albedo
 
 RIG = StereoRig(160, 120, 140.0, 0.15)
 GRID = MapGrid(-0.6, 0.5, 0.04, 25, 30)
@@ -347,7 +347,7 @@ def test_albedo_in_the_shadow_of_the_sun_is_restored(turn):
     formation = ImageFormation(scenario, illumination, estimated_floor(elevation), np.random.default_rng(0), rig)
     albedo, shape = 128, (rig.height_px, rig.width_px)
     depth = np.full(shape, 1.5, np.float32)
-    light = formation.radiance(np.full((*shape, 3), albedo, np.uint8), depth, 0, StampedPose(camera, 0.0))
+    light = formation.radiance(RenderedView(np.full((*shape, 3), albedo, np.uint8), depth, 0, StampedPose(camera, 0.0)))
     gain = 0.9 / float(light.max())
     image = np.clip(255 * gain * light + 0.5, 0, 255).astype(np.uint8)
     turned = np.diag([turn, turn, 1.0, 1.0])

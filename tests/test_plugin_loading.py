@@ -33,8 +33,9 @@ def test_a_class_is_loaded_by_module_and_name_and_by_entry_point(package):
     by_module = loading.load("control.plugin", loading.CONTROLLERS, "one:Lqr")
     assert by_module is loading.load("control.plugin", loading.CONTROLLERS, "lqr")
     assert loading.load("control.plugin", loading.CONTROLLERS, "one:Lqr.Inner") is by_module.Inner
-    assert loading.registered(loading.CONTROLLERS) == [loading.Registered("lqr", "one:Lqr", by_module)]
-    assert loading.registered(loading.TERRAINS) == []
+    ((made, target),) = loading.registered(loading.CONTROLLERS, lambda plugin, target: (plugin, target))
+    assert isinstance(made, by_module) and target == "one:Lqr"
+    assert loading.registered(loading.TERRAINS, lambda plugin, target: plugin) == []
 
 
 @pytest.mark.parametrize(
@@ -103,7 +104,7 @@ def test_a_replay_names_a_module_only_with_permission(tmp_path):
 def test_a_registered_plugin_that_cannot_be_imported_is_refused_with_the_name_of_its_entry_point(package):
     package("broken", "import absent", bad="Lqr")
     with pytest.raises(TwinError, match="^twin.controllers bad: broken:Lqr: ModuleNotFoundError"):
-        loading.registered(loading.CONTROLLERS)
+        loading.registered(loading.CONTROLLERS, lambda plugin, target: plugin)
 
 
 def test_the_description_of_an_exception_is_one_line_without_control_characters():

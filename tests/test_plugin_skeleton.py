@@ -49,7 +49,7 @@ def test_the_readme_of_a_new_plugin_names_the_commands_that_use_it(tmp_path):
         assert readme.splitlines()[-1].strip() == command and f"Plug-in ({kind}) for" in readme
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["estimator", "terrain"])
 def test_a_new_estimator_and_a_new_terrain_fly(tmp_path, kind):
     folder = tmp_path / f"my_{kind}"

@@ -8,7 +8,7 @@ import pytest
 from twin.core.records import Trajectory
 from twin.errors import TwinError
 from twin.judge.metrics import empty_metrics
-from twin.report import comparison
+from twin.report import run_comparison
 
 
 def write_run(folder, error_m, completeness, **scenario):
@@ -35,11 +35,11 @@ def runs(tmp_path):
     first = write_run(tmp_path / "a" / "run", 0.002, 0.9, seed=1)
     second = write_run(tmp_path / "b" / "run", 0.003, 0.95, seed=2)
     third = write_run(tmp_path / "b" / "worse", 0.02, None, seed=1)
-    return comparison.load_runs([first, second, third])
+    return run_comparison.load_runs([first, second, third])
 
 
 def row(runs, name):
-    return next(row for row in comparison.table(runs) if row.quantity.name == name).cells
+    return next(row for row in run_comparison.table(runs) if row.quantity.name == name).cells
 
 
 def test_differences_are_those_from_the_first_run_and_better_is_told_from_worse(runs):
@@ -54,16 +54,16 @@ def test_differences_are_those_from_the_first_run_and_better_is_told_from_worse(
 
 
 def test_a_quantity_that_no_run_has_is_left_out(runs):
-    assert "map.le90_m" not in [row.quantity.name for row in comparison.table(runs)]
+    assert "map.le90_m" not in [row.quantity.name for row in run_comparison.table(runs)]
 
 
 def test_runs_of_equal_folder_names_are_told_apart(runs):
-    assert comparison.names_of(runs) == ["a/run", "b/run", "b/worse"]
-    assert comparison.names_of(runs[1:]) == ["run", "worse"]
+    assert run_comparison.names_of(runs) == ["a/run", "b/run", "b/worse"]
+    assert run_comparison.names_of(runs[1:]) == ["run", "worse"]
 
 
 def test_the_json_has_values_differences_and_what_the_scenarios_differ_in(runs):
-    tree = json.loads(json.dumps(comparison.as_json(runs)))
+    tree = json.loads(json.dumps(run_comparison.as_json(runs)))
     assert [run["status"] for run in tree["runs"]] == ["complete"] * 3
     assert tree["metrics"]["trajectory.final.ate_rmse_m"]["values"] == [0.002, 0.003, 0.02]
     assert tree["metrics"]["map.completeness"]["differences"] == [None, pytest.approx(0.05), None]
@@ -71,7 +71,7 @@ def test_the_json_has_values_differences_and_what_the_scenarios_differ_in(runs):
 
 
 def test_the_page_names_every_run_draws_the_curves_and_warns_of_different_floors(runs):
-    page = comparison.render(runs)
+    page = run_comparison.render(runs)
     for text in (
         "a/run",
         "b/worse",
@@ -81,25 +81,25 @@ def test_the_page_names_every_run_draws_the_curves_and_warns_of_different_floors
     ):
         assert text in page
     assert page.count("data:image/png;base64,") == 2  # position errors and paths; the runs have no maps
-    same = comparison.render([runs[0], runs[2]])
+    same = run_comparison.render([runs[0], runs[2]])
     assert "different floors" not in same and "Differences of the scenarios" not in same
 
 
 def test_runs_without_truth_are_compared_by_their_paths_alone(runs):
     for run in runs[:2]:
         (run.folder / "trajectory_truth.tum").unlink()
-    page = comparison.render(comparison.load_runs([run.folder for run in runs[:2]]))
+    page = run_comparison.render(run_comparison.load_runs([run.folder for run in runs[:2]]))
     assert page.count("data:image/png;base64,") == 1  # paths; there are no errors
 
 
 def test_runs_that_cannot_be_compared_are_refused(tmp_path, runs):
     folder = runs[0].folder
     with pytest.raises(TwinError, match="RUN: 1 runs .allowed: 2 to 8"):
-        comparison.load_runs([folder])
+        run_comparison.load_runs([folder])
     with pytest.raises(TwinError, match="the same folder is given twice"):
-        comparison.load_runs([folder, folder / ".." / "run"])
+        run_comparison.load_runs([folder, folder / ".." / "run"])
     with pytest.raises(TwinError, match="is not a run folder"):
-        comparison.load_runs([folder, tmp_path])
+        run_comparison.load_runs([folder, tmp_path])
     (folder / "metrics.json").unlink()
     with pytest.raises(TwinError, match="the survey is unfinished"):
-        comparison.load_runs([folder, runs[1].folder])
+        run_comparison.load_runs([folder, runs[1].folder])

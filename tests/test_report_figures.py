@@ -10,7 +10,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
-from twin.report import figures, wording
+from twin.report import plotting, survey_figures
+from twin.report.number_formats import DASH, angle, length, milliradians, percent, with_unit
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.studies.answers import rounded
 
@@ -21,7 +22,7 @@ def test_bars_before_and_after_alignment_have_the_heights_and_colours_of_their_l
         {"track": 2, "before_ga_rmse_m": 0.05, "after_ga_rmse_m": None},
     ]
     run: Any = SimpleNamespace(metrics={"tracks": tracks})
-    figure = figures.track_bars(run)
+    figure = survey_figures.track_bars(run)
     assert figure is not None
     before, after = figure.axes[0].containers
     assert [(bar.get_height(), bar.get_x() < k) for k, bar in enumerate(before)] == [(0.03, True), (0.05, True)]
@@ -37,13 +38,13 @@ def test_labels_of_a_logarithmic_axis_are_numbers_that_do_not_touch(low, ratio):
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(2.6, 2.0))
         canvas, axes = FigureCanvasAgg(figure), figure.add_subplot()
-        figures.log_axis(axes.xaxis, wording.length)
+        plotting.log_axis(axes.xaxis, length)
         axes.set_xlim(low, low * ratio)
         canvas.draw()
     places = [place for place in axes.xaxis.get_majorticklocs() if low <= place <= low * ratio]
     labels = axes.xaxis.get_majorticklabels()
     boxes = [label.get_window_extent(canvas.get_renderer()) for label in labels]
-    assert [label.get_text() for label in labels] == [wording.length(place) for place in places] != []
+    assert [label.get_text() for label in labels] == [length(place) for place in places] != []
     assert all(one.x1 < other.x0 for one, other in zip(boxes, boxes[1:], strict=False))
     assert not any(label.get_text() for label in axes.xaxis.get_minorticklabels())
 
@@ -57,7 +58,7 @@ def test_labels_of_a_logarithmic_axis_are_numbers_that_do_not_touch(low, ratio):
     ],
 )  # fmt: skip
 def test_a_limit_has_the_unit_of_its_metric(name, value, text):
-    assert wording.with_unit(name, value) == text
+    assert with_unit(name, value) == text
 
 
 def test_bounds_of_a_range_have_no_exponent():
@@ -74,11 +75,11 @@ def test_bounds_of_a_range_have_no_exponent():
 @pytest.mark.parametrize(
     ("function", "value", "text"),
     [
-        (wording.length, 0.00043, "0.43 mm"), (wording.length, 0.0064, "6.4 mm"), (wording.length, -0.083, "-8.3 cm"),
-        (wording.length, 1.0, "1.00 m"), (wording.milliradians, 0.1, "1.7 mrad"), (wording.angle, 0.1, "0.10°"),
-        (wording.percent, 0.9996, "> 99.9 %"), (wording.percent, 0.0004, "< 0.1 %"), (wording.percent, 0.5, "50 %"),
+        (length, 0.00043, "0.43 mm"), (length, 0.0064, "6.4 mm"), (length, -0.083, "-8.3 cm"),
+        (length, 1.0, "1.00 m"), (milliradians, 0.1, "1.7 mrad"), (angle, 0.1, "0.10°"),
+        (percent, 0.9996, "> 99.9 %"), (percent, 0.0004, "< 0.1 %"), (percent, 0.5, "50 %"),
     ],
 )  # fmt: skip
 def test_numbers_are_written_in_their_unit(function, value, text):
     assert function(value) == text
-    assert function(None) == wording.DASH
+    assert function(None) == DASH

@@ -20,7 +20,7 @@ from study_surveys import STUDY, fly, study_of
 
 import twin
 from twin.recordings.replay import ReplayOptions
-from twin.report import comparison, survey_page
+from twin.report import run_comparison, survey_page
 from twin.reproduce.exhibit import PAGE_FILE, read_all, write_all
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.report import write_report
@@ -89,7 +89,7 @@ def compared(folder):
     runs = [write_folder(folder / "survey")]
     runs += [Path(shutil.copytree(runs[0], folder / f"survey_with_a_long_name_{k}")) for k in range(5)]
     page = folder / "compare.html"
-    page.write_text(comparison.render(comparison.load_runs(runs)))
+    page.write_text(run_comparison.render(run_comparison.load_runs(runs)))
     return page
 
 

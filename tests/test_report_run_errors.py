@@ -10,7 +10,8 @@ from twin.core import geometry
 from twin.core.records import Trajectory
 from twin.judge.recorded import recorded_errors
 from twin.judge.trajectory_errors import path_errors
-from twin.report import comparison_figures, figures, recording, wording
+from twin.report import recording, run_comparison, survey_figures
+from twin.report.headline import REPLAY_ALIGNMENTS
 from twin.report.run_folder import load_run
 from twin.report.survey_page import context
 
@@ -40,8 +41,8 @@ def test_the_curves_of_a_replay_have_its_alignment(run, alignment, monkeypatch):
     monkeypatch.setattr(recording, "log_curve", lambda _, entity, times, values, *role: logged.update({entity: values}))
     recording.log_curves(recording.rr.RecordingStream("test"), replayed)
     curves = [
-        figures.path_error_curves(replayed).axes[0].lines[-1].get_ydata(),
-        comparison_figures.error_curves([(replayed, {})]).axes[1].lines[-1].get_ydata(),
+        survey_figures.path_error_curves(replayed).axes[0].lines[-1].get_ydata(),
+        run_comparison.error_curves([(replayed, {})]).axes[1].lines[-1].get_ydata(),
         logged["error/position/final"],
     ]
     for curve in curves:
@@ -58,4 +59,4 @@ def test_other_curves_are_anchored_at_the_first_true_pose(run, alignment):
 def test_the_page_states_the_alignment_of_the_curves(run):
     assert context(run)["alignment"] == "anchored at the first true pose"
     replayed = replace(run, metrics=run.metrics | {"replay": {"alignment": "none"}})
-    assert context(replayed)["alignment"] == wording.REPLAY_ALIGNMENTS["none"]
+    assert context(replayed)["alignment"] == REPLAY_ALIGNMENTS["none"]

@@ -12,10 +12,9 @@ from judge_synthetic import SCENARIO, write_folder
 
 from twin.core.records import Trajectory
 from twin.errors import TwinError
-from twin.judge.processing_budget import stage_times
-from twin.report import figures, wording
+from twin.report import number_formats, plotting, survey_figures
 from twin.report.run_folder import load_run
-from twin.report.stage_table import stage_rows
+from twin.report.stage_tables import stage_rows, stage_times
 from twin.report.style import FIGURE_STYLE
 from twin.report.survey_page import sample_images, write_report
 
@@ -60,14 +59,14 @@ def test_the_report_contains_the_values_of_the_metrics(folder, report):
     metrics, page = json.loads((folder / "metrics.json").read_text()), report
     assert "The survey is complete" in page and "Jerlov type IB (Solonenko &amp; Mobley 2015)" in page
     for value in (metrics["trajectory"]["final"]["ate_rmse_m"], metrics["map"]["le90_m"], metrics["map"]["nmad_m"]):
-        assert wording.length(value) in page
+        assert number_formats.length(value) in page
     for row in metrics["tracks"]:
-        assert f">{wording.length(row['farthest_error_m'])}</td>" in page
+        assert f">{number_formats.length(row['farthest_error_m'])}</td>" in page
     assert 'class="good">passed</td>' in page.replace("\n", "")
     for direction in ("along", "across"):
         assert f">{metrics['links'][direction]['count']}</td>" in page
     for stage in metrics["stages"].values():
-        assert f">{wording.length(stage['ate_rmse_m'])}</td>" in page
+        assert f">{number_formats.length(stage['ate_rmse_m'])}</td>" in page
     sections = "plan_view path_errors stages tracks elevation error histogram mosaic samples network timing terms"
     for section in sections.split():
         assert f'<section id="{section}">' in page, section
@@ -135,7 +134,12 @@ def stages(**errors_m):
 def test_the_gain_of_a_stage_is_the_ratio_of_errors():
     rows = stage_rows(stages(f2f=0.4, chain=0.04, online=0.08, final=0.001), {})
     assert [row.gain for row in rows] == [None, pytest.approx(10), pytest.approx(0.5), pytest.approx(80)]
-    assert [wording.improvement(row.gain) for row in rows] == ["", "10 × smaller", "2.0 × larger", "80 × smaller"]
+    assert [number_formats.improvement(row.gain) for row in rows] == [
+        "",
+        "10 × smaller",
+        "2.0 × larger",
+        "80 × smaller",
+    ]
 
 
 def test_a_stage_without_an_error_is_skipped():
@@ -176,7 +180,7 @@ def test_stage_rows_list_inputs_and_disabled_parts(settings, online, final):
     ],
 )
 def test_lengths_have_a_suitable_unit(value, text):
-    assert wording.length(value) == text
+    assert number_formats.length(value) == text
 
 
 def test_the_real_time_budget_is_that_of_the_paper():
@@ -206,14 +210,14 @@ def test_an_outlier_of_the_height_does_not_flatten_the_hill_shading():
     plain = np.sin(x) * np.cos(y)
     outlier = plain.copy()
     outlier[40, 60] = -50.0
-    shaded, expected = figures.hillshade(outlier, "gray"), figures.hillshade(plain, "gray")
+    shaded, expected = plotting.hillshade(outlier, "gray"), plotting.hillshade(plain, "gray")
     away = np.hypot(*np.ogrid[-40:50, -60:60]) > 2
     # not equal: the shading is scaled to the steepest slope, which is that of the outlier
     assert shaded[away, 0].std() == pytest.approx(expected[away, 0].std(), rel=0.1)
     assert np.abs(shaded[away] - expected[away]).max() < 0.2
 
 
-@pytest.mark.parametrize("figure", [figures.path_error_curves])
+@pytest.mark.parametrize("figure", [survey_figures.path_error_curves])
 def test_tick_labels_of_a_logarithmic_axis_are_plain_numbers(folder, figure):
     with matplotlib.rc_context(FIGURE_STYLE):
         drawn = figure(load_run(folder))

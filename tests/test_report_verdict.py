@@ -10,8 +10,8 @@ from judge_synthetic import evaluated, survey, write_folder
 
 from twin.app import console
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
-from twin.judge.warnings import NEES_BOUNDS, metric_warnings, nees_bounds
-from twin.report import headline, wording
+from twin.judge.verdict import NEES_BOUNDS, metric_warnings, nees_bounds
+from twin.report import headline, number_formats
 from twin.report.headline import badge, first_lines
 from twin.report.run_folder import load_run
 from twin.report.survey_page import write_report
@@ -208,7 +208,7 @@ def test_every_map_statistic_is_reported_with_completeness():
 def test_a_map_with_too_many_holes_has_an_infinite_le90_in_the_text():
     metrics = changed(map={"completeness_area": 0.5, "le90_area_m": None})
     assert "LE90 of its heights over this area is infinite" in headline.headline(metrics, {})
-    assert wording.area_le90({"completeness_area": None, "le90_area_m": None}) == wording.DASH
+    assert number_formats.area_le90({"completeness_area": None, "le90_area_m": None}) == number_formats.DASH
 
 
 @pytest.mark.parametrize(

@@ -4,10 +4,10 @@ import csv
 
 import pytest
 
-from twin.reproduce.daylight_comparison import DaylightSelection, daylight_cells, daylight_table
+from twin.reproduce.daylight_comparison import daylight_cells, daylight_table
 from twin.reproduce.light_cell import write_csv
 
-FEW = DaylightSelection(("IB",), (45.0,), (4.0,), (2.0,))
+FEW = ("IB",), (45.0,), (4.0,), (2.0,)
 
 
 def test_a_cell_agrees_with_the_reference():
@@ -28,7 +28,7 @@ def test_a_cell_agrees_with_the_reference():
 
 
 def test_table_and_file_hold_all_cells(tmp_path):
-    found = list(daylight_cells(FEW._replace(elevations_deg=(90.0, 45.0)), 640))
+    found = list(daylight_cells((FEW[0], (90.0, 45.0), *FEW[2:]), 640))
     rows = write_csv(found, tmp_path / "light" / "daylight.csv")
     with (tmp_path / "light" / "daylight.csv").open() as file:
         read = list(csv.DictReader(file))

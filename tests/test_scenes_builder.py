@@ -8,8 +8,7 @@ import pytest
 from twin import terrains
 from twin.core import geometry
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
-from twin.scenes.builder import SceneModel, build
-from twin.scenes.floor import MAX_TILES, TILE_CELLS, tile_cells
+from twin.scenes.builder import MAX_TILES, TILE_CELLS, SceneModel, build, tile_cells
 from twin.scenes.gl import mujoco
 from twin.terrains import TextureSource
 

@@ -52,7 +52,7 @@ def test_measured_frames_and_a_few_lost_ones_are_flown_at_full_pace():
 
 def test_the_vehicle_stops_where_vision_is_lost_and_flies_on_slowly_at_first():
     log = []
-    actions = MissionActions(mission(), lambda action, _: log.append(action))
+    actions = MissionActions(mission(), lambda _, action, **__: log.append(action))
     blind = paces(actions, frames(5, "lost"))
     assert blind[round(BLIND_S * RATE_HZ) - 1] == FULL
     assert blind[-1].rate == pytest.approx(0.0, abs=0.02) and sum(pace.keyframe for pace in blind) >= 1
@@ -184,7 +184,7 @@ def fly_blind(first, end, monkeypatch, actions):
                 return motion, status
             predicted.restart()
             predicted.predict(1 / RATE_HZ)
-            return constant_velocity_motion(predicted.pose)
+            return constant_velocity_motion(predicted.pose), "too few points matched"
 
         monkeypatch.setattr(world.vision, "track_frame", track_frame)
         monkeypatch.setattr(

@@ -81,7 +81,7 @@ def test_an_area_with_a_tenth_missing_is_a_finding():
 
 def test_only_a_lasting_departure_from_the_path_is_a_finding():
     limit_m = off_course_limit_m(mission())
-    assert limit_m == pytest.approx(0.25 * min(mission().plan.footprint_m))
+    assert limit_m == pytest.approx(0.25 * min(mission().plan.request.footprint_m))
     for n_frames, expected in ((20, []), (40, ["off_course"])):
         path = np.zeros((90, 3))
         path[30 : 30 + n_frames, 1] = 1.1 * limit_m
@@ -101,7 +101,7 @@ def test_removed_rectification_errors_are_reported():
 def test_a_survey_whose_position_is_lost_is_aborted():
     monitor = SurveyMonitor(mission(), SimpleNamespace(log=lambda *_, **__: None), lambda _: None)
     frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), None)
-    half_m = 0.5 * min(mission().plan.footprint_m)
+    half_m = 0.5 * min(mission().plan.request.footprint_m)
 
     def estimate(sigma_m):
         return Estimate(1.0, np.eye(4), np.eye(4), np.zeros(6), sigma_m, "ok")

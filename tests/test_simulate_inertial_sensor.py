@@ -10,9 +10,9 @@ from twin.scenario.file import load_scenario
 from twin.scenario.model import ImuConfig, VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenes.gl import mujoco
-from twin.simulate.inertial_sensor import InertialSensor
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.sensors import InertialSensor
 from twin.world.mission import motion_rate_hz, prepare
 
 RATE_HZ = 120.0

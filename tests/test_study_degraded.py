@@ -9,7 +9,7 @@ from test_study_report import analyse
 from test_study_tuning import TUNING
 
 from twin.judge.map_error import with_completeness
-from twin.studies import flight, wording
+from twin.studies import flight, sentences
 from twin.studies.progress import survey_line
 from twin.studies.report import summary, write_report
 from twin.studies.surveys import surveys
@@ -43,7 +43,7 @@ def test_a_degraded_survey_counts_and_does_not_pass(study, tmp_path):
 def test_the_report_of_a_study_names_the_reason_of_degraded_surveys(study, tmp_path, monkeypatch):
     analysis = analyse(study, tmp_path, half_degraded)
     assert {r.reason for r in analysis.failure_reasons if r.status == "degraded"} == {"the stereo residuals are … px"}
-    monkeypatch.setattr("twin.studies.figures.draw_all", lambda *_: {}, raising=False)
+    monkeypatch.setattr("twin.studies.study_figures.draw_all", lambda *_: {}, raising=False)
     write_report(analysis, tmp_path / "study.html")
     assert re.search(r">degraded</td><td[^>]*>6</td>", (tmp_path / "study.html").read_text())
 
@@ -76,7 +76,7 @@ def test_the_row_of_a_survey_has_its_status(study, tmp_path, monkeypatch, status
 
 def test_a_sentence_as_a_warning_ends_with_one_full_stop(study, tmp_path):
     warned = analyse(study, tmp_path, lambda s: fly(s) | {"warning": "The surrogate extrapolates: too turbid."})
-    assert wording.headline(warned).endswith("12 of 12 surveys: The surrogate extrapolates: too turbid.")
+    assert sentences.headline(warned).endswith("12 of 12 surveys: The surrogate extrapolates: too turbid.")
 
 
 def test_every_map_statistic_of_a_study_is_reported_with_completeness(study, tmp_path):

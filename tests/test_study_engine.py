@@ -11,8 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import study_tasks
 
-from twin.app.study_command import open_engine
-from twin.engines.engine import LocalEngine
+from twin.engines.engine import LocalEngine, open_engine
 from twin.engines.worker import TaskLimits, WorkerPool
 from twin.errors import TwinError
 
@@ -120,7 +119,7 @@ def test_slurm_jobs_need_dask_jobqueue(monkeypatch):
             pass
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_dask_cluster_gives_the_outcomes_of_a_local_engine_even_if_it_loses_a_worker(tmp_path):
     from distributed import LocalCluster
 

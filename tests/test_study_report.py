@@ -10,7 +10,7 @@ from study_surveys import LOST, STUDY, fail, fly, study_of
 
 from twin import survey as survey_module
 from twin.errors import ScenarioError, UnmodelledError
-from twin.studies import flight, wording
+from twin.studies import flight, sentences
 from twin.studies.analysis import StudyAnalysis, mask_numbers
 from twin.studies.flight import row_of
 from twin.studies.report import summary as summary_of
@@ -41,7 +41,7 @@ def analysis(study, tmp_path):
 def test_the_first_sentence_states_where_the_seek_key_passes(tmp_path):
     study = study_of(tmp_path, STUDY, ("samples = 12", "samples = 200"))
     analysis = analyse(study, tmp_path)
-    first = wording.headline(analysis).partition(". ")[0]
+    first = sentences.headline(analysis).partition(". ")[0]
     assert first.startswith("At least 80 % of surveys pass at water.turbidity 1 to ")
     passes, *_, fails = analysis.answers["water.turbidity"]
     assert (passes.verdict, fails.verdict) == ("passes", "fails")
@@ -53,7 +53,7 @@ def test_the_pass_probability_includes_aborted_surveys(study, analysis):
     turbid = [turbidity > 25 for turbidity in analysis.rows["vary.water.turbidity"].to_pylist()]
     assert (analysis.status == "aborted").tolist() == turbid
     assert analysis.pass_probability.value == analysis.passed.mean()
-    assert f"{analysis.passed.sum()} of 64 surveys were completed" in wording.headline(analysis)
+    assert f"{analysis.passed.sum()} of 64 surveys were completed" in sentences.headline(analysis)
 
 
 def test_failed_surveys_are_not_counted(tmp_path):
@@ -62,7 +62,7 @@ def test_failed_surveys_are_not_counted(tmp_path):
     assert half.evaluated.sum() == 6
     assert half.pass_probability.value == half.passed[half.evaluated].mean()
     failed = "6 more surveys failed because of the computer or the program and are not counted"
-    assert failed in wording.headline(half)
+    assert failed in sentences.headline(half)
 
 
 def refused_by_the_surrogate(survey):
@@ -79,13 +79,13 @@ def test_surveys_that_only_the_surrogate_refuses_are_unknown_in_the_pass_probabi
     assert found.unmodelled.sum() == n_unknown > 20
     assert found.pass_probability == wilson_interval(n_known, n_known, unknown=n_unknown)
     assert found.requirement_missed
-    text = wording.headline(found)
+    text = sentences.headline(found)
     assert f"samples ({n_unknown} surveys) are unknown, because the surrogate cannot simulate them" in text
     assert "The required 80 % is not decided" in text and "cannot be flown" not in text
     assert summary_of(found, {})["unmodelled"] == n_unknown
     (last,) = [answer for answer in found.answers["water.turbidity"] if answer.unknown]
     assert (last.verdict, last.unknown, last.surveys) == ("undecided", n_unknown, n_unknown)
-    assert f"{n_unknown} of them unknown" in wording.answer_lines(found)[0]
+    assert f"{n_unknown} of them unknown" in sentences.answer_lines(found)[0]
     write_report(found, tmp_path / "study.html")
     assert f"{n_unknown} unknown" in (tmp_path / "study.html").read_text()
 
@@ -101,7 +101,7 @@ def test_the_row_of_a_survey_states_that_only_the_surrogate_refuses_it(study, tm
 def test_a_single_failed_survey_is_singular(tmp_path):
     study = study_of(tmp_path)
     rest = analyse(study, tmp_path, lambda survey: fail(survey) if survey.sample == 3 else fly(survey))
-    headline = wording.headline(rest)
+    headline = sentences.headline(rest)
     assert " 1 more survey failed because of the computer or the program and is not counted; if it had not " in headline
     assert headline.endswith("Use --resume to fly it again.")
 
@@ -115,22 +115,22 @@ def test_warnings_of_repeated_surveys_count_once(tmp_path):
     study = study_of(tmp_path, STUDY, *grid, ("{ uniform = [1.6, 2.4] }", "{ grid = [1.8, 2.2] }"))
     warned = analyse(study, tmp_path, lambda survey: fly(survey) | {"warning": "too turbid"})
     assert (len(warned.rows), warned.duplicate.sum(), warned.warning_counts) == (12, 4, {"too turbid": 8})
-    assert wording.headline(warned).endswith("Warning in 8 of 8 surveys: too turbid.")
+    assert sentences.headline(warned).endswith("Warning in 8 of 8 surveys: too turbid.")
 
 
 def test_warnings_are_counted_and_the_first_one_is_shown(tmp_path):
     study = study_of(tmp_path)
     warned = analyse(study, tmp_path, lambda s: fly(s) | {"warning": "surrogate: too turbid" if s.sample < 3 else ""})
-    assert wording.headline(warned).endswith("Warning in 3 of 12 surveys: surrogate: too turbid.")
+    assert sentences.headline(warned).endswith("Warning in 3 of 12 surveys: surrogate: too turbid.")
 
 
 def test_without_warnings_the_headline_has_none(study, analysis):
-    assert "Warning" not in wording.headline(analysis)
+    assert "Warning" not in sentences.headline(analysis)
 
 
 def test_if_all_surveys_failed_there_is_no_result(tmp_path):
     study = study_of(tmp_path)
-    assert wording.headline(analyse(study, tmp_path, fail)).startswith("No survey could be evaluated.")
+    assert sentences.headline(analyse(study, tmp_path, fail)).startswith("No survey could be evaluated.")
 
 
 def test_the_bound_of_an_error_is_its_95th_percentile(analysis):

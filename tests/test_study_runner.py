@@ -8,10 +8,10 @@ import study_surveys
 from study_surveys import STUDY, SerialEngine, study_of
 
 from twin.app import study_command
-from twin.app.study_command import open_engine
+from twin.engines.engine import open_engine
 from twin.engines.worker import Outcome
 from twin.errors import ScenarioError, TwinError
-from twin.studies import runner, wording
+from twin.studies import runner, sentences
 from twin.studies.flight import flatten, has_passed
 from twin.studies.progress import StudyProgress
 from twin.studies.results_log import ResultsLog
@@ -73,7 +73,7 @@ def test_the_throughput_counts_only_the_surveys_flown_by_this_call(study, tmp_pa
     first = run_study(study, tmp_path / "out", SerialEngine(stop_before=5), function=fly).throughput
     rest = run_study(study, tmp_path / "out", resume=True, function=fly).throughput
     assert [(throughput.surveys, throughput.worker_s) for throughput in (first, rest)] == [(5, 10.0), (11, 22.0)]
-    assert wording.throughput(600, 300.0, 540.0) == "600 surveys in 300 s, 120 per minute; mean run time 0.90 s"
+    assert sentences.throughput(600, 300.0, 540.0) == "600 surveys in 300 s, 120 per minute; mean run time 0.90 s"
 
 
 def test_a_row_contains_the_number_of_attempts():

@@ -358,7 +358,7 @@ def test_the_cost_is_the_first_duration_or_else_the_first_objective(tmp_path, ob
     assert config.objectives[cost_index(config)] == cost
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tuned_plan_of_a_tiny_survey_is_verified_by_rendered_surveys(tmp_path):
     (tmp_path / "study.toml").write_text(TINY)
     options = study_command.StudyOptions(tmp_path / "out", jobs=2)

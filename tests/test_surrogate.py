@@ -15,7 +15,7 @@ from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, SurveyAborted
 from twin.estimate.vision import matching
 from twin.imaging.camera.photo_sensor import sensor_of
-from twin.imaging.image_formation import ImageFormation, StampedPose
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.scenario.file import load_scenario
 from twin.session.assembly import navigator_with, open_world
 from twin.surrogate import error_model_file
@@ -30,8 +30,8 @@ from twin.surrogate.matchability import (
     unevenness_px,
     window_texture,
 )
-from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
-from twin.surrogate.vision import corner_count, overlap_inflation
+from twin.surrogate.surrogate_world import SurrogateWorld
+from twin.surrogate.vision import SurrogateVision, corner_count, overlap_inflation
 from twin.terrains import Terrain
 from twin.world.mission import prepare
 from twin.world.pilot import make_pilot
@@ -144,7 +144,7 @@ def test_a_survey_in_snow_that_prevents_all_matches_is_refused_even_with_extrapo
     size = "rig.image_width_px=128", "rig.image_height_px=96"
     m = mission("snow.density_per_m3=5000", "snow.diameter_m=0.02", "imaging.extrapolate=true", *size)
     with pytest.raises(ScenarioError, match=r"imaging.fidelity: .*marine snow prevents all matches .*less \[snow\]"):
-        surrogate_vision(m, MODEL, lambda: m.start, Stopwatch())
+        SurrogateVision(m, MODEL, lambda: m.start, Stopwatch())
 
 
 def test_small_images_have_fewer_corners_but_as_many_points_on_a_grid(reef):
@@ -166,7 +166,7 @@ def test_the_inflation_by_common_pixels_is_that_of_patches_spread_at_random(reef
 def test_tracking_is_lost_where_too_few_points_would_be_matched_between_frames(reef):
     """The estimators need a quarter of the points; the bound of this water is 0.01 px."""
     for half_px, tracked in ((0.05, True), (0.007, False)):
-        vision = surrogate_vision(reef, MODEL._replace(match_half_px=half_px), lambda: reef.start, Stopwatch())
+        vision = SurrogateVision(reef, MODEL._replace(match_half_px=half_px), lambda: reef.start, Stopwatch())
         observe_keyframes(vision, [reef.start], [reef.start])
         vision.restart_tracking()
         assert (vision.frame_errors is not None) == tracked
@@ -251,7 +251,7 @@ def test_link_errors_are_consistent_with_their_covariance(reef, bias_fraction, g
         match_bias_fraction=bias_fraction, distance_growth=growth, match_floor_px=0.05, efficiency=0.0, relief_gain=0.0,
         lamp_growth=0.0,
     )  # fmt: skip
-    vision = surrogate_vision(reef, model, lambda: poses[at[0]], Stopwatch())
+    vision = SurrogateVision(reef, model, lambda: poses[at[0]], Stopwatch())
     for seed in range(150):
         observe_keyframes(reseeded(vision, seed), poses, at)
         error = error_of_link(vision, 0, 1)
@@ -264,7 +264,7 @@ def test_lamps_scale_errors_of_links_and_daylight_does_not(reef):
     plain = MODEL._replace(match_floor_px=0.2, efficiency=0.0, lamp_growth=0.0)
     poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
     for flown, factor in ((reef, 5.0), (mission("lamps=[]", "sun.illuminance_lx=2000"), 1.0)):
-        vision, errors = surrogate_vision(flown, plain, lambda: poses[at[0]], Stopwatch()), []
+        vision, errors = SurrogateVision(flown, plain, lambda: poses[at[0]], Stopwatch()), []
         observe_keyframes(vision, poses, at)
         for vision.model in (plain, plain._replace(lamp_growth=2.0)):
             errors.append(error_of_link(vision, 0, 1))
@@ -278,7 +278,7 @@ def test_relief_makes_the_matches_of_a_stereo_pair_less_precise():
     sigmas = []
     for gain in (0.0, 3.0):
         model = MODEL._replace(match_floor_px=0.02, efficiency=0.0, stereo_relief_gain=gain)
-        vision = surrogate_vision(rough, model, lambda: at, Stopwatch())
+        vision = SurrogateVision(rough, model, lambda: at, Stopwatch())
         cov = vision.observe_stereo(None, 0).cov
         sigmas.append(np.sqrt(np.median(np.trace(cov, axis1=1, axis2=2)) * raster_fraction(vision)))
     parallax_px = vision.latest.unevenness_px * np.mean(vision.latest.points[:, 2])
@@ -288,7 +288,7 @@ def test_relief_makes_the_matches_of_a_stereo_pair_less_precise():
 
 def test_stereo_points_lie_in_both_images(reef):
     pose = tilted(0, 0, 2.0)
-    vision = surrogate_vision(reef, MODEL, lambda: pose, Stopwatch())
+    vision = SurrogateVision(reef, MODEL, lambda: pose, Stopwatch())
     points = vision.observe_stereo(None, 0)
     right_px = points.pixels[:, 0] - reef.rig.focal_px * vision.latest.points[:, 2]
     assert right_px.min() >= reef.scenario.estimate.patch_px // 2
@@ -299,7 +299,7 @@ def test_stereo_points_lie_in_both_images(reef):
 def test_a_fifth_of_the_image_suffices_for_a_link_with_larger_covariance(reef):
     """As with images: the common points have to be consistent, not numerous."""
     poses, at = [tilted(0.1 * k, 0.0, 2.0) for k in range(30)], [0]
-    vision = surrogate_vision(reef, MODEL, lambda: poses[at[0]], Stopwatch())
+    vision = SurrogateVision(reef, MODEL, lambda: poses[at[0]], Stopwatch())
     observe_keyframes(vision, poses, at)
     links = [link_of(vision, 0, k) for k in range(1, 30)]
     measured = [link for link in links if link is not None]
@@ -310,7 +310,7 @@ def test_a_fifth_of_the_image_suffices_for_a_link_with_larger_covariance(reef):
 
 def test_a_link_does_not_depend_on_earlier_measurements(reef):
     poses, at = [tilted(0, 0, 2.0), tilted(0.2, 0.1, 2.05)], [0]
-    vision = surrogate_vision(reef, MODEL, lambda: poses[at[0]], Stopwatch())
+    vision = SurrogateVision(reef, MODEL, lambda: poses[at[0]], Stopwatch())
     observe_keyframes(vision, poses, at)
     first = link_of(vision, 0, 1)
     vision.draw_normals(1)
@@ -322,7 +322,7 @@ def test_the_bias_of_a_keyframe_reduces_the_loop_closure_error_of_three_keyframe
 
     def closure(bias_fraction):
         model = MODEL._replace(match_bias_fraction=bias_fraction, match_floor_px=0.05, relief_gain=0.0)
-        vision, squares = surrogate_vision(reef, model, lambda: poses[at[0]], Stopwatch()), []
+        vision, squares = SurrogateVision(reef, model, lambda: poses[at[0]], Stopwatch()), []
         for seed in range(60):
             observe_keyframes(reseeded(vision, seed), poses, at)
             a, b, c = (link_of(vision, i, j).a_from_b for i, j in ((0, 1), (1, 2), (0, 2)))
@@ -336,7 +336,7 @@ def test_errors_due_to_relief_accumulate_along_a_path_and_cancel_around_a_loop(r
     """Ten equal steps; independent errors would accumulate to ten times the variance of one step."""
     poses, at = [tilted(0.02 * k, 0, 2.0) for k in range(11)], [0]
     model = MODEL._replace(match_floor_px=1e-4, efficiency=0.0, stereo_relief_gain=0.0, relief_gain=1e3)
-    vision = surrogate_vision(reef, model, lambda: poses[at[0]], Stopwatch())
+    vision = SurrogateVision(reef, model, lambda: poses[at[0]], Stopwatch())
     steps, sums, closures = [], [], []
     for seed in range(30):
         observe_keyframes(reseeded(vision, seed), poses, at)
@@ -349,7 +349,7 @@ def test_errors_due_to_relief_accumulate_along_a_path_and_cancel_around_a_loop(r
 
 
 def test_below_the_floor_nothing_is_matched(reef):
-    vision = surrogate_vision(reef, MODEL, lambda: tilted(0, 0, -1.0), Stopwatch())
+    vision = SurrogateVision(reef, MODEL, lambda: tilted(0, 0, -1.0), Stopwatch())
     with np.errstate(divide="raise"):
         assert vision.observe_stereo(None, 0) is None
 
@@ -380,7 +380,7 @@ def test_the_relative_bound_is_that_of_random_textures_in_crops_of_the_image():
     shape = rig.height_px, rig.width_px
     depth, camera = np.full(shape, 2.0, np.float32), StampedPose(tilted(0.0, 0.0, 2.0), 0.0)
     albedo = np.repeat(rng.integers(40, 140, (*shape, 1), np.uint8), 3, axis=2)
-    lights = [formation.radiance(image, depth, 0, camera) for image in (albedo, np.full_like(albedo, 90))]
+    lights = [formation.radiance(RenderedView(image, depth, 0, camera)) for image in (albedo, np.full_like(albedo, 90))]
     sensor = sensor_of(m.scenario, rig)
     setting = sensor.meter(lights[0])
     signal = matching.gray(((lights[0] - lights[1]) * 255 * setting.gain).astype(np.float32))

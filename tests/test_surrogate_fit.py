@@ -17,9 +17,10 @@ from twin.session.assembly import navigator_with
 from twin.surrogate import error_model_file
 from twin.surrogate.error_model_file import FittedErrorModel
 from twin.surrogate.height_errors import CellConditions, height_sigmas
-from twin.surrogate.surrogate_world import SurrogateWorld, surrogate_vision
+from twin.surrogate.surrogate_world import SurrogateWorld
+from twin.surrogate.vision import SurrogateVision
 from twin.surrogate_fit import rendered_surveys
-from twin.surrogate_fit.comparison import RELIEF_GAIN, ComparisonVision, single_error_models
+from twin.surrogate_fit.comparison_vision import RELIEF_GAIN, ComparisonVision, single_error_models
 from twin.surrogate_fit.fit import SurveyStatistics, comparisons, fit_error_model, misfit
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
 from twin.world.mission import prepare
@@ -138,7 +139,7 @@ def test_sampled_links_separate_keyframe_bias_from_relief(bias_fraction, relief_
     """60 paths of eleven keyframes: the correlation has a standard error of 0.03. This reef is smooth."""
     poses, at = [tilted(0.04 * k, 0.02 * k, 2.0) for k in range(11)], [0]
     model = COMPARED._replace(match_bias_fraction=bias_fraction, relief_gain=relief_gain, lamp_growth=0.0)
-    vision = surrogate_vision(mission(), model, lambda: poses[at[0]], Stopwatch())
+    vision = SurrogateVision(mission(), model, lambda: poses[at[0]], Stopwatch())
     found = {name: [] for name in ("images", "patches", "relief")}
     for seed in range(60):
         vision._link_key = seed
@@ -209,7 +210,7 @@ def compare_survey(flown, true, seed):
         return world.world_from_camera
 
     world.vision._rng, world.vision._link_key = np.random.default_rng(100 + seed), seed
-    compared = surrogate_vision(flown, COMPARED, true_pose, Stopwatch())
+    compared = SurrogateVision(flown, COMPARED, true_pose, Stopwatch())
     vision = ComparisonVision(SimulatedImages(world.vision), compared, true_pose)
     navigator = navigator_with(flown, vision, Stopwatch())
     survey.fly(flown, world, navigator, lambda *_: None)

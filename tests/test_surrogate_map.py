@@ -14,7 +14,7 @@ from twin.surrogate.floor_relief import edge_strength, floor_relief, roughness, 
 from twin.surrogate.height_errors import CellConditions, height_sigmas, relief_error_px
 from twin.surrogate.map_model import MapModel, heavy_tailed, window_noise
 from twin.surrogate.matchability import EVEN_TEXTURE, NO_DEPENDENCE, PositionDependence, WindowTexture
-from twin.surrogate_fit.comparison import exact_map_model
+from twin.surrogate_fit.comparison_vision import exact_map_model
 
 MODEL = error_model_file.load().model
 EXACT = exact_map_model(MODEL)

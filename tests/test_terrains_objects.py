@@ -15,7 +15,7 @@ from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario, TerrainConfig
 from twin.terrains.ground_cover import COVERS
 from twin.terrains.objects import mesh_file, scattering
-from twin.terrains.objects.coloured_mesh import Mesh
+from twin.terrains.objects.coloured_mesh import Mesh, with_colours
 from twin.terrains.objects.detail import levels_of
 from twin.terrains.objects.floor_mesh import tiles_of
 from twin.terrains.objects.mesh_header import face_count
@@ -169,7 +169,7 @@ def test_built_in_shapes_are_manifold_of_size_one_and_seeded(name):
     assert (solid.is_watertight and solid.volume > 0) or name == "kelp"
 
 
-CONE = model_of(mesh_file._mesh(*(lambda c: (c.vertices, c.faces, np.full((len(c.vertices), 3), 99)))(
+CONE = model_of(with_colours(*(lambda c: (c.vertices, c.faces, np.full((len(c.vertices), 3), 99)))(
     trimesh.creation.cone(0.5, 1.0))))  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from twin import terrains
 from twin.core.user_files import path_problem, read_bytes, read_json, read_text
 from twin.datasets.text_files import read_yaml
 from twin.errors import TwinError
-from twin.report.comparison import load_runs
+from twin.report.run_comparison import load_runs
 from twin.report.run_folder import read_raster
 from twin.scenario.file import load_scenario
 from twin.terrains.objects.mesh_file import read_mesh

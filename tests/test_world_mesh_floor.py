@@ -15,7 +15,7 @@ from twin.core import geometry
 from twin.core.height_field import grid_triangles
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import ScenarioError, TwinError
-from twin.imaging.scene.object_view import ObjectRenderer, Objects
+from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.scenario.file import find_scene, load_scenario
 from twin.scenes.gl import mujoco
 from twin.surrogate import matchability
@@ -26,8 +26,7 @@ from twin.terrains.objects.mesh_file import TexturedMesh
 from twin.world import mesh_floor, top_surface
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, prepare
-from twin.world.top_surface import true_heights
-from twin.world.true_albedo import true_albedo
+from twin.world.top_surface import true_albedo, true_heights
 
 W, H, FOCAL = 160, 120, 130.0
 RIG = StereoRig(W, H, FOCAL, 0.15, 30.0, geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3)))
@@ -118,7 +117,7 @@ def test_the_depth_of_a_mesh_floor_is_that_of_ray_casting_also_below_an_overhang
     tiles = tabled.mesh_floor.tiles
     pose = looking((0.1, -1.1, 0.35), (0.1, 0.2, 0.33))  # below the upper side of the plate
     albedo, depth = np.zeros((H, W, 3), np.uint8), np.full((H, W), np.inf, np.float32)
-    view = ObjectRenderer(Objects((), floor=tiles), RIG).draw(albedo, depth, pose, 0.0)
+    view = draw_over_floor(Objects((), floor=tiles), RIG, albedo, depth, pose, 0.0)
     expected = ray_depths([tile.placed.model.levels[0].mesh for tile in tiles.tiles], pose)
     both = np.isfinite(depth) & np.isfinite(expected)
     assert (np.isfinite(depth) == np.isfinite(expected)).mean() > 0.999
@@ -183,8 +182,8 @@ def test_objects_stand_on_the_highest_surface_and_the_floor_is_no_obstacle(tmp_p
     tiles = mission.mesh_floor.tiles.tiles
     assert len(drawn.placed) == len(mission.objects) + len(tiles) and drawn.surface is not None
     labels = [-1] * (1 + len(mission.objects)) + [tile.texture for tile in tiles]  # the floor is labelled after objects
-    np.testing.assert_array_equal(drawn.surface.of_label, labels)
-    assert [drawn.uv_of(k) is not None for k in range(len(drawn.placed))] == [texture >= 0 for texture in labels[1:]]
+    np.testing.assert_array_equal(drawn.surface[1], labels)
+    assert [uv is not None for uv in drawn.uv] == [texture >= 0 for texture in labels[1:]]
 
 
 def test_the_surrogate_sees_the_texture_of_the_mesh(tabled):
@@ -244,8 +243,8 @@ def test_large_triangles_are_divided_without_cracks_or_change_of_shape(tmp_path)
     outline = fine.mesh.vertices_m[ends[count == 1]].mean(axis=1)  # edges of one triangle lie on the outline only
     assert np.allclose(np.abs(outline[:, :2]).max(axis=1), 3)
     albedo, depth = np.zeros((H, W, 3), np.uint8), np.full((H, W), np.inf, np.float32)
-    renderer = ObjectRenderer(Objects((), floor=tiles_of(fine)), RIG)
-    renderer.draw(albedo, depth, looking((0.0, -2.0, 0.8), (0.0, -1.0, 0.8)), 0.0)
+    pose = looking((0.0, -2.0, 0.8), (0.0, -1.0, 0.8))
+    draw_over_floor(Objects((), floor=tiles_of(fine)), RIG, albedo, depth, pose, 0.0)
     assert np.isfinite(depth[H // 2 + 10 :]).all()
 
 
@@ -260,7 +259,7 @@ ABOVE = geometry.pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, 0.5]))
 def seen_from(tiles, pose: np.ndarray) -> np.ndarray:
     """Returns the albedo (H, W, 3) of tiles seen by a camera."""
     albedo, depth = np.zeros((H, W, 3), np.uint8), np.full((H, W), np.inf, np.float32)
-    ObjectRenderer(Objects((), floor=tiles), RIG).draw(albedo, depth, pose, 0.0)
+    draw_over_floor(Objects((), floor=tiles), RIG, albedo, depth, pose, 0.0)
     return albedo
 
 

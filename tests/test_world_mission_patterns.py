@@ -11,7 +11,7 @@ from twin.errors import ScenarioError, SurveyAborted, TwinError
 from twin.scenario.file import load_scenario
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.world.mission import prepare
-from twin.world.thrust_authority import check_speed
+from twin.world.path_checks import check_speed
 
 pytestmark = pytest.mark.long
 

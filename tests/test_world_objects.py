@@ -15,8 +15,7 @@ from twin.terrains.objects.primitives import sphere
 from twin.terrains.objects.shapes import build_shape
 from twin.world.mission import prepare
 from twin.world.observed_cells import Coverage
-from twin.world.top_surface import TopSurface, top_surface
-from twin.world.true_albedo import without_objects
+from twin.world.top_surface import TopSurface, top_surface, without_objects
 
 GRID = MapGrid(-0.6, 0.5, 0.01, 100, 120)
 FLOOR = np.full((100, 120), 0.2, np.float32)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from twin import terrains
-from twin.core.height_field import ray_grid
-from twin.core.image_overlap import RAY_COLUMNS, image_overlap
+from twin.core.height_field import RAY_COLUMNS, image_overlap, ray_grid
 from twin.core.timing import Stopwatch
 from twin.scenario.file import load_scenario
 from twin.surrogate import error_model_file
@@ -18,7 +17,7 @@ from twin.terrains.objects.placed_object import PlacedObject, model_of
 from twin.terrains.objects.primitives import box
 from twin.world.floor_forecast import forecast_over_floor, planned_surface
 from twin.world.mission import prepare
-from twin.world.planned_images import floor_of
+from twin.world.planning import floor_of
 from twin.world.top_surface import FINE_M
 
 LEVEL = Terrain(np.zeros((141, 181), np.float32), 0.05, -4.5, -3.5, np.zeros((2, 2, 3), np.uint8), 4.5)

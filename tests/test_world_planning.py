@@ -9,15 +9,14 @@ from twin import terrains
 from twin.controllers.camera_surface import surface_above_floor
 from twin.core.records import SurveyResult, Trajectory, Truth
 from twin.errors import ScenarioError, TwinError
-from twin.judge.overlap import overlap_metrics
+from twin.judge.swaths import overlap_metrics
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.terrains import Terrain, TextureSource
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread
 from twin.world.mission import prepare
-from twin.world.planned_images import planned_keyframes, planned_references
-from twin.world.planning import plan_survey, survey_request
-from twin.world.thrust_authority import check_thrust, climb_slope
+from twin.world.path_checks import check_thrust, climb_slope
+from twin.world.planning import plan_survey, planned_keyframes, survey_request
 from twin.world.top_surface import true_heights
 
 SMALL = ["terrain.texture_px_m=0.2", "plan.area_m=[3.0, 1.6]", "plan.altitude_m=2.0"]
@@ -73,7 +72,7 @@ def test_over_a_raised_plane_the_spacing_is_that_of_the_remaining_altitude():
     assert over_floor.swath_spacing_m == nearer.swath_spacing_m
     # the steps of the search reduce the spacing by at least 1 %
     assert 0.97 * nearer.n_frames_per_keyframe <= over_floor.n_frames_per_keyframe <= nearer.n_frames_per_keyframe
-    assert over_floor.altitude_m == 2.0
+    assert over_floor.request.altitude_m == 2.0
 
 
 @pytest.mark.parametrize("kind", ["reef", "fractal", "step"])
@@ -96,7 +95,7 @@ def test_the_forecast_over_a_level_floor_has_its_closed_form(height_m, monkeypat
     mission = over(raised(height_m), monkeypatch, "plan.overlap_reference=plane")
     forecast, plan, rig = forecast_over_floor(mission), mission.plan, mission.rig
     range_m = 2.0 - height_m
-    step_m = plan.n_frames_per_keyframe * plan.speed_mps / plan.frame_rate_hz
+    step_m = plan.n_frames_per_keyframe * plan.speed_mps / plan.request.frame_rate_hz
     assert spread(forecast.overlap_along).p05 == pytest.approx(1 - step_m * rig.focal_px / (240 * range_m), abs=1e-3)
     sidelap = 1 - plan.swath_spacing_m * rig.focal_px / (320 * range_m)
     assert spread(forecast.overlap_across).median == pytest.approx(sidelap, abs=0.01)  # frames on the corners
@@ -193,7 +192,7 @@ def test_a_path_over_a_slope_higher_than_the_altitude_follows_it(grade, monkeypa
     """The level path at 1.2 m would lie below the upper part of the slope."""
     slope = floor(lambda x, y: 1.0 + grade * x)
     mission = over(slope, monkeypatch, "plan.height=floor", "plan.altitude_m=1.2", "plan.area_m=[5.0, 1.0]")
-    x, y, z = planned_references(mission.plan).position.T
+    x, y, z = mission.plan.all_references().position.T
     assert np.ptp(z) > 4.9 * abs(grade)
     assert z - slope.height_at(x, y) == pytest.approx(1.2, abs=0.03)
 

@@ -18,11 +18,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """Returns `twin.World`, which needs the simulator, or the version, when they are asked for.
-
-    Raises:
-        AttributeError: the module has no attribute of this name.
-    """
+    """Returns `twin.World`, which needs the simulator, or the version, when they are asked for."""
     if name == "World":
         from twin.session.stepped_world import SteppedWorld
 

@@ -33,13 +33,13 @@ def load_scenario(
     Args:
         path: a TOML file, or the name of a scenario in scenes/.
         overrides: values that replace those of the file: strings `key=value`, or a mapping of dotted keys.
-        allow_plugins: whether the file and the overrides may name a plug-in as module:Class, which runs code of any
-            module that can be imported; the names of installed entry points are always allowed.
+        allow_plugins: whether a plug-in may be named as module:Class, which runs code of any module that can be
+            imported; the names of installed entry points are always allowed.
         sections: sections or top-level keys with their values, e.g. `plan={"tracks": 1}, seed=3`.
 
     Raises:
-        ScenarioError: there is no such scenario, or a file or a value is invalid. The message lists the errors of
-            files as `FILE:LINE: key: problem (allowed: ...)` and those of overrides in lines that begin with `--set`.
+        ScenarioError: there is no such scenario, or a file or a value is invalid. The message lists the errors of files
+            as `FILE:LINE: key: problem (allowed: ...)` and those of overrides in lines that begin with `--set`.
     """
     from twin.scenario.file import load_scenario
 
@@ -49,15 +49,11 @@ def load_scenario(
 def run(
     scene: str | Path | Scenario, out: str | Path | None = None, overrides: Overrides = (), **sections: Any
 ) -> RunResult:
-    """Runs a survey and writes its run folder.
+    """Runs a survey and writes its run folder; returns status, metrics, trajectories and maps.
 
     Args:
-        scene: the survey.
         out: run folder to write, new or empty; default: the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new.
         overrides, sections: values of keys, as in `load_scenario`.
-
-    Returns:
-        Status, metrics and run folder of the survey, its trajectories and maps as arrays.
 
     Raises:
         ScenarioError: the survey cannot be carried out as described; nothing was written.
@@ -77,7 +73,6 @@ def plan(
     """Returns the predicted properties of a survey's plan over its floor, without a simulation.
 
     Args:
-        scene: the survey.
         picture: PNG file to draw the plan into.
         overrides, sections: values of keys, as in `load_scenario`.
 
@@ -109,7 +104,6 @@ def look(
     """Returns the stereo pair at one position, and every layer of light in its left image.
 
     Args:
-        scene: the survey.
         at_m: position of the left camera in the world [m]; default: the centre of the survey area, at its altitude.
         sheet: PNG file to draw all layers into.
         overrides, sections: values of keys, as in `load_scenario`.
@@ -136,25 +130,17 @@ def look(
 
 
 def load_run(folder: str | Path) -> RunResult:
-    """Returns a finished survey from its run folder.
-
-    Raises:
-        TwinError: it is not a run folder, a file is damaged, or the survey has not finished.
-    """
+    """Returns a finished survey from its run folder; raises TwinError if it is none, damaged, or not finished."""
     from twin.report.run_result import RunResult
 
     return RunResult.of_folder(folder)
 
 
 def compare(*runs: str | Path | RunResult) -> dict[str, Any]:
-    """Returns the metrics of several runs side by side and the keys in which their scenarios differ.
+    """Returns metrics side by side and the keys that differ in the scenarios; raises TwinError if one is not valid."""
+    from twin.report import run_comparison
 
-    Raises:
-        TwinError: a folder is not that of a run, or a run has no metrics.
-    """
-    from twin.report import comparison
-
-    return comparison.as_json(comparison.load_runs([_folder(run) for run in runs]))
+    return run_comparison.as_json(run_comparison.load_runs([_folder(run) for run in runs]))
 
 
 def export(run: str | Path | RunResult, formats: str | Sequence[str], out: str | Path | None = None) -> dict[str, Any]:
@@ -207,9 +193,6 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
         out: run folder to write, new or empty.
         options: calibration, truth, alignment and settings (`twin.recordings.replay.ReplayOptions`).
 
-    Returns:
-        Status, metrics and run folder of the replay, the trajectories and the map.
-
     Raises:
         TwinError: the data set or one of its files cannot be used (nothing was written), or the run folder is not
             empty, is written by another process, or cannot be written.
@@ -220,11 +203,7 @@ def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None =
 
 
 def _scenario(scene: str | Path | Scenario, overrides: Overrides, sections: Mapping[str, Any]) -> Scenario:
-    """Returns a scenario as it is, or loads it with values set.
-
-    Raises:
-        TwinError: values are given for a `Scenario`, which is complete.
-    """
+    """Returns a scenario as it is, or loads it; raises TwinError if values are given for a complete `Scenario`."""
     if isinstance(scene, str | Path):
         return load_scenario(scene, overrides, **sections)
     if overrides or sections:
@@ -249,7 +228,6 @@ def _texts(values: Overrides) -> Iterator[str]:
 
 
 def _toml(value: Any) -> Any:
-    """Returns a value as a TOML value on one line."""
     import tomlkit
 
     if hasattr(value, "tolist"):

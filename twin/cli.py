@@ -42,12 +42,10 @@ app.add_typer(reproductions, name="reproduce")
 
 
 def option(text: str, metavar: str | None = None, flag: str = "", **limits: Any) -> Any:
-    """Returns the declaration of an option with its help text; the flag is by default the name of the parameter."""
     return typer.Option(*([flag] if flag else []), metavar=metavar, help=text, **limits)
 
 
 def argument(text: str, metavar: str) -> Any:
-    """Returns the declaration of an argument with its help text and its name in the usage."""
     return typer.Argument(metavar=metavar, help=text)
 
 
@@ -207,8 +205,6 @@ def light(
 
 
 def _add_experiment(name: str, folder: str, text: str) -> None:
-    """Adds a command that runs one experiment of the paper, and prints its tables or, as JSON, its results."""
-
     @reproductions.command(name, help=text)
     def command(out: OutFolder = Path("runs") / folder, quick: Quick = False, as_json: SummaryJson = False) -> None:
         from twin.reproduce.catalogue import EXPERIMENTS
@@ -221,23 +217,14 @@ def _add_experiment(name: str, folder: str, text: str) -> None:
 
 
 for _name, _folder, _text in (
-    (
-        "paper",
-        "paper-mission",
-        "Fly the paper's mission of 25 tracks with and without alignment (Figs. 4 to 7); takes hours without --quick.",
-    ),
+    ("paper", "paper-mission",
+     "Fly the paper's mission of 25 tracks with and without alignment (Figs. 4 to 7); takes hours without --quick."),
     ("tank1", "tank1", "Survey objects in a tank with 130 stereo pairs on parallel legs (Figs. 9 and 10)."),
-    (
-        "tank2",
-        "tank2",
-        "Survey objects in a tank with 61 stereo pairs on two loops that touch at the start (Figs. 11 and 12).",
-    ),
-    (
-        "budget",
-        "budget",
-        "Measure the time of each module and compare it with the paper's budget at 30 Hz (section IV).",
-    ),
-):
+    ("tank2", "tank2",
+     "Survey objects in a tank with 61 stereo pairs on two loops that touch at the start (Figs. 11 and 12)."),
+    ("budget", "budget",
+     "Measure the time of each module and compare it with the paper's budget at 30 Hz (section IV)."),
+):  # fmt: skip
     _add_experiment(_name, _folder, _text)
 
 
@@ -399,7 +386,6 @@ def replay(
 
 
 def _preview(dataset: Path, options: Any, file: Path) -> None:
-    """Draws the first stereo pair of a data set and prints its measures."""
     from twin.recordings import preview as previewing
     from twin.recordings import replay as recorded
 
@@ -428,14 +414,14 @@ def compare(
     as_json: SummaryJson = False,
 ) -> None:
     """Compare runs: a table of metrics with differences from the first run, overlaid curves, one HTML page."""
-    from twin.report import comparison
+    from twin.report import run_comparison
 
-    runs = comparison.load_runs(folders)
+    runs = run_comparison.load_runs(folders)
     file = outputs.output_file(out)
     with outputs.writing(file):
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(comparison.render(runs), encoding="utf-8")
-    _show(as_json, comparison.as_json(runs), [("Comparison", comparison.text_rows(runs))], f"Page: {file}")
+        file.write_text(run_comparison.render(runs), encoding="utf-8")
+    _show(as_json, run_comparison.as_json(runs), [("Comparison", run_comparison.text_rows(runs))], f"Page: {file}")
 
 
 @app.command()
@@ -515,10 +501,7 @@ def schema() -> None:
 
 
 def exit_status(result: "RunResult | ReplayResult") -> int:
-    """Returns the exit status of a survey or a replay.
-
-    130 if it was interrupted; 1 if aborted for another reason, degraded, or if it misses a requirement; otherwise 0.
-    """
+    """Returns exit status 130 if interrupted; 1 if otherwise aborted, degraded, or missing a requirement; else 0."""
     if result.status == "aborted" and result.metrics["reason"].startswith("interrupted"):
         return INTERRUPTED
     missed = [r for r in result.metrics["require"].values() if not r["passed"]]
@@ -528,7 +511,6 @@ def exit_status(result: "RunResult | ReplayResult") -> int:
 def _run_survey(
     scene: str, overrides: list[str], out: Path | None, live: bool, allow_plugins: bool = False
 ) -> "RunResult":
-    """Loads and runs one survey with a progress bar; returns its result."""
     scenario = api.load_scenario(scene, overrides, allow_plugins)
     _require_rendering()
     from twin import survey  # imported here because it needs OpenGL
@@ -540,7 +522,6 @@ def _run_survey(
 
 
 def _conclude(result: "RunResult | ReplayResult", as_json: bool = False) -> NoReturn:
-    """Prints the result of a survey or replay and ends the program with its exit status."""
     if as_json:
         print(json.dumps(result.metrics, indent=1))
     else:
@@ -550,7 +531,6 @@ def _conclude(result: "RunResult | ReplayResult", as_json: bool = False) -> NoRe
 
 
 def _show(as_json: bool, tree: Any, tables: Iterable[tuple[str, list[tuple[str, ...]]]], last_line: str) -> None:
-    """Prints values as JSON, or else titled tables and a line."""
     if as_json:
         print(json.dumps(tree, indent=1))
         return
@@ -569,7 +549,6 @@ def _results_folder(out: Path, file: str) -> Iterator[None]:
 
 
 def _require_rendering() -> None:
-    """Prints the reason and exits with status 2 if this machine cannot render."""
     from twin.app.doctor import check_rendering
 
     check = check_rendering()

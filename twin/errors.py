@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class TwinError(Exception):
     """Invalid user input, an unwritable file or a missing system library, reported by the command line with status 2.
@@ -17,7 +20,6 @@ class TwinError(Exception):
         super().__init__(f"{field}: {problem}" + (f" (allowed: {allowed})" if allowed else ""))
 
     def __reduce__(self) -> tuple[type[TwinError], tuple[object, ...]]:
-        """Returns class and arguments, from which another process rebuilds the error."""
         return type(self), (self.field, self.problem, self.allowed)
 
 
@@ -44,3 +46,9 @@ def described(error: BaseException) -> str:
     """Returns the class and the message of an exception in one line of at most 300 characters."""
     text = "".join(letter if letter.isprintable() else "?" for letter in " ".join(str(error).split()))
     return (f"{type(error).__name__}: {text}" if text else type(error).__name__)[:300]
+
+
+def did_you_mean(word: str, names: Iterable[str]) -> str:
+    """Returns ` (did you mean NAME?)` with the name most similar to the word, or "" if none is similar."""
+    close = difflib.get_close_matches(word[:100], names, n=1)
+    return f" (did you mean {close[0]}?)" if close else ""

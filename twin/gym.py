@@ -37,9 +37,8 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     A step lasts from one keyframe to the next: `frames_per_step` frames, the last of which has both images. The
     estimators of the scenario run in the loop and give the believed pose. The truth is only in `info` and in the
-    reward. An episode is truncated after the last frame of the plan. It is terminated if the survey
-    is aborted, for example because the hull touches the floor, or if the left camera is outside the terrain at the end
-    of a step.
+    reward. An episode is truncated after the last frame of the plan. It is terminated if the survey is aborted, for
+    example because the hull touches the floor, or if the left camera is outside the terrain at the end of a step.
 
     Observation (dictionary):
         left, right: (H, W, 3) uint8 RGB, rectified stereo pair.
@@ -65,8 +64,6 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     Args:
         scenario: name or path of a scenario with imaging.fidelity = "rendered".
         overrides: strings "key=value" that replace values of the scenario.
-        action: kind of action.
-        reward: kind of reward.
         render_mode: None, or "rgb_array": `render` returns the stereo pair side by side.
 
     Raises:
@@ -111,16 +108,10 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Starts an episode and returns its first observation and its info.
+        """Starts an episode and returns its first observation and its info; `options` are not used.
 
-        Args:
-            seed: seed of the random generator of the environment, from which the seed of the scenario (floor, noise) is
-                drawn; None: the generator continues its sequence.
-            options: not used.
-
-        Raises:
-            ScenarioError: the survey cannot be flown with the drawn seed.
-            TwinError: the simulated world cannot be created.
+        The seed of the scenario (floor, noise) is drawn from the random generator of the environment, which `seed`
+        restarts. Raises ScenarioError if the survey cannot be flown with it, TwinError if the world cannot be created.
         """
         super().reset(seed=seed)
         self._frame = self._world.reset(int(self.np_random.integers(2**31)))
@@ -168,10 +159,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._world.close()
 
     def _command(self, values: Array) -> Array:
-        """Returns the command of the vehicle for one frame, given the values of an action in [-1, 1].
-
-        With the action "velocity", it also moves the target to which the controller steers.
-        """
+        """Returns the command of the vehicle for one frame; a velocity also moves the target of the controller."""
         if not self._velocity_action:
             return values
         interval_s, last = 1 / self._world.rig.frame_rate_hz, self._target
@@ -184,7 +172,6 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._steer(estimate, self._target)
 
     def _observation(self) -> Observation:
-        """Returns the observation at the current frame."""
         reference, pose = self._world.reference, self._estimate.world_from_camera
         readings, available = _readings(self._frame)
         return {
@@ -201,7 +188,6 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._world.capture().right if self._frame.right is None else self._frame.right
 
     def _info(self) -> dict[str, Any]:
-        """Returns the info of a step: time, truth, and the reason for a termination."""
         asked_m2 = float(self._asked.sum()) * self._world.mission.grid.cell_m**2
         truth = {
             "world_from_camera": self._world.true_pose,
@@ -211,15 +197,12 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {"time_s": self._frame.time_s, "truth": truth, "ended": self._ended}
 
     def _distance_to_plan_m(self) -> float:
-        """Returns the distance of the true left camera from its planned position [m]."""
         return float(np.linalg.norm(self._world.true_pose[:3, 3] - self._world.reference.position))
 
     def _seen_m2(self) -> float:
-        """Returns the part of the asked area that both cameras have seen in a keyframe [m2]."""
         return float((self._world.world.seen() & self._asked).sum()) * self._world.mission.grid.cell_m**2
 
     def _departure(self) -> str:
-        """Returns why the episode ends, if the camera left the terrain; otherwise ""."""
         x, y = self._world.true_pose[:2, 3]
         return "the camera left the terrain" if np.isnan(self._world.mission.terrain.height_at(x, y)) else ""
 

@@ -40,12 +40,7 @@ def kernel(function: Function, /) -> Function: ...
 @overload
 def kernel(**options: Any) -> Callable[[Function], Function]: ...
 def kernel(function: Any = None, /, **options: Any) -> Any:
-    """Compiles a function with `numba.njit` without the interpreter's lock and keeps the machine code on disk.
-
-    Args:
-        function: the function, where the decorator is used without options.
-        options: of `numba.njit`, apart from `cache` and `nogil`.
-    """
+    """Compiles a function with `numba.njit` (its `options`) without the interpreter's lock; keeps the code on disk."""
     if function is None:
         return lambda decorated: kernel(decorated, **options)
     dispatcher: Any = numba.njit(nogil=True, **options)(function)
@@ -62,7 +57,6 @@ class KernelLocator:
 
     @classmethod
     def from_function(cls, function: Callable[..., Any], file: str) -> KernelLocator | None:
-        """Returns the locator of a function, None where no folder can be written."""
         folder = _cache_folder(Path(file).resolve(), function.__module__)
         return cls(folder, function.__code__.co_firstlineno) if folder is not None else None
 
@@ -71,7 +65,6 @@ class KernelLocator:
         self._folder.mkdir(parents=True, exist_ok=True)
 
     def get_cache_path(self) -> str:
-        """Returns the folder."""
         return str(self._folder)
 
     def get_source_stamp(self) -> str:
@@ -98,10 +91,7 @@ def source_hash(file: Path) -> str:
 
 @cache
 def _cache_folder(file: Path, name: str) -> Path | None:
-    """Returns the folder of one module's compiled code, or None where no folder can be written.
-
-    The compiled code refers to the module by its name, which may differ between checkouts of the same sources.
-    """
+    """Returns the folder of a module's code, whose name may differ between checkouts; None if none can be written."""
     module = cache_root() / name
     folder = module / source_hash(file)
     try:
@@ -159,7 +149,6 @@ def _use_own_file_names(dispatcher: Any) -> None:
 
 
 def _reachable(file: Path) -> set[Path]:
-    """Returns the file and all files of the project that it imports, directly or not."""
     found, waiting = {file}, [file]
     while waiting:
         for imported in _imports(waiting.pop()) - found:
@@ -170,7 +159,6 @@ def _reachable(file: Path) -> set[Path]:
 
 @cache
 def _imports(file: Path) -> frozenset[Path]:
-    """Returns the project's files that a file imports, packages by their `__init__.py`."""
     names: set[str] = set()
     for dots, module, imported in _IMPORT.findall(file.read_text(encoding="utf-8")):
         package = _package_of(file, len(dots)) + module
@@ -179,13 +167,11 @@ def _imports(file: Path) -> frozenset[Path]:
 
 
 def _package_of(file: Path, level: int) -> str:
-    """Returns the package, with a final dot, that an import of this level starts from."""
     return _module_name(file.parents[level - 1] / "__init__.py").removesuffix("__init__") if level else ""
 
 
 @cache
 def _file_of(name: str) -> Path | None:
-    """Returns the source file of a module of the project, None for any other name."""
     path = _ROOT.joinpath(*name.split("."))
     candidates = (path.with_name(path.name + ".py"), path / "__init__.py")
     return next((candidate for candidate in candidates if candidate.is_file()), None)

@@ -11,12 +11,11 @@ from twin.core.records import Estimate, Frame
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted
-from twin.estimate.pipeline import Navigator
 from twin.report.frame_recorder import FrameRecorder, remove_keyframe_images
 from twin.report.run_result import RunResult
 from twin.report.run_writer import OPTIONAL_OUTPUTS, RunFolder
 from twin.scenario.model import Scenario
-from twin.session.assembly import make_navigator, open_world
+from twin.session.assembly import Estimators, make_navigator, open_world
 from twin.session.conclusion import Estimation, conclude
 from twin.session.flown_survey import FlownSurvey
 from twin.session.mission_actions import MissionActions
@@ -39,21 +38,14 @@ def run(
 
     An interrupt (Ctrl-C) during the flight ends the flight. A later interrupt ends only the current stage: alignment,
     elevation map, orthomosaic, evaluation, map files, report or recording. The results of all other stages are written,
-    and metrics.json in any case.
+    and metrics.json in any case. Errors are those of `twin.run`.
 
     Args:
-        scenario: description of the survey.
-        out: run folder, new or empty.
         progress: function called with the progress during the later stages and after every frame, except frames between
             keyframes that the compiled loop of a surrogate survey simulates.
         live: whether to show the survey in Rerun while it runs.
         outputs: outputs to write in addition to metrics, trajectories and maps: "report", "recording", both or none of
             them. None: write the metrics only.
-
-    Raises:
-        ScenarioError: the scenario cannot be flown; nothing was written.
-        TwinError: the run folder is not empty, another process writes it, it or metrics.json cannot be written, or the
-            world cannot be created.
     """
     with sole_writer(out), one_blas_thread():
         return _run(prepare(scenario), out, progress, live, outputs)
@@ -66,7 +58,6 @@ def _run(
     live: bool,
     outputs: Collection[str] | None,
 ) -> RunResult:
-    """Runs a survey as `run` does, in a folder that this process has locked."""
     scenario, stopwatch, guard = mission.scenario, Stopwatch(), StageGuard()
     images = scenario.imaging.fidelity == "rendered" and outputs is not None
     with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
@@ -92,7 +83,6 @@ def _run(
 
 
 def _log_warnings(mission: Mission, world: World, folder: RunFolder) -> None:
-    """Logs the limits of the floor and of the simulation."""
     if (share := mission.terrain.orthophoto_share) is not None and share < 1.0:
         folder.log("orthophoto covers a part of the floor; the rest has the other texture", share=round(share, 4))
     for warning in (*mission.terrain.hole_notes, *world.warnings):
@@ -102,7 +92,7 @@ def _log_warnings(mission: Mission, world: World, folder: RunFolder) -> None:
 def fly(
     mission: Mission,
     world: World,
-    navigator: Navigator,
+    navigator: Estimators,
     observe: Callable[[Estimate, Frame], None],
     actions: MissionActions | None = None,
 ) -> None:
@@ -111,9 +101,6 @@ def fly(
     After each track, the vehicle keeps station while the navigator runs a global alignment.
 
     Args:
-        mission: the survey to fly.
-        world: simulates the vehicle, which executes the commands, and returns the frames.
-        navigator: estimates the pose from the frames.
         observe: called with the estimate and its frame after every update of the navigator; not called for frames
             between keyframes that the compiled loop of a surrogate survey simulates.
         actions: chooses the pace along the path: the vehicle slows down or stops if tracking is poor or lost, until

@@ -28,7 +28,6 @@ _SHIFT_PX = 12  # of the images from frame to frame
 
 
 def survey(folder: Path) -> None:
-    """Flies a small survey."""
     from twin.scenario.file import load_scenario
     from twin.survey import run
 
@@ -53,7 +52,6 @@ def estimators(folder: Path) -> ElevationMap | None:
 
 
 def _frames(rig: StereoRig, depth_m: float) -> Iterator[Frame]:
-    """Yields frames of a camera that moves sideways above a flat floor, with readings."""
     import cv2
     import numpy as np
 

@@ -20,17 +20,20 @@ class Mesh(NamedTuple):
 
 def mesh_of(vertices_m: ArrayLike, faces: ArrayLike, albedo: ArrayLike) -> Mesh:
     """Returns a mesh of vertices (n, 3) and faces (m, 3) with the albedo (3,) or (n, 3), limited to 0 to 1."""
-    vertices = np.asarray(vertices_m, np.float64)
-    colours = np.broadcast_to(np.clip(np.asarray(albedo, np.float64), 0, 1) * 255, vertices.shape)
+    return with_colours(vertices_m, faces, np.rint(np.clip(np.asarray(albedo, np.float64), 0, 1) * 255))
+
+
+def with_colours(vertices_m: ArrayLike, faces: ArrayLike, colours: ArrayLike) -> Mesh:
+    """Returns a mesh whose colours, 0 to 255, are one for each vertex or one for all."""
+    vertices = np.asarray(vertices_m)
     return Mesh(
         np.ascontiguousarray(vertices, np.float32),
         np.ascontiguousarray(faces, np.int32),
-        np.ascontiguousarray(np.rint(colours), np.uint8),
+        np.ascontiguousarray(np.broadcast_to(colours, vertices.shape), np.uint8),
     )
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Returns one mesh of all triangles of several meshes."""
     first = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     faces = [mesh.faces + np.int32(k) for mesh, k in zip(meshes, first, strict=False)]
     return Mesh(
@@ -41,7 +44,6 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def standing(mesh: Mesh) -> Mesh:
-    """Returns the mesh moved so that its lowest point has z = 0, and the centre of its extent in x and y is 0."""
     low, high = extent(mesh)
     origin = np.append((low + high)[:2] / 2, low[2])
     return mesh._replace(vertices_m=(mesh.vertices_m - origin).astype(np.float32))
@@ -56,7 +58,7 @@ def welded_faces(mesh: Mesh) -> NDArray[np.int64]:
 
 
 def is_closed(mesh: Mesh) -> bool:
-    """Returns whether a mesh encloses a volume and all its triangles face outwards, so that back faces are hidden."""
+    """Returns whether a mesh encloses a volume with all triangles facing outwards, so that back faces are hidden."""
     faces, n = welded_faces(mesh), len(mesh.vertices_m)
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     there, back = np.sort(start * n + end), np.sort(end * n + start)
@@ -66,15 +68,13 @@ def is_closed(mesh: Mesh) -> bool:
 
 
 def extent(mesh: Mesh) -> tuple[Array, Array]:
-    """Returns the minimum and maximum corner (3,) of the bounding box [m]."""
     return mesh.vertices_m.min(axis=0).astype(np.float64), mesh.vertices_m.max(axis=0).astype(np.float64)
 
 
 def median_edge_m(mesh: Mesh) -> float:
     """Returns the median length of the edges of the triangles [m].
 
-    Edges shorter than a millionth of the largest extent, as of degenerate triangles, count only if all are; then the
-    result is that millionth.
+    Edges shorter than a millionth of the largest extent count only if all are; then the result is that millionth.
     """
     corners = mesh.vertices_m[mesh.faces]
     lengths_m = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)

@@ -27,16 +27,12 @@ NO_GROUP = -1  #: `PlacedObject.group` of a tile
 
 
 class FloorTile(NamedTuple):
-    """Part of a mesh floor with one texture."""
-
     placed: PlacedObject  #: the triangles as an object
     texture: int  #: number of its texture in `FloorTiles.textures`; -1: the colours of the vertices
     uv: NDArray[np.float32]  #: (n, 3) texture coordinates of its vertices (across, down), and side of a texel there [m]
 
 
 class FloorTiles(NamedTuple):
-    """Mesh floor in tiles, with its textures."""
-
     tiles: tuple[FloorTile, ...]
     textures: Textures
 
@@ -44,8 +40,7 @@ class FloorTiles(NamedTuple):
 def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
     """Returns a mesh as read from a file in metres with its upper side up, centred at x = y = 0.
 
-    A mesh encloses a volume, or is an open sheet. Its triangles are turned over if the volume is negative, or if most
-    of the area of a sheet, projected onto a level plane, faces down.
+    Triangles are turned over if the volume is negative, or if most of the area of an open sheet faces down.
     """
     vertices, faces = read.mesh.vertices_m.astype(np.float64) * scale, read.mesh.faces
     a, b, c = np.moveaxis(vertices[faces] - vertices.mean(axis=0), 1, 0)
@@ -62,11 +57,8 @@ def levelled(read: TexturedMesh, scale: float) -> TexturedMesh:
 def divided(whole: TexturedMesh) -> TexturedMesh:
     """Returns a mesh whose long edges are halved until none is longer than allowed, without cracks.
 
-    The limit is LONGEST_EDGE_M, or a 400th of the largest extent of the mesh if that is longer. The rasterizer leaves
-    out a triangle with a corner behind the camera, so that no triangle should be large.
-
-    Raises:
-        ValueError: more than MAX_DIVIDED triangles would be needed.
+    The limit is LONGEST_EDGE_M, or a 400th of the largest extent if that is longer: the rasterizer leaves out a
+    triangle with a corner behind the camera. Raises ValueError if more than MAX_DIVIDED triangles would be needed.
     """
     longest_m = max(LONGEST_EDGE_M, float(np.ptp(whole.mesh.vertices_m, axis=0).max()) / 400)
     while True:
@@ -81,10 +73,7 @@ def divided(whole: TexturedMesh) -> TexturedMesh:
 
 
 def _halved(whole: TexturedMesh, long: NDArray[np.bool_]) -> TexturedMesh:
-    """Returns a mesh with the marked edges (m, 3) halved; edge k of a triangle joins its corners k and k + 1.
-
-    A triangle with one, two or three halved edges becomes two, three or four triangles.
-    """
+    """Returns a mesh with the marked edges (m, 3) halved; edge k of a triangle joins its corners k and k + 1."""
     mesh, n = whole.mesh, len(whole.mesh.vertices_m)
     ends = np.sort(np.stack([mesh.faces, np.roll(mesh.faces, -1, axis=1)], axis=2)[long], axis=1)
     pairs, number = np.unique(ends, axis=0, return_inverse=True)
@@ -118,26 +107,20 @@ def _halved(whole: TexturedMesh, long: NDArray[np.bool_]) -> TexturedMesh:
 
 
 def raised(whole: TexturedMesh, height_m: float) -> TexturedMesh:
-    """Returns a mesh moved up by a height [m]."""
     vertices = whole.mesh.vertices_m + np.array([0, 0, height_m], np.float32)
     return whole._replace(mesh=whole.mesh._replace(vertices_m=vertices))
 
 
 def upward_part(mesh: Mesh) -> Mesh:
-    """Returns the mesh without the triangles that are vertical or face down."""
     return mesh._replace(faces=mesh.faces[_upward_m2(mesh.vertices_m.astype(np.float64), mesh.faces) > 0])
 
 
 def downward_part(mesh: Mesh) -> Mesh:
-    """Returns the mesh without the triangles that are vertical or face up."""
     return mesh._replace(faces=mesh.faces[_upward_m2(mesh.vertices_m.astype(np.float64), mesh.faces) < 0])
 
 
 def tiles_of(whole: TexturedMesh) -> FloorTiles:
-    """Returns a mesh floor in square tiles, separate ones for each texture.
-
-    A triangle belongs to the tile of its texture in which its centre lies.
-    """
+    """Returns a mesh floor in square tiles by the centres of the triangles, separate ones for each texture."""
     mesh, texture = whole.mesh, whole.texture
     centres = mesh.vertices_m[mesh.faces].mean(axis=1)[:, :2]
     side_m = TILE_M
@@ -158,7 +141,6 @@ def _tile(
     mesh: Mesh, part: NDArray[np.int64], uv: NDArray[np.float32], colours: list[tuple[NDArray[np.uint8], float]],
     texture: int,
 ) -> FloorTile:  # fmt: skip
-    """Returns the tile of the triangles with the numbers `part`."""
     used, faces = np.unique(mesh.faces[part], return_inverse=True)
     kept = colours if texture < 0 else colours[:1]
     faces = np.ascontiguousarray(faces.reshape(-1, 3), np.int32)
@@ -170,8 +152,7 @@ def _tile(
 def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
     """Returns (n, 3): texture coordinates of the vertices, from the upper left corner, and side of a texel there [m].
 
-    The side of a texel is the root of the ratio of the areas of a triangle on the floor and in the texture; at a
-    vertex, it is the mean over its triangles.
+    This is the root of the ratio of the areas of a triangle on the floor and in the texture, at a vertex the mean.
     """
     mesh, n = whole.mesh, len(whole.mesh.vertices_m)
     corners, places = mesh.vertices_m[mesh.faces].astype(np.float64), whole.uv[mesh.faces].astype(np.float64)
@@ -187,9 +168,9 @@ def _texture_places(whole: TexturedMesh) -> NDArray[np.float32]:
 
 
 def _colour_levels(whole: TexturedMesh) -> list[tuple[NDArray[np.uint8], float]]:
-    """Returns pairs of colours (n, 3) of the vertices and the side [m] of the cells over which they are averaged.
+    """Returns colours (n, 3) of the vertices, each with the side [m] of the cells over which they are averaged.
 
-    The first pair has the colours themselves and the side 0; there are no others if every triangle has a texture.
+    There are no others if every triangle has a texture.
     """
     mesh = whole.mesh
     levels, cell_m = [(mesh.colours, 0.0)], np.inf if (whole.texture >= 0).all() else median_edge_m(mesh)

@@ -15,7 +15,7 @@ from twin.core.geometry import Array
 from twin.core.user_files import IMAGE_FORMATS, reading
 from twin.errors import TwinError
 from twin.terrains.file_header import eight_bits
-from twin.terrains.objects.coloured_mesh import Mesh, joined, welded_faces
+from twin.terrains.objects.coloured_mesh import Mesh, joined, welded_faces, with_colours
 from twin.terrains.objects.mesh_header import FORMATS, face_count
 
 MAX_FACES = 2_000_000  #: a mesh takes about 100 bytes per triangle, with its levels of detail
@@ -29,27 +29,24 @@ class TexturedMesh(NamedTuple):
     """Mesh whose triangles have the colours of textures or of their vertices."""
 
     mesh: Mesh  #: triangles, with the colours of their vertices; a vertex without a colour is white
-    #: (n, 2) float32 texture coordinates of the vertices, which increase to the right and upwards; textures repeat
-    #: beyond 0 to 1
+    #: (n, 2) float32 texture coordinates, which increase to the right and upwards; textures repeat beyond 0 to 1
     uv: NDArray[np.float32]
     texture: NDArray[np.int32]  #: (m,) number, from 0, of the texture of each triangle; -1: the colours of its vertices
     images: tuple[NDArray[np.uint8], ...]  #: the textures, (h, w, 3) each
 
 
 def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: bool = False) -> Mesh:
-    """Returns the mesh of a file, in the unit of the file; a mesh far from the origin is moved to it.
+    """Returns the mesh of a PLY, OBJ or GLB file, in its unit; a mesh far from the origin is moved to it.
 
     A mesh may be open, as photogrammetric models are, but no edge may belong to more than two triangles. A texture is
     sampled at the vertices, after the triangles have been divided.
 
     Args:
-        file: path of a PLY, OBJ or GLB file.
         field: scenario key of the file, for error messages.
         albedo: albedo of a mesh without colours, 0 to 1.
         y_up: whether y of the file points up, instead of z.
     Raises:
-        TwinError: the file is missing, unreadable, too large, or is a mesh without triangles, without extent or not
-            manifold.
+        TwinError: the file is missing, unreadable or too large, has no triangles or extent, or is not manifold.
     """
     grey = np.rint(np.asarray(albedo) * 255)
     with _parts_of(file, field) as parts:
@@ -58,11 +55,7 @@ def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: 
 
 
 def read_textured_mesh(file: Path, field: str, y_up: bool = False) -> TexturedMesh:
-    """Returns the mesh of a file with its textures; arguments, unit and errors are those of `read_mesh`.
-
-    Raises:
-        TwinError: also if the mesh has neither textures nor colours.
-    """
+    """Returns the mesh of a file with its textures, as `read_mesh`; raises TwinError also if it has no colours."""
     meshes, uvs, numbers, images, coloured = [], [], [], [], False
     with _parts_of(file, field) as parts:
         for part in parts:
@@ -76,7 +69,7 @@ def read_textured_mesh(file: Path, field: str, y_up: bool = False) -> TexturedMe
                 number = next((k for k, other in enumerate(images) if other is image), len(images))
                 images += [image] if number == len(images) else []
             coloured = coloured or found is not None or colours is not None
-            meshes.append(_mesh(part.vertices, part.faces, 255 if colours is None else colours))
+            meshes.append(with_colours(part.vertices, part.faces, 255 if colours is None else colours))
             uvs.append(uv)
             numbers.append(np.full(len(part.faces), number, np.int32))
     mesh = _checked(meshes, file, field, y_up)
@@ -98,7 +91,6 @@ def _parts_of(file: Path, field: str) -> Iterator[list[Any]]:
 
 
 def _loaded(file: Path, field: str) -> list[Any]:
-    """Returns the trimesh meshes of a file, in its axes."""
     import trimesh  # imported here: it takes 0.3 s, and most scenarios have no mesh files
     from PIL import Image
     from trimesh.resolvers import FilePathResolver
@@ -128,8 +120,8 @@ def _loaded(file: Path, field: str) -> list[Any]:
 def _near_origin(parts: list[Any]) -> list[Any]:
     """Returns trimesh meshes, moved together so that the centre of their bounding box is the origin if it is far off.
 
-    It is far off if the magnitude of one of its coordinates exceeds 8 times the largest side of the box. Georeferenced
-    models have coordinates of 1e5 to 1e7 m, which single precision rounds to steps of up to 1 m.
+    It is if one of its coordinates exceeds 8 times the largest side of the box. Georeferenced models have coordinates
+    of 1e5 to 1e7 m, which single precision rounds to steps of up to 1 m.
     """
     corners = [np.asarray(part.vertices) for part in parts if len(part.vertices)]
     if not corners:
@@ -143,37 +135,24 @@ def _near_origin(parts: list[Any]) -> list[Any]:
 
 
 def _coloured(part: Any, grey: Array, most_faces: int) -> Mesh:
-    """Returns a trimesh mesh with the colours of its texture, vertices or material; `grey` (3,) if it has none.
-
-    All triangles of a textured mesh are divided into four, repeatedly, as long as this makes at most `most_faces`.
-    """
+    """Returns a mesh with the colours of texture (divided up to `most_faces`), vertices or material, else `grey`."""
     import trimesh
 
     if (texture := _texture_of(part)) is None:
         colours = _own_colours(part)
-        return _mesh(part.vertices, part.faces, grey if colours is None else colours)
+        return with_colours(part.vertices, part.faces, grey if colours is None else colours)
     image, uv = texture
     vertices, faces, at = np.asarray(part.vertices), np.asarray(part.faces), {"uv": np.asarray(uv)}
     while 0 < len(faces) * 4 <= most_faces:
         divided: Any = trimesh.remesh.subdivide(vertices, faces, vertex_attributes=at)
         vertices, faces, at = divided
-    return _mesh(vertices, faces, _sampled(_rgb(image), at["uv"]))
-
-
-def _mesh(vertices: Any, faces: Any, colours: Any) -> Mesh:
-    """Returns a mesh whose colours, 0 to 255, are one for each vertex or one for all."""
-    return Mesh(
-        np.ascontiguousarray(vertices, np.float32),
-        np.ascontiguousarray(faces, np.int32),
-        np.ascontiguousarray(np.broadcast_to(colours, (len(vertices), 3)), np.uint8),
-    )
+    return with_colours(vertices, faces, _sampled(_rgb(image), at["uv"]))
 
 
 def _own_colours(part: Any) -> Any:
     """Returns the colours of the vertices (n, 3) or of the glTF material (3,), 0 to 255; None if it has neither.
 
-    The baseColorFactor of a material is used without a texture only: trimesh, for example, writes textures with a
-    factor of 0.4 that is not intended.
+    The factor of a material with a texture is not used: trimesh writes one of 0.4 that is not intended.
     """
     if hasattr(part.visual, "vertex_colors") and part.visual.defined:
         return np.asarray(part.visual.vertex_colors)[:, :3]
@@ -193,10 +172,7 @@ def _texture_of(part: Any) -> tuple[Any, Any] | None:
 
 
 def _rgb(image: Any) -> NDArray[np.uint8]:
-    """Returns the colours (h, w, 3) of a PIL image; grey levels of 16 bits become 8 bits.
-
-    Pillow gives grey images of 16 bits a mode of integers ("I;16", "I"), whose conversion to RGB clips at 255.
-    """
+    """Returns the colours (h, w, 3) of a PIL image; 16-bit grey, which Pillow would clip at 255, is scaled."""
     if not image.mode.startswith("I"):
         return np.asarray(image.convert("RGB"), np.uint8)
     values = np.clip(np.asarray(image), 0, 65535)
@@ -212,7 +188,6 @@ def _sampled(image: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
 
 
 def _checked(meshes: list[Mesh], file: Path, field: str, y_up: bool) -> Mesh:
-    """Returns the joined meshes with z up; raises TwinError if they have a problem."""
     if not meshes:
         raise TwinError(field, f"{file.name!r} has no triangles", FORMATS)
     mesh = joined(meshes)
@@ -223,7 +198,6 @@ def _checked(meshes: list[Mesh], file: Path, field: str, y_up: bool) -> Mesh:
 
 
 def _problem(mesh: Mesh) -> tuple[str, str] | None:
-    """Returns why a mesh cannot be used, and what is allowed; None if it can."""
     if len(mesh.faces) > MAX_FACES:
         return f"has {len(mesh.faces)} triangles", f"at most {MAX_FACES} triangles"
     if mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices_m):
@@ -239,7 +213,7 @@ def _problem(mesh: Mesh) -> tuple[str, str] | None:
 
 
 def crowded_edges(mesh: Mesh) -> int:
-    """Returns the number of edges that belong to more than two triangles; equal positions count as one corner."""
+    """Returns the number of edges that belong to more than two triangles; equal positions are one corner."""
     faces = welded_faces(mesh)
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
     _, count = np.unique(edges[:, 0] * (len(mesh.vertices_m) + 1) + edges[:, 1], return_counts=True)

@@ -14,12 +14,7 @@ _LONGEST_JSON = 16_777_216  # largest number of bytes of the description in a GL
 
 
 def face_count(file: Path) -> int:
-    """Returns the number of triangles that a PLY, OBJ or GLB file declares; each face of a PLY file counts as one.
-
-    Raises:
-        ValueError: the file is not a mesh of a known format; the message states why.
-        OSError: the file cannot be read.
-    """
+    """Returns the number of triangles that a file declares (of a PLY file, of faces); ValueError for other formats."""
     counters = {".ply": _ply_faces, ".obj": _obj_faces, ".glb": _glb_faces}
     if file.suffix.lower() not in counters:
         raise ValueError("is not a mesh file")
@@ -27,7 +22,6 @@ def face_count(file: Path) -> int:
 
 
 def _ply_faces(file: Path) -> int:
-    """Returns the number of faces in a PLY header; raises ValueError if it or its element `face` is missing."""
     with file.open("rb") as stream:
         header = stream.read(_LONGEST_HEADER)
     if not header.startswith(b"ply") or b"end_header" not in header:
@@ -40,7 +34,6 @@ def _ply_faces(file: Path) -> int:
 
 
 def _obj_faces(file: Path) -> int:
-    """Returns the number of triangles of an OBJ file; a face with n corners counts as n - 2."""
     count = 0
     with file.open("rb") as stream:
         while line := stream.readline(_LONGEST_HEADER):
@@ -50,10 +43,7 @@ def _obj_faces(file: Path) -> int:
 
 
 def _glb_faces(file: Path) -> int:
-    """Returns the number of triangles of a binary glTF file, from the accessors of its meshes.
-
-    A mesh counts once for each node that places it; a mesh that no node places counts once, because it is loaded too.
-    """
+    """Returns the number of triangles of a binary glTF file: a mesh counts for each node that places it."""
     with file.open("rb") as stream:
         start = stream.read(20)
         if len(start) < 20 or start[:4] != b"glTF" or start[16:] != b"JSON":

@@ -12,10 +12,7 @@ from twin.terrains.objects.detail import Level, levels_of
 
 
 class ObjectModel(NamedTuple):
-    """Shape that several objects share, or a tile of a mesh floor.
-
-    A shape stands on the plane z = 0 and is centred at x = y = 0; a tile has world coordinates.
-    """
+    """Shape of objects, standing on z = 0 and centred at x = y = 0, or a tile of a mesh floor in world coordinates."""
 
     levels: tuple[Level, ...]  #: levels of detail, finest first
     low_m: Array  #: (3,) minimum and maximum corner of the bounding box
@@ -27,13 +24,10 @@ class ObjectModel(NamedTuple):
 
     @property
     def size_m(self) -> float:
-        """Returns the largest extent along x, y or z [m]."""
         return float((self.high_m - self.low_m).max())
 
 
 class PlacedObject(NamedTuple):
-    """One object in the world."""
-
     model: ObjectModel
     world_from_object: Array  #: (4, 4) pose, with its rotation multiplied by the scale
     scale: float  #: size in the world divided by the size of the model
@@ -42,12 +36,10 @@ class PlacedObject(NamedTuple):
 
     @property
     def centre_m(self) -> Array:
-        """Returns the centre (3,) of the bounding sphere in the world [m]."""
         return self.world_from_object[:3, :3] @ self.model.centre_m + self.world_from_object[:3, 3]
 
     @property
     def radius_m(self) -> float:
-        """Returns the radius of the bounding sphere [m]."""
         return self.scale * self.model.radius_m
 
     def corners_m(self) -> Array:
@@ -57,13 +49,11 @@ class PlacedObject(NamedTuple):
 
 
 def model_of(mesh: Mesh, sways: bool = False) -> ObjectModel:
-    """Returns the model of a mesh, moved so that it stands at the origin."""
     mesh = standing(mesh)
     return model_with(levels_of(mesh), sways, is_closed(mesh))
 
 
 def model_with(levels: tuple[Level, ...], sways: bool = False, closed: bool = False) -> ObjectModel:
-    """Returns the model with these levels of detail, whose first has the full geometry."""
     low, high = extent(levels[0].mesh)
     centre = (low + high) / 2
     radius_m = float(np.linalg.norm(levels[0].mesh.vertices_m - centre, axis=1).max())

@@ -16,7 +16,7 @@ SPHERE_DIVISIONS = 5  #: times that each of the 20 faces of an icosahedron is di
 
 
 def sphere() -> Surface:
-    """Returns vertices (n, 3) and faces (m, 3) of a unit sphere with nearly equal triangles."""
+    """Returns a unit sphere with nearly equal triangles."""
     import trimesh  # imported here: it takes 0.3 s, and most scenarios have no objects
 
     ball = trimesh.creation.icosphere(subdivisions=SPHERE_DIVISIONS, radius=1.0)
@@ -45,25 +45,20 @@ def tube(path: Array, radius: Array, n_sides: int) -> Surface:
 
 
 def ring_faces(n_rings: int, n_sides: int, closed: bool = False) -> Faces:
-    """Returns the triangles (m, 3) between consecutive rings of vertices, which are numbered ring by ring.
-
-    With `closed`, there are triangles between the last and the first ring too.
-    """
+    """Returns the triangles (m, 3) between rings of vertices, numbered ring by ring; `closed`: also last to first."""
     ring = np.arange(n_rings * n_sides).reshape(n_rings, n_sides)
     lower, upper = (ring, np.roll(ring, -1, axis=0)) if closed else (ring[:-1], ring[1:])
     return quad_faces(lower, np.roll(lower, -1, axis=1), np.roll(upper, -1, axis=1), upper)
 
 
 def quad_faces(a: Faces, b: Faces, c: Faces, d: Faces) -> Faces:
-    """Returns the triangles (m, 3) of quadrilaterals with the corners a, b, c, d, split from a to c."""
     return np.stack([a, b, c, a, c, d], axis=-1).reshape(-1, 3)
 
 
 def turned(profile: Array, n_sides: int) -> Surface:
     """Returns a surface of revolution about z.
 
-    `profile` (k, 2) has the radii, all positive, and heights along a closed outline, counter-clockwise with the radius
-    to the right.
+    `profile` (k, 2) has positive radii, and heights, along a closed outline, counter-clockwise, radius to the right.
     """
     angle = 2 * np.pi * np.arange(n_sides) / n_sides
     radius, height = profile[:, :1], profile[:, 1:]
@@ -72,7 +67,6 @@ def turned(profile: Array, n_sides: int) -> Surface:
 
 
 def resampled(outline: Array, n: int) -> Array:
-    """Returns n points (n, 2) at equal distances along a closed outline (k, 2)."""
     closed = np.concatenate([outline, outline[:1]])
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(closed, axis=0), axis=1))])
     at = np.arange(n) / n * along[-1]
@@ -80,7 +74,7 @@ def resampled(outline: Array, n: int) -> Array:
 
 
 def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
-    """Returns a box of extents `size` with its centre at the origin, its sides divided into `n` cells along x, y, z."""
+    """Returns a box of extents `size` about the origin, its sides divided into `n` cells along x, y, z."""
     parts, faces, count = [], [], 0
     for axis in range(3):
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -99,8 +93,7 @@ def box(size: tuple[float, float, float], n: tuple[int, int, int]) -> Surface:
 def noise(points: Array, coarsest: float, octaves: int, rng: np.random.Generator, gain: float = 0.5) -> Array:
     """Returns smooth random values (n,) at points (n, 3), with a standard deviation of about 1.
 
-    Each octave is a sum of plane waves with random directions and phases; octave k has the wavelength coarsest / 2^k
-    and the amplitude gain^k.
+    Each octave is a sum of plane waves; octave k has the wavelength coarsest / 2^k and the amplitude gain^k.
     """
     total, power = np.zeros(len(points)), 0.0
     for k in range(octaves):
@@ -114,9 +107,6 @@ def noise(points: Array, coarsest: float, octaves: int, rng: np.random.Generator
 
 
 def mottled(albedo: Array, points: Array, contrast: float, rng: np.random.Generator) -> Array:
-    """Returns a random albedo (n, 3) at points (n, 3) with the mean `albedo`, (3,) or (n, 3).
-
-    Its relative standard deviation is about `contrast`.
-    """
+    """Returns a random albedo (n, 3) at points (n, 3) with the mean `albedo` and the relative deviation `contrast`."""
     values = 0.7 * noise(points, 0.25, 4, rng, gain=0.8) + 0.7 * rng.standard_normal(len(points))
     return albedo * np.exp(contrast * values - contrast**2 / 2)[:, None]

@@ -21,8 +21,6 @@ TRIES = (8, 64, 512)  #: sizes of the batches of random positions that are tried
 
 
 class Disc(NamedTuple):
-    """Circle in the x-y plane that encloses an object [m]."""
-
     x_m: float
     y_m: float
     radius_m: float
@@ -52,7 +50,6 @@ def place(
 
 
 def disc_of(item: PlacedObject) -> Disc:
-    """Returns the circle in the x-y plane around the bounding box of an object."""
     corners = item.corners_m()[:, :2]
     centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
     return Disc(float(centre[0]), float(centre[1]), float(np.linalg.norm(np.ptp(corners, axis=0)) / 2))
@@ -66,15 +63,12 @@ def slope_deg(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array
 
 
 class _Entry(NamedTuple):
-    """An entry of `[[objects]]` on a terrain, with its random generator."""
-
     number: int
     group: ObjectConfig
     terrain: Terrain
     rng: np.random.Generator
 
     def scattered(self, models: Sequence[ObjectModel], taken: Sequence[PlacedObject]) -> list[PlacedObject]:
-        """Returns objects at random positions that do not overlap each other or the objects in `taken`."""
         field = f"objects.{self.number}.per_m2"
         low, high = self._region()
         n = self._count(low, high, field)
@@ -103,8 +97,8 @@ class _Entry(NamedTuple):
     def at(self, model: ObjectModel, scale: float, position_m: tuple[float, float]) -> PlacedObject:
         """Returns an object at a position (x, y) [m].
 
-        Where the group gives no height, the object stands on the floor, sunk by a share of its height; where it gives
-        no heading, the heading is random. An object that is not upright is tilted to the normal of the floor.
+        Without a given height it stands on the floor, sunk by a share of its height; without a heading, that is random.
+        An object that is not upright is tilted to the normal of the floor.
         """
         (x, y), group, terrain = position_m, self.group, self.terrain
         heading, phase = self.rng.uniform(0, 2 * np.pi, 2)
@@ -125,7 +119,6 @@ class _Entry(NamedTuple):
         return PlacedObject(model, pose, float(scale), self.number, float(phase))
 
     def _region(self) -> tuple[Array, Array]:
-        """Returns the south-west and the north-east corner (2,) [m] of the area in which objects are scattered."""
         terrain, group = self.terrain, self.group
         low, high = np.array([terrain.west_m, terrain.south_m]), np.array([terrain.east_m, terrain.north_m])
         if group.area_m is None:
@@ -134,10 +127,7 @@ class _Entry(NamedTuple):
         return np.maximum(low, centre - half), np.minimum(high, centre + half)
 
     def _count(self, low: Array, high: Array, field: str) -> int:
-        """Returns the number of scattered objects: their density times the area of the ground that they may stand on.
-
-        Raises TwinError if there are none or too many.
-        """
+        """Returns density times area of ground; raises TwinError if there are no or too many objects."""
         group = self.group
         assert group.per_m2 is not None
         area_m2 = float(np.maximum(high - low, 0).prod())
@@ -153,17 +143,16 @@ class _Entry(NamedTuple):
         return n
 
     def _on_ground(self, x_m: Array, y_m: Array, reach_m: float) -> NDArray[np.bool_]:
-        """Returns whether the slope of the floor at each point is one on which the objects of the group may stand."""
         if self.group.on == "anywhere":
             return np.isfinite(self.terrain.height_at(x_m, y_m))
         slope = slope_deg(self.terrain, x_m, y_m, reach_m)
         return slope < STEEP_DEG if self.group.on == "sand" else slope >= STEEP_DEG
 
     def _free_position(self, low: Array, high: Array, radius_m: float, around: Array) -> tuple[float, float] | None:
-        """Returns a random position (x, y) [m] where an object may stand; None if none is found.
+        """Returns a random position (x, y) [m] between two corners where an object may stand; None if none is found.
 
-        The position lies between the corners `low` and `high`, at least `group.spacing_m` from the centres of the
-        circles `around` (n, 3): x, y, radius [m]. The circle of radius `radius_m` about it overlaps none of them.
+        It is at least `group.spacing_m` from the centres of the circles `around` (n, 3): x, y, radius [m], and the
+        circle of radius `radius_m` about it overlaps none of them.
         """
         if (low >= high).any():
             return None
@@ -197,14 +186,10 @@ def _tilt(terrain: Terrain, x: float, y: float, reach_m: float) -> Array:
 
 
 def _check_inside(item: PlacedObject, terrain: Terrain, field: str) -> None:
-    """Raises TwinError if an object is outside the terrain or reaches over its edge."""
     corners = item.corners_m()
     low, high = corners.min(axis=0), corners.max(axis=0)
     inside = low[0] >= terrain.west_m and low[1] >= terrain.south_m
     if inside and high[0] <= terrain.east_m and high[1] <= terrain.north_m:
         return
     extent = f"x {low[0]:.2f} to {high[0]:.2f}, y {low[1]:.2f} to {high[1]:.2f} m"
-    raise TwinError(
-        field, f"the object reaches beyond the terrain: {extent}",
-        f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m",
-    )  # fmt: skip
+    raise TwinError(field, f"the object reaches beyond the terrain: {extent}", terrain.extent)

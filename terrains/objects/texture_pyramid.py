@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 
 class Textures(NamedTuple):
-    """Textures with their levels of resolution."""
-
     texels: NDArray[np.uint8]  #: (n, 3) texels of all levels of all textures, row by row
     #: (textures, levels, 3) number of the first texel, rows and columns of each level, finest first; a texture with
     #: fewer levels repeats its last one
@@ -20,10 +18,7 @@ class Textures(NamedTuple):
 
 
 def textures_of(images: Sequence[NDArray[np.uint8]]) -> Textures:
-    """Returns the textures (h, w, 3) with their levels; each level has half the rows and columns of the one before.
-
-    Halves are rounded down, to at least 1. The texels of a level are means over the texels of the level before.
-    """
+    """Returns the textures (h, w, 3) with their levels; each has half the rows and columns of the one before."""
     pyramids = [_pyramid(image) for image in images]
     most = max((len(levels) for levels in pyramids), default=1)
     table, blocks, first = np.zeros((len(images), most, 3), np.int64), [], 0
@@ -37,7 +32,6 @@ def textures_of(images: Sequence[NDArray[np.uint8]]) -> Textures:
 
 
 def _pyramid(image: NDArray[np.uint8]) -> list[NDArray[np.uint8]]:
-    """Returns the levels of an image (h, w, 3), finest first, down to one texel."""
     levels = [np.ascontiguousarray(image)]
     while max(levels[-1].shape[:2]) > 1:
         rows, cols = (max(1, n // 2) for n in levels[-1].shape[:2])

@@ -44,7 +44,6 @@ def accept_any_text() -> None:
 
 @contextmanager
 def _bar(task: str, *columns: TextColumn) -> Iterator[Callable[..., None]]:
-    """Shows a progress bar if stderr is a terminal; yields the function that updates its fields."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield lambda **_: None
@@ -56,7 +55,6 @@ def _bar(task: str, *columns: TextColumn) -> Iterator[Callable[..., None]]:
 
 @contextmanager
 def progress_bar() -> Iterator[Callable[[SurveyProgress], None]]:
-    """Shows the progress bar of a survey if stderr is a terminal; yields the function that updates it."""
     with _bar("survey", TextColumn("{task.fields[note]}")) as update:
         yield lambda now: update(completed=now.share, description=now.stage, note=progress_note(now))
 
@@ -69,10 +67,7 @@ def replay_bar() -> Iterator[Callable[[str, float], None]]:
 
 
 def progress_note(now: SurveyProgress) -> str:
-    """Returns the progress of a survey as text.
-
-    During the flight: simulated time, real-time factor and position uncertainty; otherwise: the wall time.
-    """
+    """Returns the progress of a survey as text: during the flight, with real-time factor and position uncertainty."""
     if not now.simulated_s:
         return f"{now.wall_s:.0f} s"
     factor = now.simulated_s / max(now.wall_s, 1e-3)
@@ -89,7 +84,6 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
 
 
 def print_plan(summary: PlanSummary) -> None:
-    """Prints the tables of a plan on stdout, and its warnings on stderr."""
     from twin.planning import summary as plan_summary
 
     print_table(f"Plan of {summary.mission.scenario.name}", plan_summary.rows(summary))
@@ -102,7 +96,7 @@ def print_plan(summary: PlanSummary) -> None:
 
 def print_requirements(require: dict[str, dict[str, Any]], suffix: str, passed: str) -> None:
     """Prints a table of the requirements; `passed` is the word for a limit that is met."""
-    from twin.report.wording import with_unit
+    from twin.report.number_formats import with_unit
 
     rows = [
         (name, with_unit(name, row["value"]) + suffix, f"limit {with_unit(name, row['limit'])}",
@@ -113,7 +107,6 @@ def print_requirements(require: dict[str, dict[str, Any]], suffix: str, passed: 
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
-    """Prints the verdict on a survey or replay, its reasons and warnings, the key figures and the requirements."""
     from twin.report.headline import badge, first_lines, key_figures, results
 
     seed = "" if metrics["seed"] is None else f", seed {metrics['seed']}"
@@ -128,7 +121,6 @@ def print_metrics(metrics: dict[str, Any]) -> None:
 
 
 def print_outputs(folder: Path) -> None:
-    """Prints the path of a run's report and the command that opens its recording, each only if the file exists."""
     if (folder / "report.html").is_file():
         print(f"Report: {folder / 'report.html'}")
     if (folder / "run.rrd").is_file():

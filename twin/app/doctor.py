@@ -1,7 +1,6 @@
 """Checks of this machine (Python, packages, rendering, disk space, processors), with a remedy for each failure.
 
-`python -m twin.app.doctor` renders a test image. `check_rendering` runs this command in a separate process, because a
-faulty graphics driver can crash the process that renders.
+`python -m twin.app.doctor` renders a test image, in a process of its own, which a faulty graphics driver can crash.
 """
 
 from __future__ import annotations
@@ -26,8 +25,6 @@ _SPHERE = """
 
 
 class Check(NamedTuple):
-    """Result of one check."""
-
     name: str
     ok: bool
     found: str  #: version, size or error message
@@ -78,9 +75,7 @@ def _package(name: str) -> Check:
 def render_test_image() -> str:
     """Renders a white sphere; returns the name of the OpenGL renderer and the value of MUJOCO_GL as text.
 
-    Raises:
-        TwinError: OpenGL is missing.
-        RuntimeError: the rendered image is black.
+    Raises TwinError if OpenGL is missing, RuntimeError if the rendered image is black.
     """
     from twin.scenes.gl import mujoco, offscreen_context
 

@@ -26,14 +26,8 @@ DEFAULT_STUDIES = (
 def run(files: Sequence[str], out: Path, runs: Path, jobs: int | None = None) -> None:
     """Runs the rendered surveys of the studies, fits the error model to their statistics and writes the model.
 
-    Args:
-        files: study files; if empty, `DEFAULT_STUDIES`.
-        out: TOML file to which the error model is written.
-        runs: folder of the rendered surveys; finished surveys are reused.
-        jobs: number of processes that fly surveys; None for one per core.
-
-    Raises:
-        TwinError: a study is invalid, or too few surveys are complete.
+    Finished surveys in `runs` are reused; without files, the studies are `DEFAULT_STUDIES`. Raises TwinError if a study
+    is invalid, or too few surveys are complete.
     """
     compared = comparison_model(error_model_file.load().model)
     rendered = [

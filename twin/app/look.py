@@ -14,7 +14,7 @@ from twin.errors import TwinError
 from twin.imaging.scene.renderer import NEAR_M
 from twin.imaging.stereo_camera import AT_REST, DecomposedImage, StereoCapture
 from twin.judge.summary_statistics import finite_tree
-from twin.report.wording import DASH, percent
+from twin.report.number_formats import DASH, percent
 from twin.world.mission import Mission
 from twin.world.rendered_world import RenderedWorld
 
@@ -50,20 +50,11 @@ class ViewLayers(NamedTuple):
 def render_view(
     mission: Mission, at_m: tuple[float, float, float] | None = None, twist_body: Array | None = None
 ) -> ViewLayers:
-    """Renders a stereo pair and the light components of its left image.
+    """Renders a stereo pair and the light components of its left image; the arguments are those of `twin.look`.
 
-    The cameras look straight down, and the bow has the heading of the survey area (`SurveyArea.heading`).
-
-    Args:
-        mission: the survey.
-        at_m: position of the left camera in the world [m]; None: above the centre of the survey area, at the
-            planned altitude above the reference plane.
-        twist_body: (6,) [angular, linear] velocity of the body in its own axes during the exposure [rad/s, m/s];
-            None: at rest.
-
-    Raises:
-        TwinError: a camera or a lamp is outside the terrain, or less than `NEAR_M` above the sea floor, or a velocity
-            is given without a section [sensor], which has the exposure time.
+    The cameras look straight down, and the bow has the heading of the survey area (`SurveyArea.heading`). Raises
+    TwinError if a camera or a lamp is outside the terrain, or less than `NEAR_M` above the sea floor, or a velocity is
+    given without a section [sensor], which has the exposure time.
     """
     if twist_body is not None and mission.scenario.sensor is None:
         raise TwinError("--twist", "the scenario has no exposure time", "with a section [sensor]: --set sensor.bits=12")
@@ -79,17 +70,12 @@ def render_view(
 
 
 def parse_position(text: str) -> tuple[float, float, float]:
-    """Returns the position (x, y, z) [m] of a text X,Y,Z. Raises TwinError unless it is three finite numbers."""
     x, y, z = _numbers(text, "--at", "position", "X,Y,Z of the left camera [m], as in 0.5,-1,2")
     return x, y, z
 
 
 def parse_twist(text: str) -> Array:
-    """Returns the twist (6,) [angular, linear] in [rad/s, m/s] of a text VX,VY,VZ,WX,WY,WZ in [m/s] and [deg/s].
-
-    Raises:
-        TwinError: the text is not six finite numbers.
-    """
+    """Returns the twist (6,) [angular, linear] in [rad/s, m/s] of a text VX,VY,VZ,WX,WY,WZ in [m/s] and [deg/s]."""
     values = _numbers(text, "--twist", "velocity", "VX,VY,VZ,WX,WY,WZ [m/s, deg/s], as in 0.5,0,0,0,0,20")
     return np.concatenate([np.deg2rad(values[3:]), values[:3]])
 
@@ -130,19 +116,18 @@ def _check_rig(mission: Mission, world_from_left: Array) -> None:
 
 
 def image_quality(view: ViewLayers) -> dict[str, Any]:
-    """Computes measures of the quality of the left image.
+    """Returns measures of the quality of the left image, by name.
 
-    Returns:
-        Position of the left camera in the world [m] and median depth [m]; with a section [sensor], exposure time [ms]
-        and analogue gain; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean,
-        as a fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
-        noise, in windows of about `WINDOW_SHARE` of the image width. `veil_share`: fraction of the light that is
-        backscatter. `saturated_share`: fraction of saturated pixels. `snr`: mean / standard deviation of the noise.
-        `texture_snr`: median local standard deviation of the image without noise / standard deviation of the noise; a
-        low value limits matching.
+    These are position of the left camera in the world [m] and median depth [m]; with a section [sensor], exposure time
+    [ms] and analogue gain; and lists of three values for R, G, B, where None is an undefined value. `gray_level`: mean,
+    as a fraction of full scale. `contrast`: median over the image of local standard deviation / local mean, without
+    noise, in windows of about `WINDOW_SHARE` of the image width. `veil_share`: fraction of the light that is
+    backscatter. `saturated_share`: fraction of saturated pixels. `snr`: mean / standard deviation of the noise.
+    `texture_snr`: median local standard deviation of the image without noise / standard deviation of the noise; a low
+    value limits matching.
     """
     a, left = view.decomposed, view.stereo_pair.left
-    signal = a.components.total.astype(np.float64) * a.gain if a.linear else a.noise_free / 255
+    signal = a.components.total.astype(np.float64) * a.setting.gain if a.linear else a.noise_free / 255
     side = max(3, round(signal.shape[1] * WINDOW_SHARE) | 1)
     mean = cv2.blur(signal, (side, side))
     local_sigma = np.sqrt(np.maximum(cv2.blur(signal**2, (side, side)) - mean**2, 0))
@@ -167,7 +152,6 @@ def image_quality(view: ViewLayers) -> dict[str, Any]:
 
 
 def quality_rows(quality: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Returns the R, G, B values of `image_quality` as the rows of a table: label, red, green, blue."""
     percent_of = {"gray_level", "veil_share", "saturated_share"}
     rows = [
         (label, *(DASH if v is None else percent(v) if name in percent_of else f"{v:.3g}" for v in quality[name]))

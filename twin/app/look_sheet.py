@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from twin.app.look import ViewLayers
 from twin.imaging.light.optics import range_of
+from twin.report.number_formats import DASH
 from twin.report.style import FIGURE_STYLE
-from twin.report.wording import DASH
 from twin.scenario.model import Scenario
 
 PANEL_IN = 3.5
@@ -25,8 +25,6 @@ _SHADOW = {"facecolor": "#00000088", "edgecolor": "none", "pad": 2.0}
 
 
 class Panel(NamedTuple):
-    """One panel of the contact sheet."""
-
     title: str
     unit: str
     values: NDArray[Any]  #: values whose minimum, median and maximum are printed, apart from those that are not finite
@@ -37,7 +35,6 @@ class Panel(NamedTuple):
 
 
 def draw(scenario: Scenario, view: ViewLayers, file: Path) -> Path:
-    """Writes the contact sheet as a PNG file and returns the path of the file."""
     panels = _panels(scenario, view)
     columns = 4 if len(panels) <= 8 else 5
     rows = -(-len(panels) // columns)
@@ -83,14 +80,14 @@ def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:
         Panel("range", "m", range_m, range_m, colours=("viridis_r", *ends_m)),
         Panel("albedo", "1", a.albedo / 255, a.albedo / 255),
         _light("light on the sea floor", "lx", a.components.floor_lx, 0.0),
-        _light("direct signal", "cd/m2", a.components.direct, a.gain, a.linear),
-        _light("backscatter", "cd/m2", a.components.backscatter, a.gain, a.linear),
+        _light("direct signal", "cd/m2", a.components.direct, a.setting.gain, a.linear),
+        _light("backscatter", "cd/m2", a.components.backscatter, a.setting.gain, a.linear),
         Panel("noise", "grey level", noise, noise.mean(axis=2), "mean of the bands", ("RdBu_r", -reach, reach)),
     ]
     if a.components.forward is not None:
-        panels.append(_light("forward scatter", "cd/m2", a.components.forward, a.gain, a.linear))
+        panels.append(_light("forward scatter", "cd/m2", a.components.forward, a.setting.gain, a.linear))
     if a.components.snow is not None:
-        panels.append(_light("marine snow", "cd/m2", a.components.snow, a.gain, a.linear, 100.0))
+        panels.append(_light("marine snow", "cd/m2", a.components.snow, a.setting.gain, a.linear, 100.0))
     return panels
 
 
@@ -105,15 +102,9 @@ def _light(
     """Returns the colour panel of one light component (H, W, 3).
 
     A component whose `percentile` lies between half and full scale of the image is displayed as bright as in the image.
-    Any other component is scaled so that its `percentile` is white; the note of the panel then gives the scale factor,
-    or for gain 0 the value that is displayed as white. A component whose `percentile` is not positive is displayed as
-    black, with the note "none".
-
-    Args:
-        gain: image brightness (fraction of full scale) per unit of the component; 0 if the image does not
-            contain the component.
-        linear: whether the image is proportional to the radiance; if not, the note of the panel states that the
-            brightness is that before tone curve and white balance.
+    Any other is scaled so that its `percentile` is white; the note of the panel then gives the scale factor, or for
+    gain 0 (not in the image) the value that is displayed as white. Where it is not positive, the panel is black. `gain`
+    is the image brightness (fraction of full scale) per unit of the component.
     """
     top = float(np.nanpercentile(layer, percentile)) if np.isfinite(layer).any() else 0.0
     if top <= 0:
@@ -155,5 +146,4 @@ def _in_numbers(values: NDArray[Any]) -> str:
 
 
 def _short(value: float) -> str:
-    """Returns the value with three significant digits, or as an integer if its magnitude is 100 or more."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"

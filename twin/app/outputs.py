@@ -20,23 +20,22 @@ _STEM_BYTES = 100
 
 
 def new_folder(folder: Path, option: str = "--out") -> Path:
-    """Returns the folder. Raises TwinError unless the folder is new or empty and can be written."""
     check_folder(folder, option)
     _check_writable(folder, option)
     return folder
 
 
 def unused_folder(first: Path) -> Path:
-    """Returns the first of FOLDER, FOLDER-2, FOLDER-3, ... that is new or empty; raises TwinError like `new_folder`."""
+    """Returns the first of FOLDER, FOLDER-2, FOLDER-3, ... that is new or empty, checked by `new_folder`."""
     folder, count = first, 1
-    while folder.exists() and not is_empty(folder):
+    while folder.exists() and not _is_empty(folder):
         count += 1
         folder = first.with_name(f"{first.name}-{count}")
     return new_folder(folder)
 
 
 def run_folder(scenario: Scenario) -> Path:
-    """Returns the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty; raises TwinError as above."""
+    """Returns the first of runs/NAME-SEED, runs/NAME-SEED-2, ... that is new or empty (`unused_folder`)."""
     return unused_folder(Path("runs") / f"{file_stem(scenario.name)}-{scenario.seed}")
 
 
@@ -51,10 +50,7 @@ def output_file(file: Path, option: str = "--out") -> Path:
 
 @contextmanager
 def writing(path: Path, option: str = "--out") -> Iterator[None]:
-    """Converts an OSError in this context to a TwinError, which states that the user's `path` cannot be written.
-
-    If the OSError names a file outside `path`, the TwinError names that file instead.
-    """
+    """Converts an OSError in this context to a TwinError on `path`, or on the file outside it that the error names."""
     try:
         yield
     except OSError as error:
@@ -71,20 +67,14 @@ def file_stem(name: str) -> str:
 
 
 def path_stem(path: Path) -> str:
-    """Returns the name of an input file or folder for use in a file name (`file_stem`)."""
     return file_stem(resolved(path).name)
 
 
-def is_empty(folder: Path) -> bool:
-    """Returns whether a path is an empty folder."""
+def _is_empty(folder: Path) -> bool:
     return folder.is_dir() and not any(folder.iterdir())
 
 
 def _check_writable(path: Path, option: str) -> None:
-    """Raises TwinError if no file can be created in the folder `path` or, if it is no existing folder, in its parent.
-
-    If the parent does not exist either, the closest existing folder above it is tested.
-    """
     closest = next(p for p in (path, *path.absolute().parents) if p.exists())
     folder = closest.parent if closest == path and closest.is_file() else closest
     try:

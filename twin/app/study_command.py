@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.core.output_folder import sole_writer
-from twin.engines.engine import Engine, LocalEngine, default_jobs
-from twin.errors import TwinError
-from twin.studies import agreement, rendered_check, report, wording
+from twin.engines.engine import open_engine
+from twin.studies import agreement, rendered_check, report, sentences
 from twin.studies.progress import study_progress
 from twin.studies.rendered_check import RenderedCheck
 from twin.studies.runner import Fleet, StudyResult, run_study
@@ -23,12 +21,8 @@ from twin.tuning import rounds, tuning_report
 from twin.tuning.candidates import tuning_config
 from twin.tuning.rounds import TuningResult
 
-SLURM = "slurm"  #: value of --scheduler that starts SLURM jobs
-
 
 class StudyOptions(NamedTuple):
-    """Options of `twin study` and `twin tune`."""
-
     out: Path | None = None  #: folder to write; None: runs/study-NAME or runs/tune-NAME
     jobs: int | None = None  #: number of parallel surveys; None: one per core
     scheduler: str | None = None  #: where the surveys run (`open_engine`)
@@ -42,46 +36,13 @@ class StudyOptions(NamedTuple):
 
 
 @contextmanager
-def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
-    """Yields an engine that runs surveys in parallel; the workers that it started are stopped when the context ends.
-
-    Args:
-        jobs: number of local processes or SLURM jobs; None: one per core.
-        scheduler: None for processes on this machine; "slurm" for SLURM jobs; else the address of a running Dask
-            scheduler, e.g. tcp://host:8786, whose workers must have this package installed.
-
-    Raises:
-        TwinError: the scheduler does not answer, or a package that it needs is not installed.
-    """
-    jobs = jobs or default_jobs()
-    if scheduler:
-        if find_spec("distributed") is None:
-            raise TwinError("--scheduler", "Dask is not installed", "pip install 'seabed-twin[cluster]'")
-        from twin.engines import dask_engine
-
-        is_slurm = scheduler == SLURM
-        with dask_engine.start_slurm_jobs(jobs) if is_slurm else dask_engine.connect_scheduler(scheduler) as engine:
-            yield engine
-        return
-    engine = LocalEngine(jobs)
-    try:
-        yield engine
-    finally:
-        engine.pool.close()
-
-
-@contextmanager
 def _fleet(options: StudyOptions) -> Iterator[Fleet]:
     with open_engine(options.jobs, options.scheduler) as engine, study_progress(options.live) as progress:
         yield Fleet(engine, progress)
 
 
 def fly_study(file: str, options: StudyOptions) -> tuple[StudyResult, RenderedCheck | None]:
-    """Runs a study and, if the options ask for it, checks it by rendered surveys; writes the results.
-
-    Raises:
-        TwinError: the study file or an option is invalid; no survey was run.
-    """
+    """Runs a study, checks it by rendered surveys if asked, writes the results; raises TwinError for invalid input."""
     study = load(file, options)
     folder = _folder(options, "study", study)
     with _fleet(options) as fleet:
@@ -92,11 +53,7 @@ def fly_study(file: str, options: StudyOptions) -> tuple[StudyResult, RenderedCh
 
 
 def fly_search(file: str, options: StudyOptions) -> tuple[TuningResult, Path]:
-    """Optimises a survey plan as the study file defines; returns the result and the folder of its report.
-
-    Raises:
-        TwinError: the study file or an option is invalid; no survey was run.
-    """
+    """Optimises a plan as the study file defines; returns result and report folder; raises TwinError if invalid."""
     study = load(file, options)
     if options.verify is not None:
         config = tuning_config(study).model_copy(update={"verify": options.verify})
@@ -129,11 +86,7 @@ def study(file: str, options: StudyOptions, as_json: bool = False) -> int:
 
 
 def tune(file: str, options: StudyOptions, as_json: bool = False) -> int:
-    """Runs a search and prints its result, or only a summary as JSON.
-
-    Returns:
-        The exit status: 130 if interrupted; 1 if no plan is recommended; 0 otherwise.
-    """
+    """Runs a search and prints its result; returns 130 if interrupted, 1 without a recommended plan, otherwise 0."""
     result, folder = fly_search(file, options)
     if as_json:
         print(json.dumps(tuning_report.summary(result), indent=1))
@@ -148,14 +101,12 @@ def tune(file: str, options: StudyOptions, as_json: bool = False) -> int:
 
 
 def load(file: str, options: StudyOptions) -> Study:
-    """Returns the study of a file, with `imaging.extrapolate` set if the options ask for it."""
     study = load_study(file, options.allow_plugins)
     changes = {"imaging.extrapolate": True} if options.extrapolate else {}
     return study.model_copy(update={"set": study.set | changes})
 
 
 def _folder(options: StudyOptions, command: str, study: Study) -> Path:
-    """Returns the absolute path of the folder to write, because workers run in other folders; checks the path."""
     folder = options.out or Path("runs") / f"{command}-{file_stem(study.name or command)}"
     output_file(folder / "study.html")
     return folder.absolute()
@@ -163,11 +114,11 @@ def _folder(options: StudyOptions, command: str, study: Study) -> Path:
 
 def _print_result(result: StudyResult) -> None:
     analysis = result.analysis
-    print(wording.headline(analysis))
-    for line in wording.answer_lines(analysis):
+    print(sentences.headline(analysis))
+    for line in sentences.answer_lines(analysis):
         print(f"- {line}")
     rows = [
-        (wording.metric_name(one.name), *(wording.metric_interval(one.name, i) for i in (one.median, one.bound)))
+        (sentences.metric_name(one.name), *(sentences.metric_interval(one.name, i) for i in (one.median, one.bound)))
         for one in analysis.metric_summaries
     ]
     console.print_table(f"{analysis.study.name}: median and 95 % bound of the surveys", rows)
@@ -175,12 +126,12 @@ def _print_result(result: StudyResult) -> None:
         console.print_table(agreement.verdict_line(compared), agreement.table(compared))
     if analysis.refusal_reasons:
         reasons = [(str(reason.surveys), reason.reason) for reason in analysis.refusal_reasons]
-        samples = wording.counted(len(analysis.refused_samples), "sample")
+        samples = sentences.counted(len(analysis.refused_samples), "sample")
         console.print_table(f"{samples} cannot be flown: surveys, reason", reasons)
     for warning, count in analysis.warning_counts.items():
         print(f"Warning in {count} of {int((~analysis.duplicate).sum())} surveys: {warning}")
     if result.throughput.surveys:
-        print(wording.throughput(*result.throughput))
+        print(sentences.throughput(*result.throughput))
     if result.page.is_file():
         print(f"Report: {result.page}")
 

@@ -15,11 +15,7 @@ INTERRUPTED, TERMINATED = 128 + signal.SIGINT, 128 + signal.SIGTERM
 
 @contextmanager
 def sigterm_as_interrupt() -> Iterator[None]:
-    """Raises KeyboardInterrupt when SIGTERM arrives within this context, and then changes the exit status 130 to 143.
-
-    The previous handler is restored at the end. Outside the main thread, which alone receives signals, the context has
-    no effect.
-    """
+    """Raises KeyboardInterrupt at a SIGTERM in this context (main thread only), and exits with 143 instead of 130."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

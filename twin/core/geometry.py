@@ -34,13 +34,12 @@ def copy_into(target: Array, values: Array) -> None:
 
 @kernel
 def skew(v: Array) -> Array:
-    """Returns the skew-symmetric matrix (3, 3) of a vector (3,): skew(v) @ x is the cross product of v and x."""
+    """Returns the matrix (3, 3) with skew(v) @ x = v x x, the cross product."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 @kernel
 def pose(rotation: Array, position: Array) -> Array:
-    """Returns the pose (4, 4) with a rotation (3, 3) and a position (3,) [m]."""
     result = np.zeros((4, 4))
     copy_into(result[:3, :3], rotation)
     copy_into(result[:3, 3], position)
@@ -50,7 +49,6 @@ def pose(rotation: Array, position: Array) -> Array:
 
 @kernel
 def inverse(a_from_b: Array) -> Array:
-    """Returns b_from_a (4, 4). The rotation is inverted by transposition."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(3):
@@ -62,7 +60,6 @@ def inverse(a_from_b: Array) -> Array:
 
 @kernel
 def compose(a_from_b: Array, b_from_c: Array) -> Array:
-    """Returns a_from_c (4, 4), the product a_from_b @ b_from_c, without BLAS."""
     result = np.zeros((4, 4))
     for i in range(3):
         for k in range(4):
@@ -105,7 +102,7 @@ def product(a: Array, b: Array) -> Array:
 
 
 def nearest_rigid(matrices: Array) -> Array:
-    """Returns the nearest rigid motions (..., 4, 4) of nearly rigid matrices, such as products with rounding errors."""
+    """Returns the nearest rigid motions (..., 4, 4) of matrices with rounding errors, such as long products."""
     return _nearest_rigid(np.ascontiguousarray(matrices).reshape(-1, 4, 4)).reshape(matrices.shape)
 
 
@@ -216,7 +213,7 @@ def log(a_from_b: Array) -> Array:
 def log_derivative(motion: Array) -> Array:
     """Returns the inverse right Jacobian J (6, 6) of SE(3) at a motion (6,): log(exp(motion) exp(d)) ~ motion + J d.
 
-    For [w, v] and K = skew(w), the diagonal blocks are I + K / 2 + c K^2; the lower left block is their derivative with
+    For [w, v] and K = skew(w), the diagonal blocks are I + K / 2 + c K^2, the lower left block their derivative with
     respect to w in the direction v (Selig 2005).
     """
     w, v, result = motion[:3], motion[3:], np.zeros((6, 6))
@@ -264,7 +261,6 @@ def adjoint(a_from_b: Array) -> Array:
 
 
 def transform(a_from_b: Array, points_b: Array) -> Array:
-    """Returns points (n, 3) transformed from frame b to frame a."""
     return points_b @ a_from_b[:3, :3].T + a_from_b[:3, 3]
 
 
@@ -290,10 +286,7 @@ def rotation_from_rpy(roll: float, pitch: float, yaw: float) -> Array:
 
 @kernel
 def rpy_from_rotation(rotation: Array) -> Array:
-    """Returns roll, pitch, yaw (3,) [rad] of the rotation world_from_body (3, 3), the inverse of `rotation_from_rpy`.
-
-    At a pitch of +-90 deg, where only a combination of roll and yaw is defined, roll is set to zero.
-    """
+    """Returns roll, pitch, yaw (3,) [rad], the inverse of `rotation_from_rpy`; roll is zero at a pitch of +-90 deg."""
     horizontal = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], horizontal)
     if horizontal < 1e-12:
@@ -303,30 +296,26 @@ def rpy_from_rotation(rotation: Array) -> Array:
 
 @kernel
 def wrap_angle(angle: Array) -> Array:
-    """Returns angles wrapped to [-pi, pi) [rad]."""
     return (angle + np.pi) % (2 * np.pi) - np.pi
 
 
 def quaternion_wxyz(rotation: Array) -> Array:
-    """Returns the quaternion [w, x, y, z] (MuJoCo's order) of a rotation matrix (3, 3), w >= 0."""
     return quaternion_xyzw(rotation)[[3, 0, 1, 2]]
 
 
 def rotation_from_wxyz(quaternion: Array) -> Array:
-    """Returns the rotation matrices (..., 3, 3) of quaternions [w, x, y, z] (..., 4) in MuJoCo's order."""
     from scipy.spatial.transform import Rotation  # takes 0.15 s and 20 MB to import, and most surveys do not need it
 
     return Rotation.from_quat(np.asarray(quaternion)[..., [1, 2, 3, 0]]).as_matrix()
 
 
 def quaternion_xyzw(rotation: Array) -> Array:
-    """Returns the quaternion [x, y, z, w] (order of Rerun and TUM) of a rotation matrix (3, 3), w >= 0."""
     return quaternions_xyzw(np.asarray(rotation, np.float64)[None])[0]
 
 
 @kernel
 def quaternions_xyzw(rotations: Array) -> Array:
-    """Returns the quaternions [x, y, z, w] (n, 4) of rotation matrices (n, 3, 3), w >= 0 (Shepperd 1978)."""
+    """Returns the quaternions [x, y, z, w] (n, 4) of rotations (n, 3, 3), w >= 0 (Shepperd 1978)."""
     out = np.empty((len(rotations), 4))
     for k in range(len(rotations)):
         r = rotations[k]

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 class Georeference:
     """Position of the scene in a horizontal CRS and a vertical datum, to whose axes the scene axes are parallel.
 
-    With the origin (E0, N0, H0) of the scene and k metres per unit of the CRS, a scene point (x, y, z) [m] lies at
-    E = E0 + x / k, N = N0 + y / k and at the elevation H0 + z.
+    With the origin (E0, N0, H0) and k metres per unit of the CRS, a scene point (x, y, z) [m] lies at E = E0 + x / k,
+    N = N0 + y / k and at the elevation H0 + z.
     """
 
     #: easting, northing: coordinates E0, N0 of the scene origin in the CRS, in its unit.
@@ -25,11 +25,9 @@ class Georeference:
     vertical_datum: str = ""  #: name of the vertical CRS; "" if the source does not name it
 
     def to_scene(self, easting: ArrayLike, northing: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the scene coordinates x and y [m] of points in the CRS."""
         x = (np.asarray(easting, np.float64) - self.easting) * self.metres_per_unit
         return x, (np.asarray(northing, np.float64) - self.northing) * self.metres_per_unit
 
     def from_scene(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns the coordinates E and N in the CRS of scene points [m]."""
         easting = self.easting + np.asarray(x_m, np.float64) / self.metres_per_unit
         return easting, self.northing + np.asarray(y_m, np.float64) / self.metres_per_unit

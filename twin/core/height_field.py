@@ -1,7 +1,4 @@
-"""Floor as heights on a regular grid: the two triangles of each cell, its slopes, and the rays that meet it.
-
-Cells are split along the diagonal from south-west to north-east.
-"""
+"""Floor as heights on a regular grid, whose cells are split along the diagonal from south-west to north-east."""
 
 from __future__ import annotations
 
@@ -13,6 +10,12 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
 from twin.kernels import kernel
+
+#: Columns of the grid of rays. A cell that the edge of the second image cuts is weighted by its fraction inside; the
+#: error of an overlap is therefore far smaller than the share of one cell.
+RAY_COLUMNS = 24
+#: A floor point is occluded if its ray meets the floor earlier by more than this fraction of its range.
+HIDDEN_BEFORE = 1e-3
 
 
 class HeightField(NamedTuple):
@@ -36,7 +39,7 @@ def height_field(height_m: NDArray[np.floating], spacing_m: float, west_m: float
 
 
 def map_height_field(height_m: NDArray[np.floating], grid: MapGrid) -> HeightField:
-    """Returns the height field of a map with heights (rows, cols) [m]; its nodes are the centres of the map cells."""
+    """Returns the height field of a map with heights (rows, cols) [m]; its nodes are the centres of the cells."""
     south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m
     return height_field(height_m[::-1], grid.cell_m, grid.west_m + grid.cell_m / 2, south_m)
 
@@ -50,20 +53,12 @@ def ray_grid(rig: StereoRig, n_columns: int) -> Array:
 
 
 def cast_pixels(field: HeightField, poses: Array, rig: StereoRig, pixels: Array) -> Array:
-    """Returns the depth (n, m) of the floor along the optical axis [m] at pixels (m, 2) of n images.
-
-    The depth is inf where the ray of a pixel does not meet the floor, see `cast_ray`.
-
-    Args:
-        poses: (n, 4, 4) world_from_camera.
-        pixels: (m, 2) column and row [px].
-    """
+    """Returns the depth (n, m) of the floor along the optical axis [m] at pixels (m, 2) of n images; inf: none."""
     return _cast_directions(field, np.ascontiguousarray(poses, np.float64), rig.normalised(pixels))
 
 
 @kernel
 def _cast_directions(field, poses, directions):
-    """Compiled kernel of `cast_pixels`; directions (m, 2) are normalised coordinates."""
     depth = np.empty((len(poses), len(directions)))
     for i in range(len(poses)):
         for k in range(len(directions)):
@@ -120,8 +115,7 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
 def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
     """Returns the least t in [start, end] where the ray meets the floor of a cell; inf if none, NaN if a corner is NaN.
 
-    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell. If it
-    is below the floor at `start` already, the result is `start`.
+    The ray is (u0, v0, z0) + t (u_rate, v_rate, z_rate), with u (east) and v (north) from 0 to 1 over the cell.
     """
     h00, h01, h10, h11 = height[r, c], height[r, c + 1], height[r + 1, c], height[r + 1, c + 1]
     top = max(max(h00, h01), max(h10, h11))
@@ -148,8 +142,7 @@ def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
 def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
     """Returns the triangles (2 (rows - 1) (cols - 1), 3) of a grid, counter-clockwise from above, cell by cell.
 
-    Args:
-        vertices: (rows, cols) vertex numbers; rows run from south to north, columns from west to east.
+    Rows of the vertex numbers (rows, cols) run from south to north, columns from west to east.
     """
     sw, se, ne, nw = vertices[:-1, :-1], vertices[:-1, 1:], vertices[1:, 1:], vertices[1:, :-1]
     return np.stack([sw, se, ne, sw, ne, nw], axis=-1).reshape(-1, 3)
@@ -158,7 +151,7 @@ def grid_triangles(vertices: NDArray[Any]) -> NDArray[Any]:
 def raster_triangles(valid: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Returns the triangles (n, 3) between the centres of valid raster cells, counter-clockwise from above.
 
-    They are indices of the flattened (row-major) raster, whose row 0 is the northernmost.
+    They are indices of the row-major raster, whose row 0 is the northernmost.
     """
     cells = np.arange(valid.size).reshape(valid.shape)
     triangles = grid_triangles(cells[::-1])
@@ -174,12 +167,63 @@ def rises(south_west, south_east, north_west, north_east, east_part, north_part)
 
 
 def map_slopes(height_m: Array, cell_m: float) -> tuple[Array, Array]:
-    """Returns the slopes of a map towards the east and towards the north, each (rows, cols), by central differences.
-
-    At the edges, they are one-sided. Along an axis with a single cell, the slope is 0. Row 0 is the northernmost.
-    """
+    """Returns the slopes of a map, row 0 = north, to east and north, each (rows, cols); 0 along an axis of one cell."""
     south, east = (
         np.gradient(height_m, cell_m, axis=axis) if height_m.shape[axis] > 1 else np.zeros_like(height_m)
         for axis in (0, 1)
     )
     return np.asarray(east, np.float64), -np.asarray(south, np.float64)
+
+
+def image_overlap(field: HeightField, first: Array, second: Array, rig: StereoRig) -> Array:
+    """Returns the overlap (n,) of pairs of images: the share of the floor in the first that the second shows too.
+
+    The floor at each cell of a grid over the first image is weighted by the part of the cell that projects into the
+    second, 0 if occluded. NaN if no cell shows floor. Poses (n, 4, 4) are world_from_camera.
+    """
+    pixels = ray_grid(rig, RAY_COLUMNS)
+    cell = rig.width_px / RAY_COLUMNS, rig.height_px / (len(pixels) // RAY_COLUMNS)
+    camera = (rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px))
+    first, second = (np.ascontiguousarray(p, np.float64).reshape(-1, 4, 4) for p in (first, second))
+    return _overlaps(field, first, second, camera, rig.normalised(pixels), cell)
+
+
+@kernel
+def _overlaps(field, first, second, camera, directions, cell):
+    result = np.empty(len(first))
+    for i in range(len(first)):
+        pose, shared, count = first[i], 0.0, 0
+        for k in range(len(directions)):
+            a, b = directions[k, 0], directions[k, 1]
+            depth = cast_camera_ray(field, pose, a, b)
+            if depth < np.inf:
+                count += 1
+                x = pose[0, 3] + depth * (pose[0, 0] * a + pose[0, 1] * b + pose[0, 2])
+                y = pose[1, 3] + depth * (pose[1, 0] * a + pose[1, 1] * b + pose[1, 2])
+                z = pose[2, 3] + depth * (pose[2, 0] * a + pose[2, 1] * b + pose[2, 2])
+                shared += _share_seen(field, second[i], camera, cell, x, y, z, depth)
+        result[i] = shared / count if count else np.nan
+    return result
+
+
+@kernel
+def _share_seen(field, pose, camera, cell, x, y, z, depth):
+    """Returns the share (0 to 1) of a cell of the first image that the second camera sees.
+
+    `camera` is fx, fy, cx, cy, width and height, `cell` the size of a cell [px]; (x, y, z) is the floor point at its
+    centre and `depth` its depth in the first camera [m].
+    """
+    fx, fy, cx, cy, width, height = camera
+    dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+    depth2 = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
+    if depth2 <= 0:
+        return 0.0
+    u = fx * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth2 + cx + 0.5
+    v = fy * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth2 + cy + 0.5
+    scale = depth / depth2
+    in_u = min(max(min(u, width - u) / (scale * cell[0]) + 0.5, 0.0), 1.0)
+    in_v = min(max(min(v, height - v) / (scale * cell[1]) + 0.5, 0.0), 1.0)
+    if in_u * in_v == 0:
+        return 0.0
+    seen = cast_ray(field, pose[0, 3], pose[1, 3], pose[2, 3], dx, dy, dz) >= 1 - HIDDEN_BEFORE
+    return in_u * in_v if seen else 0.0

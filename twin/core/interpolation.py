@@ -17,10 +17,7 @@ def bilinear(image, row, col, row_fraction, col_fraction):
 
 @kernel(inline="always")
 def catmull_rom(a, b, c, e, t):
-    """Returns value and derivative of the Catmull-Rom cubic through samples a, b, c, e, at fraction t between b and c.
-
-    This is the cubic convolution of Keys (1981) with the parameter a = -1/2.
-    """
+    """Returns value and derivative of the Catmull-Rom cubic (Keys 1981) at the fraction t between b and c."""
     c1 = 0.5 * (c - a)
     c2 = a - 2.5 * b + 2 * c - 0.5 * e
     c3 = 0.5 * (e - a) + 1.5 * (b - c)
@@ -29,10 +26,7 @@ def catmull_rom(a, b, c, e, t):
 
 @kernel(inline="always")
 def catmull_rom_weights(t):
-    """Returns the weights of four samples in the Catmull-Rom cubic at the fraction t (float32) between the middle two.
-
-    See `catmull_rom`, which also returns the derivative.
-    """
+    """Returns the weights of four samples in the Catmull-Rom cubic at the fraction t (float32) of the middle two."""
     half, one, two = np.float32(0.5), np.float32(1), np.float32(2)
     first, last = half * t * (t * (two - t) - one), half * t * t * (t - one)
     second = one + half * t * t * (np.float32(3) * t - np.float32(5))
@@ -41,11 +35,10 @@ def catmull_rom_weights(t):
 
 @kernel(inline="always")
 def bicubic_with_gradient(image, x, y):
-    """Returns the value of an image at column x and row y, and its derivatives with respect to x and y.
+    """Returns the value of an image at column x and row y, and its derivatives, by bicubic (Catmull-Rom) interpolation.
 
-    The interpolation is bicubic (Catmull-Rom). (x, y) must lie inside the image; samples beyond the border repeat the
-    border pixel. If y is an integer, as in rectified stereo, the derivative with respect to y is the central
-    difference at the column floor(x).
+    (x, y) must lie inside the image; samples beyond the border repeat the border pixel. If y is an integer, as in
+    rectified stereo, the derivative with respect to y is the central difference at the column floor(x).
     """
     height, width = image.shape
     i, j = int(x), int(y)

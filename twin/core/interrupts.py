@@ -16,9 +16,8 @@ T = TypeVar("T")
 class StageGuard:
     """Context manager that delivers interrupts only within a stage.
 
-    An interrupt that arrives between two stages is delivered at the start of the second one, to the handler that was
-    installed when the context was entered and usually raises KeyboardInterrupt. A signal without a Python handler is
-    not intercepted. Outside the main thread, which alone receives signals, the context has no effect.
+    One that arrives between two stages is delivered at the start of the second, to the handler installed when the
+    context was entered. Signals without a Python handler, and threads other than the main one, are not affected.
 
     Attributes:
         cause: why the survey is aborted, set by the caller; "" if there is no such cause.
@@ -68,7 +67,6 @@ class StageGuard:
         return f"{self.cause or 'interrupted'}; {', '.join(self.skipped)} skipped" if self.skipped else self.cause
 
     def _receive(self, number: int, frame: FrameType | None) -> None:
-        """Handles a signal: delivers the first one that arrives within a stage, keeps any other for the next stage."""
         if self._open:
             self._open = False  # a second signal must not interrupt the handling of the first
             self._deliver(number, frame)

@@ -26,8 +26,7 @@ class Link(NamedTuple):
     #: times the factor for errors of the floor (`link_selection.inflate_for_shared_noise`). `cov` is the covariance of
     #: the single measurement times this number.
     shared_by: float = 1.0
-    #: (4, 4) motion from the closed form (eq. (2) of Negahdaripour & Madjidi 2003), which treats depth as exact; None:
-    #: not computed.
+    #: (4, 4) motion from the closed form (Negahdaripour & Madjidi 2003, eq. 2), with exact depth; None: not computed.
     closed_form: Array | None = None
     #: fraction (0 to 1) of the variance that image noise does not explain: it is due to the relief within the matched
     #: patches, and correlated between links that use the same patches. `Links` does not store it.
@@ -35,7 +34,7 @@ class Link(NamedTuple):
 
     @property
     def own_cov(self) -> Array:
-        """Returns the covariance (6, 6) of the single measurement, without the factor `shared_by`."""
+        """Returns the covariance (6, 6) of the single measurement."""
         return self.cov / self.shared_by
 
 
@@ -49,7 +48,7 @@ _NOT_COMPUTED = np.full((4, 4), np.nan)
 
 
 class Links(Sequence[Link]):
-    """Sequence of links stored as a structured array, for vectorised access; access to single links is slower."""
+    """Sequence of links stored as a structured array, for vectorised access."""
 
     def __init__(self, links: Iterable[Link] = ()):
         self._rows = GrowingArray(dtype=_LINK)
@@ -57,15 +56,13 @@ class Links(Sequence[Link]):
 
     @classmethod
     def from_sequence(cls, links: Sequence[Link]) -> Links:
-        """Returns the links as a `Links` object; the argument itself if it is one already."""
         return links if isinstance(links, cls) else cls(links)
 
     def add(self, links: Iterable[Link]) -> None:
-        """Appends links."""
         self._pending += links
 
     def select(self, mask: NDArray[np.bool_]) -> Links:
-        """Returns the links where the mask (n,) is true; this object itself if the mask is true for all links."""
+        """Returns the links where the mask (n,) is true; this object itself if it is true for all."""
         if mask.all():
             return self
         selected = Links()
@@ -91,47 +88,39 @@ class Links(Sequence[Link]):
 
     @property
     def i(self) -> NDArray[np.int64]:
-        """Returns the number (n,) of the earlier keyframe of each link."""
         return self._table["i"]
 
     @property
     def j(self) -> NDArray[np.int64]:
-        """Returns the number (n,) of the later keyframe of each link."""
         return self._table["j"]
 
     @property
     def i_from_j(self) -> Array:
-        """Returns the measured motions (n, 4, 4)."""
         return self._table["i_from_j"]
 
     @property
     def cov(self) -> Array:
-        """Returns the covariances (n, 6, 6) of [rotation, translation] (rad, m)."""
         return symmetric_inverses(self.information)
 
     @property
     def own_cov(self) -> Array:
-        """Returns `Link.own_cov` (n, 6, 6)."""
         return self.cov / self.shared_by[:, None, None]
 
     @property
     def shared_by(self) -> Array:
-        """Returns `Link.shared_by` (n,)."""
         return self._table["shared_by"]
 
     @property
     def information(self) -> Array:
-        """Returns the information matrices (n, 6, 6), the inverses of `cov`."""
         return self._table["information"]
 
     @property
     def n_points(self) -> NDArray[np.int64]:
-        """Returns `Link.n_points` (n,)."""
         return self._table["n_points"]
 
     @property
     def by_closed_form(self) -> tuple[NDArray[np.bool_], Array]:
-        """Returns the mask (n,) of the links that have a closed-form motion, and the closed-form motions (m, 4, 4)."""
+        """Returns the mask (n,) of the links that have a closed-form motion, and these motions (m, 4, 4)."""
         forms = self._table["closed_form"]
         known = ~np.isnan(forms[:, 0, 0])
         return known, forms[known]

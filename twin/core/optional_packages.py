@@ -9,15 +9,7 @@ from twin.errors import TwinError
 
 
 def optional(module: str, extra: str, purpose: str) -> Any:
-    """Returns a module of an optional package.
-
-    Args:
-        extra: name of the extra of this project that installs the package.
-        purpose: command or option that needs the package, for the message.
-
-    Raises:
-        TwinError: the package, or this module of it, is not installed.
-    """
+    """Returns a module of the optional packages `extra`; TwinError, which names `purpose`, if it is not installed."""
     try:
         return import_module(module)
     except ModuleNotFoundError as error:

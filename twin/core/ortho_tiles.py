@@ -24,7 +24,6 @@ class OrthoTile(NamedTuple):
 
     @property
     def known(self) -> np.ndarray:
-        """Returns a mask (rows, cols) of the pixels that have a colour."""
         return self.rgba[..., 3] > 0
 
 

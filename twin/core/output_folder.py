@@ -67,14 +67,12 @@ def check_folder(folder: Path, option: str = "--out", used: bool = False, allowe
 
 
 def check_path(path: Path, option: str, allowed: str) -> None:
-    """Raises TwinError if the file system rejects a path (see `path_problem`); the path need not exist."""
     if problem := path_problem(path):
         shown = str(path) if len(str(path)) <= 200 else f"{str(path)[:100]}..."
         raise TwinError(option, f"{ascii(shown)}: {problem}", allowed)
 
 
 def _locked(folder: Path, option: str) -> int:
-    """Returns the descriptor of the locked lock file, which now names this process."""
     file = folder / LOCK_FILE
     while True:
         folder.mkdir(parents=True, exist_ok=True)

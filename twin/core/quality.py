@@ -13,10 +13,7 @@ Array = NDArray[np.float64]
 
 
 class EpipolarError(NamedTuple):
-    """Errors of the rectification of the right image, estimated from row differences."""
-
-    #: (4,) pitch, yaw, roll of the right camera [rad], with the signs of `calibration_error.right_*`, and row offset
-    #: [focal lengths].
+    #: (4,) pitch, yaw, roll [rad], with the signs of `calibration_error.right_*`, and row offset [focal lengths].
     estimate: Array
     sigma: Array  #: (4,) standard deviations of `estimate`
     removed: Array  #: (4,) errors corrected in the right images, in the same units; yaw is never corrected
@@ -49,11 +46,9 @@ class EstimationQuality(NamedTuple):
     #: links_tried, links_failed: number of attempted and of failed measurements of links between nodes.
     links_tried: int = 0
     links_failed: int = 0
-    #: median over the links of the residual of the matched points (robust standard deviation), divided by its expected
-    #: value; None without a measured link.
+    #: median over the links of the residual of the points / its expected value; None without a measured link.
     link_residual: float | None = None
-    #: mean chi-square of the links after the last global alignment, per degree of freedom; 1 is expected; None without
-    #: an alignment.
+    #: mean chi-square of the links after the last alignment, per degree of freedom (1 expected); None without one.
     link_chi2: float | None = None
     alignment_converged: bool = True  #: whether the last global alignment converged; True without an alignment
     #: estimated errors of the rectification; None without images, unless a surrogate models them.
@@ -61,14 +56,11 @@ class EstimationQuality(NamedTuple):
     #: standard deviation (3-D) of the position of a keyframe relative to the previous keyframe, by frame-to-frame
     #: motion alone; 90th percentile over the keyframes [m]; None if it is not known at any keyframe.
     frame_sigma_m: float | None = None
-    #: offset common to all disparities, estimated from the links; None without images, or if the offset is not
-    #: observable.
+    #: offset common to all disparities, from the links; None without images or if it is not observable.
     disparity_offset: DisparityOffset | None = None
-    #: number of independent errors to which the correlated position errors of the keyframes are equivalent, by their
-    #: joint covariance; None without a final alignment.
+    #: number of independent errors equivalent to the position errors of all keyframes; None without a final alignment.
     independent_errors: float | None = None
-    #: length_scale, depth_scale: scale of the lengths from the images across and along the optical axis; None without a
-    #: sensor that determines it.
+    #: length_scale, depth_scale: scale of image lengths across and along the optical axis; None without a sensor.
     length_scale: LengthScale | None = None
     depth_scale: LengthScale | None = None
     #: rows of the frames at which a camera was frozen, by status ("the left camera repeats its image").
@@ -81,7 +73,6 @@ class EstimationQuality(NamedTuple):
 
     @property
     def repeat_notes(self) -> list[str]:
-        """Returns for each frozen camera a sentence that names the frames at which it was frozen."""
         return [
             f"{status.capitalize()} in {len(rows)} frames ({_spans(rows)}); these images were not used."
             for status, rows in self.repeats.items()
@@ -89,7 +80,6 @@ class EstimationQuality(NamedTuple):
 
 
 def _spans(rows: Sequence[int], most: int = 5) -> str:
-    """Returns increasing rows as a text of at most `most` spans, "3 to 8, 12, ..."."""
     spans = np.split(np.array(rows), np.flatnonzero(np.diff(rows) > 1) + 1)
     texts = [str(s[0]) if len(s) == 1 else f"{s[0]} to {s[-1]}" for s in spans[:most]]
     return ", ".join(texts + ["..."] * (len(spans) > most))
@@ -112,7 +102,6 @@ class ActionTimes(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Returns a sentence on why and for how long the vehicle was slowed or stopped; "" if it was neither."""
         done = [f"slowed for {self.slowed_s:.1f} s because frames were lost"] * (self.slowed_s > 0)
         done += [f"held station for {self.held_s:.1f} s because vision was lost"] * (self.held_s > 0)
         return f"The vehicle {' and '.join(done)}." if done else ""

@@ -11,11 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.geometry import Array
 from twin.core.links import Links
 from twin.core.quality import EstimationQuality
 
-Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
+Map = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+Radiance = NDArray[np.float32]  #: (H, W, 3) light of an image for R, G, B [cd/m2]
+Depth = NDArray[np.float32]  #: (H, W) depth along the optical axis [m]; inf where there is nothing
 #: Linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]; see `Frame.exposure`.
 Exposure = tuple[float, float, float]
 
@@ -26,11 +30,7 @@ PASCAL_PER_METRE = _WATER_KG_M3 * _GRAVITY_MPS2
 
 @dataclass(frozen=True)
 class StereoRig:
-    """Believed calibration of a rectified stereo pair.
-
-    Both cameras are pinhole cameras with the same intrinsics and parallel axes. The right camera is displaced along the
-    +x axis of the left camera. The pair may look in any direction.
-    """
+    """Believed calibration of a rectified pair: equal pinhole cameras, the right one along +x of the left one."""
 
     #: width_px, height_px: image size.
     width_px: int
@@ -55,27 +55,22 @@ class StereoRig:
 
     @property
     def focals_px(self) -> Array:
-        """Returns (fx, fy) [px]."""
         return np.array([self.fx_px, self.fy_px])
 
     @property
     def cx_px(self) -> float:
-        """Returns the column of the principal point [px]."""
         return (self.width_px - 1) / 2 if self.principal_point_px is None else self.principal_point_px[0]
 
     @property
     def cy_px(self) -> float:
-        """Returns the row of the principal point [px]."""
         return (self.height_px - 1) / 2 if self.principal_point_px is None else self.principal_point_px[1]
 
     @property
     def matrix(self) -> Array:
-        """Returns the camera matrix K (3, 3) of both cameras [px]."""
         return np.array([[self.fx_px, 0, self.cx_px], [0, self.fy_px, self.cy_px], [0, 0, 1.0]])
 
     @property
     def left_from_right(self) -> Array:
-        """Returns the pose (4, 4) of the right camera in the frame of the left camera."""
         return geometry.pose(np.eye(3), np.array([self.baseline_m, 0.0, 0.0]))
 
     def binned(self, by: int) -> StereoRig:
@@ -126,7 +121,6 @@ class SensorNoise:
 
     @property
     def attitude_sigmas_rad(self) -> Array:
-        """Returns the standard deviations (3,) of roll, pitch and yaw [rad]."""
         return np.array([self.attitude_rad, self.attitude_rad, self.heading_rad])
 
 
@@ -209,19 +203,17 @@ class Trajectory:
 
     @property
     def positions(self) -> Array:
-        """Returns the positions (n, 3) of the left camera in the world [m]."""
         return self.world_from_camera[:, :3, 3]
 
-    def save(self, path: Path) -> None:
-        """Writes a TUM file: time x y z qx qy qz qw, one line per pose."""
+    def save(self, path: Path, digits: int = 9, header: str = "") -> None:
+        """Writes a TUM file: time x y z qx qy qz qw, one line per pose, each number with so many digits."""
         poses = self.world_from_camera
         rows = np.column_stack([self.times_s, self.positions, geometry.quaternions_xyzw(poses[:, :3, :3])])
-        line = "%.6f" + " %.9g" * 7 + "\n"
-        path.write_text(line * len(rows) % tuple(rows.ravel().tolist()))
+        line = "%.6f" + f" %.{digits}g" * 7 + "\n"
+        path.write_text(header + line * len(rows) % tuple(rows.ravel().tolist()))
 
     @staticmethod
     def load(path: Path) -> Trajectory:
-        """Returns the trajectory in a TUM file, as written by `save`."""
         rows = np.loadtxt(path, ndmin=2)
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         poses[:, :3, :3] = geometry.rotation_from_wxyz(rows[:, [7, 4, 5, 6]])
@@ -261,7 +253,6 @@ class StereoObservation(NamedTuple):
 
     @property
     def row_spread_ratio(self) -> float | None:
-        """Returns row_spread_px / row_sigma_px, 1 for the expected noise; None if one is None or row_sigma_px is 0."""
         return self.row_spread_px / self.row_sigma_px if self.row_spread_px is not None and self.row_sigma_px else None
 
 
@@ -293,8 +284,7 @@ class SurveyResult:
     def unlinked(self) -> NDArray[np.bool_]:
         """Returns the mask (n_keyframes,) of the keyframes whose pose is dead reckoning from an earlier keyframe.
 
-        No measured link joins them, or the node whose pose they follow, to another node. Without any measured link (a
-        plug-in), there are none.
+        No measured link joins them, or their node, to another node. None are without any measured link.
         """
         links, n = self.links, len(self.keyframe_rows)
         measured = links.n_points > 0
@@ -326,7 +316,6 @@ class MapGrid:
     cols: int
 
     def centres(self) -> tuple[Array, Array]:
-        """Returns x (cols,) and y (rows,) of the cell centres [m]."""
         across, down = ((np.arange(n, dtype=np.float64) + 0.5) * self.cell_m for n in (self.cols, self.rows))
         return self.west_m + across, self.north_m - down
 
@@ -344,7 +333,6 @@ class ElevationMap:
     map_from_world: Array = field(default_factory=lambda: np.eye(4))
 
     def to_world(self, points: Array) -> Array:
-        """Returns the world coordinates (n, 3) of points (n, 3) of the map frame [m]."""
         return geometry.transform(geometry.inverse(self.map_from_world), points)
 
 
@@ -368,6 +356,5 @@ class Truth:
     #: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a height grid
     #: without objects and for the surrogate. `height_m` is the height of the highest surface, floor or object.
     objects: NDArray[np.uint16] | None = None
-    #: (rows, cols) bool, cells whose floor is hidden below an overhanging object or part of a mesh floor; None where
-    #: `objects` is None.
+    #: (rows, cols) bool, cells whose floor is hidden below an overhang of an object or mesh floor; None as `objects`.
     overhung: NDArray[np.bool_] | None = None

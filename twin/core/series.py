@@ -13,7 +13,7 @@ _INITIAL_CAPACITY = 2**17
 class GrowingArray:
     """Contiguous array of rows of one shape (omitted for scalars); its capacity doubles when it is full.
 
-    The initial capacity suffices for most surveys: pages that are never written occupy no RAM.
+    Pages of the initial capacity that are never written occupy no RAM.
     """
 
     def __init__(self, *shape: int, dtype: DTypeLike = float):
@@ -31,11 +31,9 @@ class GrowingArray:
 
     @property
     def array(self) -> NDArray[Any]:
-        """Returns all rows (n, *shape), a view of the buffer."""
         return self._buffer[: self._n]
 
     def append(self, rows: ArrayLike) -> None:
-        """Appends one row (*shape) or several (k, *shape)."""
         rows = np.asarray(rows).reshape(-1, *self._buffer.shape[1:])
         end = self._n + len(rows)
         if end > len(self._buffer):
@@ -46,10 +44,7 @@ class GrowingArray:
 
 
 def nearest_index(sorted_s: NDArray[np.float64], times_s: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Returns the index (n,) of the element of the sorted times (m,) that is nearest to each of the times (n,) [s].
-
-    The sorted times must not be empty. Of two elements at the same distance, the earlier one is chosen.
-    """
+    """Returns the index (n,) of the sorted time (m >= 1) nearest to each time (n,) [s]; of two, the earlier."""
     after = np.clip(np.searchsorted(sorted_s, times_s), 1, max(len(sorted_s) - 1, 1))
     last = len(sorted_s) - 1
     low, high = np.minimum(after - 1, last), np.minimum(after, last)

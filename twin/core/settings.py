@@ -12,8 +12,7 @@ from twin.errors import TwinError
 MIN_INLIER_SHARE = 0.3
 #: Standard deviation of the interpolation bias, an error common to all points of a link [px].
 COMMON_BIAS_PX = 0.005
-#: If no motion has been measured for more than BLIND_S, the vehicle stops: its speed decays with the time constant
-#: BRAKING_S [s].
+#: After BLIND_S without a measured motion, the vehicle is taken to stop with the time constant BRAKING_S [s].
 BLIND_S, BRAKING_S = 0.5, 1.0
 
 
@@ -24,11 +23,7 @@ def _key(default: Any, description: str, **limits: float) -> Any:
 
 @dataclass(frozen=True)
 class EstimatorSettings:
-    """Settings of motion estimation, the keyframe network and global alignment.
-
-    Raises:
-        TwinError: a value is out of range.
-    """
+    """Settings of motion estimation, network and global alignment; raises TwinError if one is out of range."""
 
     window_tracks: int = _key(4, "number of previous tracks in the window of global alignment", ge=0, le=1000)
     node_stride: int = _key(1, "every n-th keyframe is a node of the network", ge=1, le=20)
@@ -46,9 +41,8 @@ class EstimatorSettings:
     #: this fraction, or if tracking has failed; used only if the caller does not choose the keyframes.
     keyframe_overlap: float = field(default=0.9, metadata={"gt": 0, "lt": 1})
     #: whether features are matched over the whole images wherever a link cannot be measured from the predicted poses;
-    #: for large or unpredictable motions between keyframes. It costs time only where links fail. Otherwise this is done
-    #: only where the covariance of the predicted poses exceeds the search range, and a link must agree with this
-    #: covariance.
+    #: for large or unpredictable motions between keyframes. It costs time only where links fail. Otherwise only where
+    #: the covariance of the predicted poses, with which a link must then agree, exceeds the search range.
     wide_search: bool = False
     #: whether the images have noise, so that no image of a live camera equals the image before it.
     noisy_images: bool = True
@@ -66,10 +60,5 @@ class EstimatorSettings:
 
 
 def braking_factor(blind_s: float, interval_s: float) -> float:
-    """Returns the factor, at most 1, by which the speed is multiplied over an interval.
-
-    Args:
-        blind_s: time without a measured motion, up to the start of the interval.
-        interval_s: length of the interval.
-    """
+    """Returns the factor of the speed over an interval that starts after `blind_s` without measured motion."""
     return 1.0 if blind_s <= BLIND_S else math.exp(-interval_s / BRAKING_S)

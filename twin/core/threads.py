@@ -1,7 +1,4 @@
-"""Threads: bands of rows of an image, the images of a pair or the next item at the same time; one for linear algebra.
-
-The result does not depend on the number of bands.
-"""
+"""Threads: row bands, pairs of images, the next item, one for linear algebra. Results do not depend on the bands."""
 
 from __future__ import annotations
 
@@ -29,8 +26,7 @@ _state = threading.local()  # `whole` is set while this thread processes one ima
 def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left, Right]:
     """Returns the results of `left` and `right`, computed at the same time if there are enough processors.
 
-    Neither may modify data that the other uses. Meanwhile, `in_row_bands` does not split images. Any exception of the
-    two is raised.
+    Neither may modify data that the other uses. Meanwhile, `in_row_bands` does not split images.
     """
     if _n_processors() < THREADS:
         return left(), right()
@@ -43,7 +39,6 @@ def in_pair(left: Callable[[], Left], right: Callable[[], Right]) -> tuple[Left,
 
 
 def _whole(work: Callable[[], Left]) -> Left:
-    """Returns the result of `work`, during which `in_row_bands` does not split images in this thread."""
     _state.whole = True
     try:
         return work()
@@ -52,14 +47,9 @@ def _whole(work: Callable[[], Left]) -> Left:
 
 
 def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: int = 1) -> None:
-    """Runs `work(first_row, end_row)` over all rows, in parallel bands if the image is large.
+    """Runs `work(first_row, end_row)` over all rows, in parallel bands if the image is large and not one of a pair.
 
-    All rows are one band if there are fewer than `THREADS` processors, or within a call of `in_pair`. Any exception of
-    a band is raised.
-
-    Args:
-        work: processes rows first_row to end_row - 1; its kernels release the GIL.
-        rows_per_row: number of image rows that each processed row represents.
+    The kernels in `work` release the GIL; each processed row stands for `rows_per_row` rows of the image.
     """
     small = n_rows * rows_per_row < THREADS * LEAST_ROWS
     if small or getattr(_state, "whole", False) or _n_processors() < THREADS:
@@ -76,7 +66,7 @@ def in_row_bands(work: Callable[[int, int], None], n_rows: int, rows_per_row: in
 
 @cache
 def _thread_pool(process: int) -> ThreadPoolExecutor:
-    """Returns the pool of threads that work in addition to the calling thread; each forked process has its own pool."""
+    """Returns the threads that work in addition to the calling one; a forked process has its own."""
     return ThreadPoolExecutor(THREADS - 1, thread_name_prefix=f"bands-{process}")
 
 
@@ -86,7 +76,6 @@ def _n_processors() -> int:
 
 
 def prefetched(items: Iterator[Item]) -> Iterator[Item]:
-    """Yields the items of an iterator; a second thread prepares the next one."""
     end = object()
     with ThreadPoolExecutor(1) as pool:
         coming = pool.submit(next, items, end)
@@ -96,8 +85,5 @@ def prefetched(items: Iterator[Item]) -> Iterator[Item]:
 
 
 def one_blas_thread() -> AbstractContextManager[object]:
-    """Returns a context in which the loaded libraries of linear algebra use one thread.
-
-    Several slow down operations on small matrices, and may change the last bits.
-    """
+    """Returns a context with one thread of linear algebra: several are slow on small matrices, and change last bits."""
     return threadpool_limits(1, "blas")

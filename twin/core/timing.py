@@ -13,7 +13,6 @@ import numpy as np
 
 #: Function, such as a `Stopwatch`, that takes the name of a stage and returns a context manager that times the stage.
 StageTimer = Callable[[str], AbstractContextManager[None]]
-#: Stages of a survey, in processing order.
 STAGES = ("physics", "render", "optics", "f2f", "f2m", "stereo", "flow", "network", "ga", "map", "orthomosaic")
 
 
@@ -32,19 +31,15 @@ class Stopwatch:
             self._durations_s[stage].append(time.perf_counter() - start)
 
     def durations_ms(self, stage: str) -> list[float]:
-        """Returns all durations of a stage [ms], in order of measurement."""
         return [round(1e3 * duration_s, 3) for duration_s in self._durations_s.get(stage, [])]
 
     def summary(self) -> dict[str, dict[str, float | int | None]]:
-        """Returns count, total [s], mean and 95th percentile [ms] of all `STAGES`; the last two None for count 0."""
+        """Returns count, total [s], mean and 95th percentile [ms] (None for count 0) of all `STAGES`."""
         return {stage: _summary(self._durations_s.get(stage, [])) for stage in STAGES}
 
 
 def timing_summary(simulated_s: float, wall_s: float, stopwatch: Stopwatch) -> dict[str, Any]:
-    """Returns wall time and simulated or recorded time [s], peak memory [MiB], and the durations of the stages.
-
-    The peak memory is None on Windows.
-    """
+    """Returns wall and simulated or recorded time [s], peak memory [MiB] (None on Windows), and times of the stages."""
     memory_mb = _peak_rss_mb()
     return {"wall_s": wall_s, "simulated_s": simulated_s, "peak_rss_mb": memory_mb, "stages": stopwatch.summary()}
 

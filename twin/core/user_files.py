@@ -1,20 +1,42 @@
-"""Gate for files that a user names: bounded regular files; whatever a reader raises becomes a TwinError of one line."""
+"""Gate for files that a user names: bounded regular files; whatever a reader raises becomes a TwinError of one line.
+
+Rasters are opened by named drivers of GDAL only, without network and without other files.
+"""
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
+import re
+import warnings
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from twin.errors import TwinError, described
+
+if TYPE_CHECKING:
+    import rasterio
 
 MOST_TEXT_BYTES = 64 * 2**20  #: largest text file, unless its reader sets another limit
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")  #: formats of images by their names in Pillow
 MOST_IMAGE_BYTES = 512 * 2**20  #: largest encoded image
 _MOST_BYTES = 16 * 2**30  # largest file that is not read as a whole
+#: First bytes of the files of each driver. Other drivers (WMS, VRT) read other files or send requests.
+_SIGNATURES = {
+    "GTiff": rb"II[*+]\0|MM\0[*+]",
+    "PNG": rb"\x89PNG",
+    "JPEG": rb"\xff\xd8\xff",
+    "BMP": rb"BM",
+    "WEBP": rb"RIFF....WEBP",
+}
+IMAGE_DRIVERS = tuple(_SIGNATURES)  #: drivers that read plain images
+_MOST_TILE_PX = 2**24  # largest number of pixels of a tile that exceeds the raster
+_BESIDE = re.compile(r"<(SRS|GeoTransform|NoDataValue|Scale|Offset|UnitType|GCPList)\b")
+_ONE_FILE = "one file that contains them, as gdal_translate IN OUT writes it"
 
 
 @contextmanager
@@ -50,14 +72,12 @@ def read_bytes(file: Path, key: str = "", allowed: str = "", most_bytes: int = M
 def read_text(
     file: Path, key: str = "", allowed: str = "", most_bytes: int = MOST_TEXT_BYTES, encoding: str = "utf-8-sig"
 ) -> str:
-    """Returns the contents of a text file, lines ending in a line feed; raises TwinError as `reading` does."""
     data = read_bytes(file, key, allowed, most_bytes)
     with reading(file, key, allowed):
         return io.TextIOWrapper(io.BytesIO(data), encoding).read()
 
 
 def read_json(file: Path, key: str = "", allowed: str = "", most_bytes: int = MOST_TEXT_BYTES) -> Any:
-    """Returns the contents of a JSON file; raises TwinError as `reading` does."""
     text = read_text(file, key, allowed, most_bytes)
     with reading(file, key, allowed):
         try:
@@ -67,7 +87,6 @@ def read_json(file: Path, key: str = "", allowed: str = "", most_bytes: int = MO
 
 
 def _check(file: Path, key: str, allowed: str, most_bytes: int) -> None:
-    """Raises TwinError unless a path is a regular file of at most `most_bytes` bytes."""
     if not is_file(file):
         if problem := path_problem(file):
             raise _error(file, key, f"cannot be read: {problem}", allowed)
@@ -90,7 +109,6 @@ def _error(file: Path, key: str, problem: str, allowed: str = "") -> TwinError:
 
 
 def is_file(path: Path) -> bool:
-    """Returns whether a path is a regular file; False for an invalid path (null byte, too long)."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -98,7 +116,7 @@ def is_file(path: Path) -> bool:
 
 
 def resolved(path: Path) -> Path:
-    """Returns the absolute path without symbolic links; a path that cannot be resolved is only made absolute."""
+    """Returns the absolute path, without symbolic links if it can be resolved."""
     try:
         return path.resolve()
     except (OSError, ValueError, RuntimeError):  # too long; null byte; loop of links
@@ -106,7 +124,7 @@ def resolved(path: Path) -> Path:
 
 
 def path_problem(path: Path) -> str | None:
-    """Returns why the file system rejects a path, or None; the path need not exist."""
+    """Returns why the file system rejects a path, which need not exist; None if it does not."""
     text = str(path)
     if "\0" in text:
         return "contains a null byte"
@@ -119,3 +137,57 @@ def path_problem(path: Path) -> str | None:
     except (OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error)
     return None
+
+
+@contextmanager
+def open_raster(
+    file: Path, key: str = "", allowed: str = "", drivers: Sequence[str] = ("GTiff",)
+) -> Iterator[rasterio.DatasetReader]:
+    """Opens a raster file by one of the named drivers of GDAL; `key` and `allowed` are those of `reading`.
+
+    Raises TwinError if the file is missing, damaged or of another format, names another file, or has larger tiles than
+    it needs, coordinates that are not finite, or coordinates or values without data in a file beside it.
+    """
+    import rasterio  # imported here: it takes 20 MB of memory, and most terrains do not need it
+    from rasterio.errors import NotGeoreferencedWarning
+
+    # GDAL looks for no file beside the opened one: overviews and masks beside it may be of any driver
+    with reading(file, key, allowed), warnings.catch_warnings(), rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        with rasterio.open(file, driver=_driver(file, drivers)) as source:
+            _check_contents(source)
+            if source.driver == "GTiff":
+                _check_beside(file, key, source.transform.is_identity)
+            yield source
+
+
+def _driver(file: Path, drivers: Sequence[str]) -> str:
+    """Returns the driver of a file, by its first bytes; raises ValueError if it is none of `drivers`."""
+    with file.open("rb") as stream:
+        start = stream.read(12)
+    for driver in drivers:
+        if re.match(_SIGNATURES[driver], start, re.DOTALL):
+            return driver
+    raise ValueError(f"it is not a file of the format {', '.join(drivers)}")
+
+
+def _check_contents(source: rasterio.DatasetReader) -> None:
+    if "OVERVIEWS" in source.tag_namespaces():  # GDAL opens the file that OVERVIEW_FILE names, with any driver
+        raise ValueError("it names another file, of overviews")
+    if max((rows * cols for rows, cols in source.block_shapes), default=0) > max(
+        _MOST_TILE_PX, source.width * source.height
+    ):
+        raise ValueError(f"its tiles of {source.block_shapes[0]} pixels are larger than the raster")
+    if not np.isfinite(source.transform[:6]).all():
+        raise ValueError("its coordinates are not finite")
+
+
+def _check_beside(file: Path, key: str, unplaced: bool) -> None:
+    """Raises TwinError if coordinates or missing values of a raster are in a file beside it, which is not read."""
+    worlds = [file.with_suffix(suffix) for suffix in (".tfw", ".tifw", ".wld") if unplaced]
+    notes = file.with_name(f"{file.name}.aux.xml")
+    found = [world for world in worlds if world.is_file()]
+    if notes.is_file() and _BESIDE.search(read_text(notes)):
+        found.append(notes)
+    if found:
+        raise TwinError(key or str(file), f"{found[0].name!r} has coordinates or values of {file.name!r}", _ONE_FILE)

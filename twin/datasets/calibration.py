@@ -59,25 +59,22 @@ class StereoCalibration:
 
     @property
     def baseline_m(self) -> float:
-        """Returns the distance between the two cameras [m]."""
         return float(np.linalg.norm(self.right_from_left[:3, 3]))
 
     @property
     def left_from_right(self) -> Array:
-        """Returns the pose (4, 4) of the right camera in the axes of the left one."""
         return geometry.inverse(self.right_from_left)
+
+    def left_from(self, side: str) -> Array:
+        """Returns the pose (4, 4) of the "left" or the "right" camera in the axes of the left one."""
+        return np.eye(4) if side == "left" else self.left_from_right
 
     @property
     def sides(self) -> tuple[tuple[str, RecordedCamera], tuple[str, RecordedCamera]]:
-        """Returns both cameras with their names."""
         return ("left", self.left), ("right", self.right)
 
     def for_images(self, width_px: int, height_px: int) -> StereoCalibration:
-        """Returns the calibration with the size of the images set, which a calibration file need not state.
-
-        Raises:
-            TwinError: the calibration does not fit images of this size.
-        """
+        """Returns the calibration with the size of the images set; raises TwinError if it does not fit this size."""
         size = width_px, height_px
         for name, camera in self.sides:
             if fault := _misfit(name, camera, size):
@@ -92,7 +89,6 @@ def rectified_calibration(rig: StereoRig) -> StereoCalibration:
 
 
 def _misfit(name: str, camera: RecordedCamera, size: tuple[int, int]) -> tuple[str, str] | None:
-    """Returns why a camera cannot have taken images of a size, and what is allowed; None if it can."""
     given, (width, height) = camera.size_px, size
     if given is not None and given != size:
         problem = f"the {name} camera is calibrated for images of {given[0]} x {given[1]} px"
@@ -112,12 +108,7 @@ def _misfit(name: str, camera: RecordedCamera, size: tuple[int, int]) -> tuple[s
 
 
 def checked(calibration: StereoCalibration) -> StereoCalibration:
-    """Returns the calibration after checks of its values, with an exactly orthonormal rotation between the cameras.
-
-    Raises:
-        TwinError: there is no baseline, the cameras are swapped or not side by side, or a value is impossible; the
-            message names the file.
-    """
+    """Returns the calibration with an orthonormal rotation; raises TwinError, naming the file, for a wrong value."""
     pose = calibration.right_from_left
     faults = [_impossible(name, camera) for name, camera in calibration.sides]
     if not is_rigid(pose):
@@ -152,7 +143,6 @@ def _wrong_baseline(right_from_left: Array) -> tuple[str, str] | None:
 
 
 def _impossible(name: str, camera: RecordedCamera) -> tuple[str, str] | None:
-    """Returns what is wrong unless focal lengths, distortion and image size of a camera are possible."""
     matrix, distortion = camera.matrix, camera.distortion
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or not np.isfinite(distortion).all():
         return f"the matrix or the distortion of the {name} camera is not a set of finite numbers", ""
@@ -172,16 +162,11 @@ def _impossible(name: str, camera: RecordedCamera) -> tuple[str, str] | None:
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
-    """Returns the camera matrix (3, 3)."""
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
 def distortion_kind(name: Any, file: Path) -> Any:
-    """Returns the kind of distortion of a lens model such as "plumb_bob": "radtan" or "fisheye".
-
-    Raises:
-        TwinError: the lens model is not supported; the message names the file or topic.
-    """
+    """Returns "radtan" or "fisheye" for a lens model such as "plumb_bob"; raises TwinError if it is not supported."""
     text = str(name).lower()
     if text in _FISHEYE or text in _RADTAN:
         return "fisheye" if text in _FISHEYE else "radtan"

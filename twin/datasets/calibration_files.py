@@ -1,7 +1,6 @@
 """Calibration files of other programs: OpenCV, Kalibr camchain, ROS camera_info, ORB-SLAM3, COLMAP cameras.txt.
 
-Every key of a file is read or known to be irrelevant; any other is refused by its name, because a key that is dropped
-(a distortion under another name) leaves a calibration that looks right and is wrong.
+An unknown key is refused: a dropped one (a distortion under another name) leaves a wrong calibration that looks right.
 """
 
 from __future__ import annotations
@@ -45,11 +44,9 @@ _ORBSLAM_IRRELEVANT = re.compile(
 def read_calibration(file: Path) -> StereoCalibration:
     """Returns the calibration of a file of one of the programs in `READ`.
 
-    The rig of the cameras in cameras.txt is read from rigs.txt in the same folder; the other camera of a ROS pair from
-    the file whose name has "right" in place of "left".
-
-    Raises:
-        TwinError: the file cannot be read, is of an unknown kind, has an unknown key, or its values are impossible.
+    The rig of the cameras in cameras.txt is read from rigs.txt beside it; the other camera of a ROS pair from the file
+    whose name has "right" in place of "left". Raises TwinError if the file cannot be read, is of an unknown kind, has
+    an unknown key, or its values are impossible.
     """
     if file.suffix == ".txt":
         return checked(colmap.read_rig(file))
@@ -64,7 +61,6 @@ def read_calibration(file: Path) -> StereoCalibration:
 
 
 def _read_tree(file: Path) -> Mapping[str, Any]:
-    """Returns the keys and values of a YAML or JSON file, or of an XML file that OpenCV wrote."""
     if file.suffix.lower() != ".xml":
         return read_yaml(file)  # JSON is YAML
     text = read_text(file, 2**20)
@@ -83,10 +79,8 @@ def find_calibration(folder: Path) -> Path | None:
     """Returns the calibration file of a folder, or None if it has none.
 
     It is calibration.yaml (.yml, .xml, .json), otherwise the left of two ROS files, otherwise the only YAML file,
-    otherwise cameras.txt.
-
-    Raises:
-        TwinError: the folder has several YAML files, and not exactly one of them is called calibration.
+    otherwise cameras.txt. Raises TwinError if the folder has several YAML files, and not exactly one of them is called
+    calibration.
     """
     suffixes = (".yaml", ".yml", ".xml", ".json")
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in suffixes)
@@ -125,12 +119,10 @@ _PROGRAMS = {"cam0": kalibr.read_camchain, "projection_matrix": read_pair, "Came
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the calibration in the formats of OpenCV, Kalibr and COLMAP; returns the folders `believed` and `true`.
+    """Writes the calibration for OpenCV, Kalibr and COLMAP to the folders `believed` and, if it is known, `true`.
 
-    The believed calibration is that of the estimators, with which the images were rectified. The true calibration
-    describes the same rectified images: if the believed one has errors, these images still have some distortion and
-    the cameras some relative rotation. If the true calibration is not known, only `believed` is written. Runs with an
-    IMU also get imu.yaml (Kalibr).
+    Both describe the images as the estimators rectified them: with calibration errors, the true one still has
+    distortion and a relative rotation. With an IMU, imu.yaml (Kalibr) is written, too.
     """
     written = []
     for name, rig in (("believed", contents.believed), ("true", contents.true)):

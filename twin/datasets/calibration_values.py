@@ -17,7 +17,6 @@ _LARGEST = 1e12  # largest absolute value of a number in a calibration file
 
 
 def refuse_unknown(keys: Iterable[Any], file: Path) -> None:
-    """Raises TwinError if there are keys that were neither read nor known to be irrelevant."""
     unknown = [str(key)[:40] for key in keys]
     if unknown:
         names = ", ".join(map(repr, unknown[:5]))
@@ -25,19 +24,13 @@ def refuse_unknown(keys: Iterable[Any], file: Path) -> None:
 
 
 def table_of(value: Any, file: Path) -> Mapping[str, Any]:
-    """Returns the value if it is a table (keys and values); raises TwinError otherwise."""
     if not isinstance(value, Mapping):
         raise TwinError(str(file), "has no table of a camera", READ)
     return value
 
 
 def numbers_of(value: Any, file: Path, key: str, shape: tuple[int, ...] | None = None) -> Array:
-    """Returns a list of numbers, or those under its key `data`, as an array, reshaped to `shape` if it is given.
-
-    Raises:
-        TwinError: the value is not a list of numbers below 1e12 in absolute value, or their number does not fit
-            `shape`; the message names `key`.
-    """
+    """Returns numbers (or their key `data`) as an array; raises TwinError unless all |x| < 1e12 and `shape` fits."""
     value = value.get("data") if isinstance(value, Mapping) else value
     try:
         array = np.array(value, dtype=np.float64)
@@ -50,11 +43,7 @@ def numbers_of(value: Any, file: Path, key: str, shape: tuple[int, ...] | None =
 
 
 def size_of(value: Any, file: Path) -> tuple[int, int] | None:
-    """Returns an image size [width, height] as a tuple [px]; None if the value is None.
-
-    Raises:
-        TwinError: the value is not two numbers.
-    """
+    """Returns an image size [width, height] [px]; None for None; raises TwinError if these are not two numbers."""
     if value is None:
         return None
     width, height = numbers_of(value, file, "the image size", (2,))

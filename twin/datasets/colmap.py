@@ -15,8 +15,8 @@ from twin.core import geometry
 from twin.core.records import Array, ElevationMap
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix, distortion_kind
 from twin.datasets.calibration_values import size_of
-from twin.datasets.image_copy import copy_image
-from twin.datasets.run_contents import RecordedFrame, RunContents
+from twin.datasets.image_copy import CopiedImage, copy_images
+from twin.datasets.run_contents import RunContents
 from twin.datasets.text_files import text_rows
 from twin.errors import TwinError
 
@@ -38,10 +38,8 @@ _MODELS: dict[str, tuple[tuple[int, int, int, int], tuple[int | None, ...], str]
 def read_rig(file: Path) -> StereoCalibration:
     """Returns the calibration in cameras.txt and in rigs.txt beside it.
 
-    The left camera is the reference camera of the first rig, the right camera its second one.
-
-    Raises:
-        TwinError: there are fewer than two cameras or no rigs.txt, or a line of either file is not valid.
+    The left camera is the reference camera of the first rig, the right camera its second one. Raises TwinError if there
+    are fewer than two cameras or no rigs.txt, or a line of either file is not valid.
     """
     cameras = dict(_read_camera(file, number, parts) for number, parts in text_rows(file))
     rigs = file.with_name("rigs.txt")
@@ -59,7 +57,6 @@ def read_rig(file: Path) -> StereoCalibration:
 
 
 def _read_camera(file: Path, number: int, parts: list[str]) -> tuple[int, RecordedCamera]:
-    """Returns the identifier and the camera in a line of cameras.txt; raises TwinError if it is not supported."""
     model = parts[1] if len(parts) > 1 else ""
     if model not in _MODELS:
         raise TwinError(f"{file}:{number}", f"camera model {model[:40]!r} is not supported", ", ".join(_MODELS))
@@ -88,7 +85,6 @@ def write_rig(folder: Path, rig: StereoCalibration) -> None:
 
 
 def _camera_text(camera: RecordedCamera) -> str:
-    """Returns model, size and parameters of a camera."""
     assert camera.size_px is not None
     (width, height), matrix, distortion = camera.size_px, camera.matrix, camera.distortion
     values = [matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5]
@@ -110,8 +106,6 @@ def _write_lines(file: Path, *lines: str) -> None:
 
 
 class _View(NamedTuple):
-    """One image of the model, with its observations."""
-
     image: int  #: identifier of the image, from 1
     camera: int  #: identifier of its camera: 1 left, 2 right
     name: str  #: path of the image relative to the folder `images`
@@ -121,25 +115,18 @@ class _View(NamedTuple):
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the model to `sparse/0` and the stereo pairs of the keyframes to `images`; returns both folders.
+    """Writes the model to `sparse/0` and the stereo pairs of the keyframes (without any, all pairs) to `images`.
 
-    If no keyframe has a stereo pair, all stereo pairs are written. The poses are the true ones if they are known,
-    otherwise those of the final trajectory. The calibration is the true one if it is known (it is not for recorded
-    data), otherwise the believed one.
-
-    The 3D points are cells of the elevation map with the colours of the orthomosaic; without a map there are none.
-    Their observations are exact projections: an image observes a cell that is projected into it, unless another cell
-    that is projected to the same pixel is nearer by more than 2 %.
+    Poses and calibration are the true ones if they are known, otherwise the final trajectory and the believed
+    calibration. The 3D points are cells of the elevation map, with the colours of the orthomosaic. Their observations
+    are exact projections: an image observes a cell unless another one at the same pixel is nearer by more than 2 %.
     """
     model = folder / "sparse" / "0"
-    for name in (model, folder / "images" / "left", folder / "images" / "right"):
-        name.mkdir(parents=True, exist_ok=True)
+    model.mkdir(parents=True)
     frames = tuple(frame for frame in contents.pairs if frame.keyframe) or contents.pairs
     points, colours = _points(contents.elevation)
-    views = []
-    for k, frame in enumerate(frames):
-        views += _views(contents, frame, k, (points, folder))
-        contents.progress((k + 1) / len(frames))
+    images = copy_images(contents, lambda side, frame: folder / "images" / side / f"{frame.index:06d}", frames)
+    views = [_view(contents, number, image, points) for number, image in enumerate(images, 1)]
     write_rig(model, contents.best_calibration)
     _write_frames(model / "frames.txt", views)
     _write_images(model / "images.txt", views)
@@ -159,19 +146,13 @@ def _points(elevation: ElevationMap | None) -> tuple[Array, NDArray[np.uint8]]:
     return elevation.to_world(points), colours[known]
 
 
-def _views(contents: RunContents, frame: RecordedFrame, k: int, target: tuple[Array, Path]) -> list[_View]:
-    """Copies the images of stereo pair `k` and returns their views of the points (n, 3); `target`: points, folder."""
-    points, folder = target
-    rig, world_from_left = contents.best_calibration, contents.poses.world_from_camera[frame.index]
-    views = []
-    sides = (("left", frame.left, np.eye(4), rig.left), ("right", frame.right, rig.left_from_right, rig.right))
-    for number, (side, file, left_from_camera, camera) in enumerate(sides, 1):
-        assert file is not None
-        copied = copy_image(file, folder / "images" / side / f"{frame.index:06d}", contents.jpeg_quality)
-        camera_from_world = geometry.inverse(world_from_left @ left_from_camera)
-        pixels, seen = _observed(geometry.transform(camera_from_world, points), camera)
-        views.append(_View(2 * k + number, number, f"{side}/{copied.name}", camera_from_world, pixels, seen))
-    return views
+def _view(contents: RunContents, number: int, image: CopiedImage, points: Array) -> _View:
+    """Returns the view of the points (n, 3) in an image, which is that of the left camera if its number is odd."""
+    rig, world_from_left = contents.best_calibration, contents.poses.world_from_camera[image.frame.index]
+    camera_from_world = geometry.inverse(world_from_left @ rig.left_from(image.camera))
+    pixels, seen = _observed(geometry.transform(camera_from_world, points), dict(rig.sides)[image.camera])
+    name, camera = f"{image.camera}/{image.file.name}", 1 if image.camera == "left" else 2
+    return _View(number, camera, name, camera_from_world, pixels, seen)
 
 
 def _observed(points_m: Array, camera: RecordedCamera) -> tuple[Array, NDArray[np.int64]]:
@@ -190,7 +171,6 @@ def _observed(points_m: Array, camera: RecordedCamera) -> tuple[Array, NDArray[n
 
 
 def _write_frames(file: Path, views: list[_View]) -> None:
-    """Writes for each stereo pair the pose of the world in the left camera, and the image identifiers."""
     header = "# FRAME_ID, RIG_ID, RIG_FROM_WORLD, NUM_DATA_IDS, DATA_IDS[] as (SENSOR_TYPE, SENSOR_ID, DATA_ID)"
     lines = [
         f"{k} 1 {_pose_text(left.camera_from_world)} 2 CAMERA 1 {left.image} CAMERA 2 {right.image}"
@@ -200,7 +180,6 @@ def _write_frames(file: Path, views: list[_View]) -> None:
 
 
 def _write_images(file: Path, views: list[_View]) -> None:
-    """Writes for each image a line with the pose of the world in its camera, and a line of observations."""
     lines = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# POINTS2D[] as (X, Y, POINT3D_ID)"]
     for view in views:
         lines.append(f"{view.image} {_pose_text(view.camera_from_world)} {view.camera} {view.name}")
@@ -210,7 +189,6 @@ def _write_images(file: Path, views: list[_View]) -> None:
 
 
 def _write_points(file: Path, points: Array, colours: NDArray[np.uint8], views: list[_View]) -> None:
-    """Writes the points that at least one image observes, each with its observations (track)."""
     tracks: list[list[str]] = [[] for _ in points]
     for view in views:
         for row, point in enumerate(view.points):

@@ -45,8 +45,8 @@ class StereoImages(NamedTuple):
 class Dataset:
     """A recorded stereo data set.
 
-    Where a TwinError stands in place of the calibration, the truth or the readings, the data set has one that cannot be
-    used; it is raised unless the user gives another one, or replays without the readings.
+    A TwinError in place of the calibration, the truth or the readings stands for one that cannot be used; it is raised
+    unless the user gives another one, or replays without the readings.
     """
 
     folder: Path  #: folder or file of the data set; all images lie in it
@@ -82,20 +82,14 @@ class Reader(Protocol):
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a folder or file; images are not decoded.
 
-        An error in the calibration, the truth or the readings is returned in `Dataset`, not raised.
-
-        Raises:
-            TwinError: another file of the data set is missing or damaged.
+        An error in the calibration, the truth or the readings is returned in `Dataset`; TwinError is raised if another
+        file is missing or damaged.
         """
         ...
 
 
 def check_times(dataset: Dataset) -> None:
-    """Raises TwinError if the times of the frames cannot be in seconds.
-
-    This is so if the absolute value of a time is above 1e11 s or not a number, or if the median of the intervals
-    between frames at different times is below 1e-5 s.
-    """
+    """Raises TwinError unless times are below 1e11 s, and the median of the differing intervals is above 1e-5 s."""
     times_s = np.array([frame.time_s for frame in dataset.images], np.float64)
     wrong = np.flatnonzero(~(np.abs(times_s) <= _LATEST_S))
     if len(wrong):
@@ -109,7 +103,6 @@ def check_times(dataset: Dataset) -> None:
 
 
 def value_or_error(read: Callable[[], T]) -> T | TwinError:
-    """Returns the value that `read` returns, or the TwinError that it raises."""
     try:
         return read()
     except TwinError as error:

@@ -1,7 +1,6 @@
 """EuRoC/ASL folders (Burri et al. 2016), read and written: mav0/cam0, mav0/cam1, true poses, readings of sensors.
 
-In the files, times are in nanoseconds, and true poses are those of the body. In a `Dataset`, times are in seconds, and
-true poses are those of the left camera (cam0).
+In the files, times are in nanoseconds and true poses those of the body; in a `Dataset`, seconds and the left camera.
 """
 
 from __future__ import annotations
@@ -17,33 +16,30 @@ from twin.core.geometry import Array
 from twin.core.records import StereoRig, Trajectory
 from twin.datasets.calibration import StereoCalibration, checked, is_rigid
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, trajectory_of, value_or_error
-from twin.datasets.image_copy import copy_image
+from twin.datasets.image_copy import copy_images
 from twin.datasets.kalibr import camera_of, pose_of
-from twin.datasets.run_contents import RunContents
+from twin.datasets.run_contents import RecordedFrame, RunContents
 from twin.datasets.sensor_folders import pose_table, read_folder, timestamp_ns, write_csv, write_readings, write_sensor
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
-_CAMERAS = ("cam0", "cam1")
+_CAMERAS = {"left": "cam0", "right": "cam1"}
 _TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0")  # folders with true poses; the first is written
 _TRUE_MAP = "dem_truth.tif"  # file of true heights in such a folder
 _POSITIONS = "leica0"  # folder with true positions of a prism, without attitude
 
 
 class EurocReader:
-    """Reads folders in the EuRoC/ASL format."""
-
     name = "euroc"
     layout = "mav0/cam0 and mav0/cam1, each with data.csv, data/ and sensor.yaml"
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a folder, or its subfolder mav0, has the image lists (data.csv) of two cameras."""
-        return all((_root(folder) / camera / "data.csv").is_file() for camera in _CAMERAS)
+        return all((_root(folder) / camera / "data.csv").is_file() for camera in _CAMERAS.values())
 
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a folder; raises TwinError if a list of images is damaged or leads out of it."""
         root = _root(folder)
-        left, right = (_image_times(root / camera) for camera in _CAMERAS)
+        left, right = (_image_times(root / camera) for camera in _CAMERAS.values())
         frames, n_right_only = pair_by_time(left, right)
         body = value_or_error(lambda: _body_from_left(root))
         body_from_left = None if isinstance(body, TwinError) else body
@@ -70,13 +66,7 @@ class EurocReader:
 
 
 def camera_truth(file: Path, body_from_left: Array) -> Trajectory:
-    """Returns the poses of the left camera from a file of true poses of the body.
-
-    The columns are: time [ns], x, y, z [m], qw, qx, qy, qz.
-
-    Raises:
-        TwinError: the file is damaged or empty, or a quaternion is not of unit length.
-    """
+    """Returns camera poses from body poses (time [ns], x, y, z [m], qw, qx, qy, qz); raises TwinError if damaged."""
     rows = read_table(file, 8)
     body = trajectory_of(rows[:, 0] * 1e-9, rows[:, 1:4], rows[:, 4:8])
     if not len(rows) or body is None:
@@ -85,12 +75,10 @@ def camera_truth(file: Path, body_from_left: Array) -> Trajectory:
 
 
 def _root(folder: Path) -> Path:
-    """Returns the folder of the sensors: the subfolder mav0 or, without it, the folder itself."""
     return folder / "mav0" if (folder / "mav0").is_dir() else folder
 
 
 def _image_times(camera: Path) -> list[ImageTime]:
-    """Returns the times and files of the images of a camera, in the order of data.csv."""
     images, source = [], camera / "data.csv"
     for number, parts in text_rows(source):
         if len(parts) < 2 or not re.fullmatch(r"\d{1,19}", parts[0].strip()):
@@ -100,8 +88,7 @@ def _image_times(camera: Path) -> list[ImageTime]:
 
 
 def _calibration(root: Path) -> StereoCalibration | None:
-    """Returns the calibration from the files sensor.yaml of both cameras; None if one of the files is missing."""
-    files = [root / camera / "sensor.yaml" for camera in _CAMERAS]
+    files = [root / camera / "sensor.yaml" for camera in _CAMERAS.values()]
     if not all(file.is_file() for file in files):
         return None
     trees = [read_yaml(file) for file in files]
@@ -124,23 +111,20 @@ def _body_from_left(root: Path) -> Array | None:
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes images, calibration, readings and the truth, if known, to `folder`/mav0, and returns [`folder`/mav0].
 
-    The readings are those of pressure sensor, AHRS, DVL and USBL at the recorded frames, and all readings of the IMU,
-    as far as they were recorded. The truth consists of the poses of the body at all frames of the survey, including
-    those without a recorded image, and of the true heights (dem_truth.tif), if the run has them.
+    The truth has the poses of the body at all frames of the survey, also those without a recorded image, and the true
+    heights (dem_truth.tif), if the run has them.
     """
     root, rig = folder / "mav0", contents.rig
     _write_camera(root / "cam0", rig, rig.body_from_camera)
     _write_camera(root / "cam1", rig, rig.body_from_camera @ rig.left_from_right)
-    lists: dict[str, list[str]] = {camera: [] for camera in _CAMERAS}
-    for k, frame in enumerate(contents.frames):
-        stamp = str(timestamp_ns(frame.time_s))
-        for camera, file in zip(_CAMERAS, (frame.left, frame.right), strict=True):
-            if file is not None:
-                copied = copy_image(file, root / camera / "data" / stamp, contents.jpeg_quality)
-                lists[camera].append(f"{stamp},{copied.name}")
-        contents.progress((k + 1) / len(contents.frames))
-    for camera, lines in lists.items():
-        write_csv(root / camera, "filename", lines)
+
+    def stem(side: str, frame: RecordedFrame) -> Path:
+        return root / _CAMERAS[side] / "data" / str(timestamp_ns(frame.time_s))
+
+    images = copy_images(contents, stem)
+    for side, camera in _CAMERAS.items():
+        rows = [(image.frame.time_s, [image.file.name]) for image in images if image.camera == side]
+        write_csv(root / camera, "filename", rows)
     if "truth" in contents.trajectories:
         _write_truth(root / _TRUTH[0], contents)
     write_readings(root, contents)
@@ -148,7 +132,6 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _write_camera(folder: Path, rig: StereoRig, body_from_camera: Array) -> None:
-    """Creates the folder of a camera of rectified images with its calibration."""
     (folder / "data").mkdir(parents=True, exist_ok=True)
     tree = {
         "sensor_type": "camera",
@@ -164,13 +147,12 @@ def _write_camera(folder: Path, rig: StereoRig, body_from_camera: Array) -> None
 
 
 def _write_truth(folder: Path, contents: RunContents) -> None:
-    """Writes the true poses of the body, and the true heights, if the run has them."""
     folder.mkdir(exist_ok=True)
-    truth, lines = contents.trajectories["truth"], []
+    truth, rows = contents.trajectories["truth"], []
     world_from_body = truth.world_from_camera @ geometry.inverse(contents.rig.body_from_camera)
     for time_s, pose in zip(truth.times_s, world_from_body, strict=True):
         values = [*pose[:3, 3], *geometry.quaternion_wxyz(pose[:3, :3])]
-        lines.append(",".join([str(timestamp_ns(time_s)), *(f"{value:.12g}" for value in values)]))
-    write_csv(folder, "x [m],y [m],z [m],qw [],qx [],qy [],qz []", lines)
+        rows.append((time_s, [f"{value:.12g}" for value in values]))
+    write_csv(folder, "x [m],y [m],z [m],qw [],qx [],qy [],qz []", rows)
     if contents.true_map is not None:
         shutil.copyfile(contents.true_map, folder / _TRUE_MAP)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from twin.core.records import Array
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
 from twin.datasets.run_contents import RecordedFrame, RunContents
 from twin.errors import TwinError
@@ -21,24 +20,30 @@ _PNG_END = b"IEND\xaeB`\x82"  # last bytes of a complete PNG file
 class CopiedImage(NamedTuple):
     """An image in an exported data set."""
 
-    name: str  #: name of the file
+    file: Path
     frame: RecordedFrame
     camera: str  #: "left" or "right"
-    left_from_camera: Array  #: (4, 4) pose of the camera in the axes of the left camera [m]
 
 
-def copy_images(contents: RunContents, folder: Path, left_from_right: Array) -> Iterator[CopiedImage]:
-    """Copies all recorded images to a folder as CAMERA_FRAME, for example left_000012.png, and yields each copy.
-
-    Frames without a right image have only the left one. `left_from_right` (4, 4) is the pose of the right camera.
-    """
-    folder.mkdir(exist_ok=True)
-    for k, frame in enumerate(contents.frames):
-        for camera, file, pose in (("left", frame.left, np.eye(4)), ("right", frame.right, left_from_right)):
+def copy_images(
+    contents: RunContents, stem: Callable[[str, RecordedFrame], Path], frames: Sequence[RecordedFrame] | None = None
+) -> list[CopiedImage]:
+    """Copies images of recorded frames (default: all) to `stem(camera, frame)` plus suffix; reports the progress."""
+    frames, copied = contents.frames if frames is None else frames, list[CopiedImage]()
+    for k, frame in enumerate(frames):
+        for camera, file in (("left", frame.left), ("right", frame.right)):
             if file is not None:
-                copied = copy_image(file, folder / f"{camera}_{frame.index:06d}", contents.jpeg_quality)
-                yield CopiedImage(copied.name, frame, camera, pose)
-        contents.progress((k + 1) / len(contents.frames))
+                target = stem(camera, frame)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                copied.append(CopiedImage(copy_image(file, target, contents.jpeg_quality), frame, camera))
+        contents.progress((k + 1) / len(frames))
+    return copied
+
+
+def copy_all(contents: RunContents, folder: Path) -> list[CopiedImage]:
+    """Copies all recorded images to a folder as CAMERA_FRAME, for example left_000012.png; returns the copies."""
+    folder.mkdir(exist_ok=True)
+    return copy_images(contents, lambda camera, frame: folder / f"{camera}_{frame.index:06d}")
 
 
 def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Path:
@@ -52,9 +57,7 @@ def copy_image(source: Path, stem: Path, jpeg_quality: int | None = None) -> Pat
 def encoded_image(source: Path, jpeg_quality: int | None = None) -> tuple[str, bytes]:
     """Returns the format ("png" or "jpeg") and the bytes of a PNG file, as they are or, with a quality, as JPEG.
 
-    Raises:
-        TwinError: the file is truncated or not a PNG image.
-        OSError: the file cannot be read.
+    Raises TwinError if the file is truncated or not a PNG image, OSError if it cannot be read.
     """
     data = read_bytes(source, most_bytes=MOST_IMAGE_BYTES)
     image = None if jpeg_quality is None else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)

@@ -26,10 +26,7 @@ _N_SAMPLES = 8  # number of images from which the number of used bits is determi
 
 
 class UnreadableImage(Exception):  # noqa: N818 (the frame is skipped)
-    """An image cannot be used.
-
-    The message is a short reason without the file name, so that unusable images can be counted by reason.
-    """
+    """An image cannot be used; the message is a short reason without the file name, for counts by reason."""
 
 
 class ImageFormat(NamedTuple):
@@ -45,9 +42,7 @@ class StoredImage(Protocol):
     """Image that is not stored in a separate file, for example a message of a bag."""
 
     @property
-    def name(self) -> str:
-        """Returns a short name of the image, for messages."""
-        ...
+    def name(self) -> str: ...
 
     def size_px(self) -> tuple[int, int]:
         """Returns (width, height) [px]; raises UnreadableImage if the image is damaged or of an unknown encoding."""
@@ -56,8 +51,7 @@ class StoredImage(Protocol):
     def pixels(self, size_px: tuple[int, int]) -> NDArray[Any]:
         """Returns the values of the image, (H, W) or (H, W, channels) in the order BGR(A), uint8 or uint16.
 
-        Raises:
-            UnreadableImage: the image is damaged, of an unknown encoding, or (width, height) is not `size_px`.
+        Raises UnreadableImage if the image is damaged, of an unknown encoding, or (width, height) is not `size_px`.
         """
         ...
 
@@ -68,23 +62,14 @@ ImageSource = Path | StoredImage
 
 def image_size(image: ImageSource) -> tuple[int, int]:
     """Returns (width, height) of an image [px], from its header; raises UnreadableImage if it cannot be used."""
-    width, height = encoded_size(_contents(image)) if isinstance(image, Path) else image.size_px()
+    width, height = image_header(_contents(image))[:2] if isinstance(image, Path) else image.size_px()
     if width * height > _MOST_PIXELS:
         raise UnreadableImage("too many pixels")
     return width, height
 
 
-def encoded_size(data: bytes) -> tuple[int, int]:
-    """Returns (width, height) [px] of the contents of an image file; raises UnreadableImage if they are no image."""
-    return _header(data)[:2]
-
-
 def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) -> Image:
-    """Returns an image of (width, height) `size_px` as 8-bit RGB (H, W, 3).
-
-    The Bayer pattern of `form` is ignored for an image that has colours already. Raises UnreadableImage if the image is
-    missing, damaged, too large, not in a supported format, or has another size.
-    """
+    """Returns an image as 8-bit RGB (H, W, 3), demosaiced only if it has no colours; may raise UnreadableImage."""
     pixels = _pixels(image, size_px)
     if pixels.dtype == np.uint16:
         pixels = np.clip(pixels.astype(np.float32) * (255 / (2**form.bits - 1)) + 0.5, 0, 255).astype(np.uint8)
@@ -97,12 +82,9 @@ def read_rgb(image: ImageSource, size_px: tuple[int, int], form: ImageFormat) ->
 def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer: Bayer | None) -> ImageFormat:
     """Returns the format of the images of a data set, from a sample of up to `_N_SAMPLES` of them.
 
-    Cameras with 10, 12 or 14 bits store 16-bit images in which only the lower bits are used. The number of bits in use
-    is the smallest one, at least 8, that holds the largest value in the 16-bit images of the sample. It is the same for
-    all images of both cameras, so that grey levels stay comparable. Images that cannot be read are left out.
-
-    Raises:
-        TwinError: a Bayer pattern is given, but an image of the sample has colours already.
+    Cameras with 10, 12 or 14 bits use only the lower bits of 16-bit images. The number of used bits, at least 8, holds
+    the largest value of the sample; it is one for both cameras, so that grey levels stay comparable. Images that cannot
+    be read are left out. Raises TwinError if a Bayer pattern is given, but an image of the sample has colours already.
     """
     largest = 0
     for k in np.unique(np.linspace(0, len(images) - 1, _N_SAMPLES).astype(int)):
@@ -118,7 +100,6 @@ def image_format(images: Sequence[ImageSource], size_px: tuple[int, int], bayer:
 
 
 def _contents(file: Path) -> bytes:
-    """Returns the bytes of a file; raises UnreadableImage if it is missing, too large or unreadable."""
     if not is_file(file):
         raise UnreadableImage("missing")
     try:
@@ -127,8 +108,8 @@ def _contents(file: Path) -> bytes:
         raise UnreadableImage("too large" if error.problem.startswith("is too large") else "unreadable") from None
 
 
-def _header(data: bytes) -> tuple[int, int, str]:
-    """Returns width and height [px] and format ("PNG", "JPEG", "TIFF") of an image, without decoding it."""
+def image_header(data: bytes) -> tuple[int, int, str]:
+    """Returns width, height [px] and format ("PNG", "JPEG", "TIFF") of an image file; may raise UnreadableImage."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # on damaged metadata, which are not used
@@ -141,7 +122,6 @@ def _header(data: bytes) -> tuple[int, int, str]:
 
 
 def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of an image (`StoredImage.pixels`)."""
     pixels = decoded(_contents(image), size_px) if isinstance(image, Path) else image.pixels(size_px)
     if pixels.shape[1::-1] != size_px:
         raise UnreadableImage("another size")
@@ -149,12 +129,8 @@ def _pixels(image: ImageSource, size_px: tuple[int, int]) -> NDArray[Any]:
 
 
 def decoded(data: bytes, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of the contents of a PNG, JPEG or TIFF file (`StoredImage.pixels`).
-
-    Raises UnreadableImage if the data are damaged, not grey or RGB with 8 or 16 bits, or have another size or too many
-    pixels.
-    """
-    width, height, kind = _header(data)
+    """Returns the values of a PNG, JPEG or TIFF; raises UnreadableImage unless grey or RGB, 8 or 16 bit, `size_px`."""
+    width, height, kind = image_header(data)
     if (width, height) != size_px:
         raise UnreadableImage("another size")
     if width * height > _MOST_PIXELS:

@@ -1,7 +1,4 @@
-"""Calibration in files of Kalibr: the camchain of a stereo rig, also of single cameras in EuRoC folders, and imu.yaml.
-
-cam0 is the left camera, cam1 the right one.
-"""
+"""Calibration files of Kalibr (cam0 is the left camera): camchain, single cameras of EuRoC folders, imu.yaml."""
 
 from __future__ import annotations
 
@@ -28,11 +25,7 @@ _IRRELEVANT = (
 
 
 def read_camchain(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration in the keys and values of a camchain.
-
-    Raises:
-        TwinError: cam1 is missing, or a camera or T_cn_cnm1 is not valid.
-    """
+    """Returns the calibration of a camchain; raises TwinError without cam1, or if a camera or T_cn_cnm1 is wrong."""
     if "cam1" not in tree:
         raise TwinError(str(file), "has one camera only, so it has no baseline", "cam0 and cam1 with T_cn_cnm1")
     refuse_unknown((key for key in tree if not re.fullmatch(r"cam\d", str(key))), file)
@@ -41,11 +34,7 @@ def read_camchain(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 
 
 def camera_of(table: Any, file: Path) -> RecordedCamera:
-    """Returns the camera in a table of a camchain or of an EuRoC sensor.yaml.
-
-    Raises:
-        TwinError: a value is missing or not valid, or the camera model or the lens model is not supported.
-    """
+    """Returns the camera in a table of a camchain or EuRoC sensor.yaml; raises TwinError for a wrong value or model."""
     table = table_of(table, file)
     if (model := table.get("camera_model", "pinhole")) != "pinhole":
         raise TwinError(str(file), f"camera model {model!r} is not supported", "pinhole with radtan or equidistant")
@@ -58,18 +47,12 @@ def camera_of(table: Any, file: Path) -> RecordedCamera:
 
 
 def pose_of(table: Any, key: str, file: Path) -> Array:
-    """Returns the matrix (4, 4) of a pose, which may be no rigid motion; raises TwinError if it is missing or damaged.
-
-    The pose is a list of rows (Kalibr), or has `rows`, `cols` and `data` (EuRoC).
-    """
+    """Returns the matrix (4, 4) of a pose, which may be no rigid motion; raises TwinError if it is missing."""
     return numbers_of(table_of(table, file).get(key), file, key, (4, 4))
 
 
 def write_camchain(file: Path, rig: StereoCalibration, body_from_left: Array | None = None) -> None:
-    """Writes a camchain; with an IMU, whose axes are those of the body, each camera also has T_cam_imu.
-
-    The coefficient k3 is left out, because Kalibr's model radtan has none.
-    """
+    """Writes a camchain, with T_cam_imu if there is an IMU (in body axes), but no k3, which radtan does not have."""
     tree = {name: _table(camera, name) for name, camera in (("cam0", rig.left), ("cam1", rig.right))}
     tree["cam1"]["T_cn_cnm1"] = rig.right_from_left.tolist()
     if body_from_left is not None:

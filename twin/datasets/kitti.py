@@ -11,7 +11,7 @@ from twin.core.geometry import Array
 from twin.core.records import StereoRig, Trajectory
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked
 from twin.datasets.dataset import Dataset, StereoImages, value_or_error
-from twin.datasets.image_copy import copy_image
+from twin.datasets.image_copy import copy_images
 from twin.datasets.plain_folder import image_files
 from twin.datasets.run_contents import RunContents
 from twin.datasets.text_files import read_table, text_rows
@@ -27,14 +27,10 @@ class KittiReader:
     layout = "image_0 and image_1 (or image_2 and image_3), calib.txt and times.txt"
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a folder has calib.txt, and image_0 or image_2."""
         return (folder / "calib.txt").is_file() and any((folder / f"image_{k}").is_dir() for k in (0, 2))
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder.
-
-        Raises TwinError if times.txt is missing, damaged or has no time for an image, or an image folder is not valid.
-        """
+        """Returns the data set; raises TwinError if times.txt is missing, damaged or short, or images are not valid."""
         number = 2 if (folder / "image_2").is_dir() else 0
         left, right = (image_files(folder / f"image_{k}") for k in (number, number + 1))
         found = value_or_error(lambda: _calibration(folder / "calib.txt", number))
@@ -56,15 +52,10 @@ class KittiReader:
 
 
 def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Trajectory:
-    """Returns the poses of the left camera from a file with the first three rows of a pose of camera 0 in each line.
+    """Returns the poses of the left camera from lines with the first three rows of a pose of camera 0, one per time.
 
-    Args:
-        file: file of the poses.
-        times_s: (n,) times of the frames [s]; line k of the file is the pose at the k-th time.
-        body_from_left: (4, 4) pose of the left camera in the axes of camera 0; None: the left camera is camera 0.
-
-    Raises:
-        TwinError: the file is damaged, or has more poses than there are times.
+    `body_from_left` (4, 4) is the pose of the left camera in camera 0; None: both coincide. Raises TwinError if the
+    file is damaged, or has more poses than there are times.
     """
     rows = read_table(file, 12)
     if len(rows) > len(times_s):
@@ -78,10 +69,7 @@ def camera_poses(file: Path, times_s: Array, body_from_left: Array | None) -> Tr
 
 
 def _calibration(file: Path, number: int) -> tuple[StereoCalibration, Array]:
-    """Returns the calibration of the cameras `number` and `number` + 1, and the pose (4, 4) of the first in camera 0.
-
-    Both follow from the projection matrices (3, 4) of the cameras; raises TwinError if these are missing or impossible.
-    """
+    """Returns the calibration of cameras `number` and `number` + 1, and the pose (4, 4) of the first in camera 0."""
     projections = {parts[0].rstrip(":"): parts[1:13] for _, parts in text_rows(file) if len(parts) >= 13}
     try:
         left, right = (np.array(projections[f"P{k}"], float).reshape(3, 4) for k in (number, number + 1))
@@ -102,19 +90,11 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     Images are in `image_2` (left) and `image_3` (right), numbered from 000000, the times [s] in `times.txt`. As in the
     benchmark, poses of the left camera are relative to the first one, in its axes (x right, y down, z forward).
-
-    Returns:
-        The folder of the sequence and, if written, the file of the poses.
     """
     sequence = folder / "sequences" / _SEQUENCE
     pairs = contents.pairs
-    for name in ("image_2", "image_3"):
-        (sequence / name).mkdir(parents=True, exist_ok=True)
-    for k, frame in enumerate(pairs):
-        assert frame.right is not None
-        copy_image(frame.left, sequence / "image_2" / f"{k:06d}", contents.jpeg_quality)
-        copy_image(frame.right, sequence / "image_3" / f"{k:06d}", contents.jpeg_quality)
-        contents.progress((k + 1) / len(pairs))
+    folders, numbers = {"left": "image_2", "right": "image_3"}, {frame.index: k for k, frame in enumerate(pairs)}
+    copy_images(contents, lambda camera, frame: sequence / folders[camera] / f"{numbers[frame.index]:06d}", pairs)
     (sequence / "times.txt").write_text("".join(f"{frame.time_s:.9f}\n" for frame in pairs), encoding="utf-8")
     (sequence / "calib.txt").write_text(_calibration_text(contents.rig), encoding="utf-8")
     if "truth" not in contents.trajectories:
@@ -128,7 +108,6 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _calibration_text(rig: StereoRig) -> str:
-    """Returns the text of calib.txt: P0 and P2 are the projection matrix of the left camera, P1 and P3 of the right."""
     left = np.column_stack([rig.matrix, np.zeros(3)])
     right = np.column_stack([rig.matrix, [-rig.fx_px * rig.baseline_m, 0.0, 0.0]])
     rows = [left, right, left, right]

@@ -21,7 +21,6 @@ from twin.errors import TwinError
 
 
 def _sides(*stems: str) -> list[tuple[str, ...]]:
-    """Returns the names of a key of the left and of the right camera, made of stems, number and side."""
     return [
         tuple(name for stem in stems for name in (f"{stem}{k}", f"{side}{stem}", f"{stem}{side}"))
         for k, side in ((1, "left"), (2, "right"))
@@ -49,12 +48,9 @@ _TANGENTIAL = 0.05  # largest tangential coefficients of a lens without a stated
 def read_opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
     """Returns the calibration in the keys and values of an OpenCV file.
 
-    R may be a rotation matrix or a rotation vector; without R, the cameras are parallel. If D1 or D2 is missing, its
-    camera has no distortion. T is in metres or in T_unit.
-
-    Raises:
-        TwinError: M1, M2 or T is missing, a key is unknown, a value is not of the expected form, the lens model is not
-            supported or has to be stated, or T may have another unit.
+    R may be a rotation matrix or a rotation vector; without R, the cameras are parallel; without D1 or D2, its camera
+    has no distortion. T is in metres or in T_unit. Raises TwinError if M1, M2 or T is missing, a key is unknown, a
+    value is not of the expected form, the lens model is not supported or has to be stated, or T may have another unit.
     """
     keys = {re.sub(r"[\W_]", "", str(key)).lower(): key for key in tree}
     found = {role: next((keys.pop(name) for name in names if name in keys), None) for role, names in _KEYS.items()}
@@ -93,7 +89,6 @@ def _ask_for_model(cameras: list[RecordedCamera], file: Path) -> None:
 
 
 def _in_metres(translation: Array, unit: Any, file: Path) -> Array:
-    """Returns a translation in metres; raises TwinError if its unit is unknown or the length needs a stated unit."""
     if unit is not None and str(unit) not in _UNITS_M:
         raise TwinError(str(file), f"T_unit {str(unit)[:40]!r} is not known", ", ".join(_UNITS_M))
     length_m = float(np.linalg.norm(translation))
@@ -104,7 +99,6 @@ def _in_metres(translation: Array, unit: Any, file: Path) -> Array:
 
 
 def write_opencv(file: Path, rig: StereoCalibration) -> None:
-    """Writes M1, D1, M2, D2, R, T [m], image_width, image_height and residual_px."""
     assert rig.left.size_px is not None
     storage = cv2.FileStorage(str(file), cv2.FILE_STORAGE_WRITE)
     try:

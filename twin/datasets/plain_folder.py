@@ -19,20 +19,14 @@ _ASSUMED_HZ = 1.0
 
 
 class PlainFolderReader:
-    """Reads left/ and right/ with images of equal names."""
-
     name = "folder"
     layout = "left/ and right/ with images of equal names, and a calibration (OpenCV, Kalibr, ROS, ORB-SLAM3, COLMAP)"
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a folder has the subfolders left and right."""
         return (folder / "left").is_dir() and (folder / "right").is_dir()
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set in a folder.
-
-        Raises TwinError if there are no images, times.txt is damaged, or an image folder is not valid.
-        """
+        """Returns the data set; raises TwinError without images, or if times.txt or an image folder is not valid."""
         left, right = image_files(folder / "left"), image_files(folder / "right")
         names = sorted(left.keys() | right.keys(), key=_natural_order)
         if not names:
@@ -56,8 +50,8 @@ def _calibration(folder: Path) -> StereoCalibration | None:
 def image_files(folder: Path) -> dict[str, Path]:
     """Returns the image files of a folder, by file name without suffix; empty if the folder does not exist.
 
-    Hidden files (".NAME") and files with other suffixes than `SUFFIXES` are ignored. Raises TwinError if an image is a
-    link that leads out of the folder, or two images have the same name without suffix.
+    Hidden files and those with other suffixes than `SUFFIXES` are ignored. Raises TwinError if an image is a link that
+    leads out of the folder, or two images have the same name without suffix.
     """
     if not folder.is_dir():
         return {}
@@ -71,15 +65,14 @@ def image_files(folder: Path) -> dict[str, Path]:
 
 
 def _natural_order(name: str) -> list[tuple[int, int | str]]:
-    """Returns a key that sorts names by the numbers in them: img2 before img10."""
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in re.split(r"(\d+)", name) if part]
 
 
 def _times(file: Path, names: list[str]) -> tuple[list[float], tuple[str, ...]]:
     """Returns the times of the images [s], and notes on assumptions about them.
 
-    The times are those in times.txt, otherwise those in the names: seconds with a decimal point, or an integer number
-    of milliseconds, microseconds or nanoseconds since 1970 (`_UNITS`). Without both, 1 frame per second is assumed.
+    They are those in times.txt, otherwise those in the names: seconds with a decimal point, or an integer in a unit of
+    `_UNITS` since 1970. Without both, 1 frame per second is assumed.
     """
     if file.exists():
         times_s = read_table(file, 1)[:, 0].tolist()

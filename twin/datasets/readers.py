@@ -17,20 +17,9 @@ from twin.plugin import loading
 
 
 def all_readers(topics: BagTopics | None = None) -> list[Reader]:
-    """Returns the readers that other packages register, then those of this package.
-
-    Raises:
-        TwinError: a registered reader cannot be imported or created, or lacks a member of `Reader`.
-    """
-    registered = [_registered(plugin) for plugin in loading.registered(loading.READERS)]
-    return [*registered, BagReader(topics), EurocReader(), KittiReader(), PlainFolderReader()]
-
-
-def _registered(plugin: loading.Registered) -> Reader:
-    """Returns a reader of another package; raises TwinError if its class fails or it lacks a member of `Reader`."""
-    return loading.attempt(
-        f"{loading.READERS} {plugin.name}", plugin.target, lambda: _ForeignReader(plugin.create(), plugin.target)
-    )
+    """Returns the readers of other packages, then of this one; raises TwinError if one cannot be created or used."""
+    foreign = loading.registered(loading.READERS, _ForeignReader)
+    return [*foreign, BagReader(topics), EurocReader(), KittiReader(), PlainFolderReader()]
 
 
 class _ForeignReader:
@@ -41,11 +30,9 @@ class _ForeignReader:
         self._recognises, self._read = reader.recognises, reader.read
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a folder or file has the layout of the reader."""
         return bool(self._call(self._recognises, folder))
 
     def read(self, folder: Path) -> Dataset:
-        """Returns the data set; raises TwinError if the reader fails or returns a value that is not a `Dataset`."""
         found = self._call(self._read, folder)
         if not isinstance(found, Dataset):
             problem = f"{self._value} returned {type(found).__name__}"
@@ -65,10 +52,8 @@ class _ForeignReader:
 def read_dataset(folder: Path, topics: BagTopics | None = None) -> tuple[Dataset, str]:
     """Returns the data set in a folder or file (a bag), and the name of its reader.
 
-    Raises:
-        TwinError: the folder does not exist, is empty, or has no known layout or no images of the left camera; a file
-            of the data set is damaged, or its times cannot be in seconds; or a reader of another package cannot be
-            loaded.
+    Raises TwinError if it does not exist, is empty, or has no known layout or no images of the left camera; if a file
+    of it is damaged, or its times cannot be in seconds; or if a reader of another package cannot be loaded.
     """
     if problem := path_problem(folder):
         raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder or the bag of a data set")

@@ -57,38 +57,29 @@ class RecordedReadings(NamedTuple):
     notes: tuple[str, ...] = ()  #: sentences on readings that are not used, and on assumptions about their times
 
 
-class UncheckedReadings(NamedTuple):
-    """Readings of one sensor as recorded."""
-
-    source: str  #: topic or folder of the readings, for notes
-    times_s: Array  #: (n,)
-    values: Array  #: (n, k); NaN or infinite where the sensor measured nothing, such as a DVL without bottom lock
-    place: Callable[[int], str]  #: returns the place of a reading (file and line, or topic and message) by its number
-
-
 def checked_series(
-    quantity: SensorQuantity, recorded: UncheckedReadings, sigmas: Array, notes: list[str]
+    quantity: SensorQuantity, recorded: SensorSeries, source: str, place: Callable[[int], str], notes: list[str]
 ) -> SensorSeries | None:
-    """Returns the finite readings of a sensor, with standard deviations (k,), after checks of them; None without any.
+    """Returns the finite readings of a sensor, after checks of them; None without any.
 
-    Readings that are not finite are left out; an entry in `notes` states their number.
-
-    Raises:
-        TwinError: a time is not after the previous one, or a value or a standard deviation is outside its limits.
+    Values that are not finite stand for no measurement, such as a DVL without bottom lock. `source` is the topic or the
+    folder of the readings, for notes; `place` returns the place of a reading by its number, for errors. A note states
+    the number of readings that are not finite. Raises TwinError if a time is not after the previous one, or a value or
+    a standard deviation is outside its limits.
     """
     if not len(recorded.values):
-        notes.append(f"There are no readings in {recorded.source}.")
+        notes.append(f"There are no readings in {source}.")
         return None
     kept = np.flatnonzero(np.isfinite(recorded.values).all(axis=1))
     if not len(kept):
-        notes.append(f"The readings of {recorded.source} are not used: none of them is finite.")
+        notes.append(f"The readings of {source} are not used: none of them is finite.")
         return None
     if lost := len(recorded.values) - len(kept):
-        notes.append(f"{lost} of {len(recorded.values)} readings of {recorded.source} are not used: not finite.")
-    series = SensorSeries(recorded.times_s[kept], recorded.values[kept], sigmas)
+        notes.append(f"{lost} of {len(recorded.values)} readings of {source} are not used: not finite.")
+    series = SensorSeries(recorded.times_s[kept], recorded.values[kept], recorded.sigmas)
     if fault := _fault(quantity, series):
         row, problem, allowed = fault
-        raise TwinError(recorded.place(0 if row is None else int(kept[row])), problem, allowed)
+        raise TwinError(place(0 if row is None else int(kept[row])), problem, allowed)
     return series
 
 
@@ -124,14 +115,9 @@ def vertical_series(
     """Returns the direction of the vertical in body axes (unit vectors that point upwards) and its standard deviation.
 
     The standard deviation [rad] is that about each perpendicular axis: the RMS of that of `verticals` and, on top of
-    it, the error due to the bias of the accelerometer. If the mean specific force differs from gravity by more than
-    15 %, the result is None, and a note says so.
-
-    Args:
-        source: topic or folder of the IMU, for notes.
-        inertial: (n, 6) angular rates [rad/s] and specific forces [m/s2] in the axes of the IMU.
-        turn: (3, 3) rotation of these axes in the body.
-        bias_mps2: standard deviation of the bias of each specific force.
+    it, the error due to the bias of the accelerometer. `inertial` has angular rates [rad/s] and specific forces [m/s2]
+    (n, 6) in the axes of the IMU, `body_from_sensor` is their rotation (3, 3) in the body. If the mean specific force
+    differs from gravity by more than 15 %, the result is None, and a note on `source` says so.
     """
     rates, forces = inertial.values[:, :3], inertial.values[:, 3:]
     mean_mps2 = float(np.linalg.norm(forces, axis=1).mean())

@@ -32,10 +32,7 @@ class _CalibrationLoader(yaml.SafeLoader):
 
 
 def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
-    """Returns the number of values in a node, aliases expanded; infinite for a node that contains itself.
-
-    `known` has the number of values in each node that was counted before, by `id` of the node.
-    """
+    """Returns the number of values in a node, aliases expanded, given `known` ones by `id`; infinite if recursive."""
     if id(node) not in known:
         known[id(node)] = math.inf  # while its children are counted
         pairs = node.value if isinstance(node, yaml.MappingNode) else ()
@@ -44,46 +41,33 @@ def _n_values(node: yaml.Node, known: dict[int, float]) -> float:
     return known[id(node)]
 
 
-def _opencv_matrix(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """Returns a matrix of an OpenCV file (`rows`, `cols`, `data`) as a list of rows."""
-    data, matrix = _opencv_data(loader, node)
-    rows, cols = int(matrix["rows"]), int(matrix["cols"])
-    if len(data) != rows * cols:
-        raise yaml.YAMLError(f"a matrix of {rows} rows and {cols} columns has {len(data)} numbers")
-    return [data[k * cols : (k + 1) * cols] for k in range(rows)]
-
-
 def _opencv_array(loader: yaml.SafeLoader, node: yaml.Node) -> list[Any]:
-    """Returns an array of an OpenCV file (`sizes`, `data`: the form in which OpenCV 5 writes vectors) as a list."""
-    return _opencv_data(loader, node)[0]
-
-
-def _opencv_data(loader: yaml.SafeLoader, node: yaml.Node) -> tuple[list[Any], dict[Any, Any]]:
-    """Returns the numbers of a matrix or an array, and all its values."""
+    """Returns the numbers of an OpenCV matrix (`rows`, `cols`, `data`), or of a vector in the form of OpenCV 5."""
     if not isinstance(node, yaml.MappingNode):
         raise yaml.YAMLError("a matrix without data")
     values = loader.construct_mapping(node, deep=True)
     data = list(values["data"])
     if not 0 < len(data) <= _MOST_ELEMENTS:
         raise yaml.YAMLError(f"a matrix has {len(data)} numbers")
-    return data, values
+    if node.tag.endswith("-nd-matrix"):
+        return data
+    rows, cols = int(values["rows"]), int(values["cols"])
+    if len(data) != rows * cols:
+        raise yaml.YAMLError(f"a matrix of {rows} rows and {cols} columns has {len(data)} numbers")
+    return data
 
 
 for _tag in ("tag:yaml.org,2002:opencv-", "!opencv-"):
-    _CalibrationLoader.add_constructor(_tag + "matrix", _opencv_matrix)
+    _CalibrationLoader.add_constructor(_tag + "matrix", _opencv_array)
     _CalibrationLoader.add_constructor(_tag + "nd-matrix", _opencv_array)
 
 
 def read_text(file: Path, most_bytes: int = _MOST_BYTES) -> str:
-    """Returns the contents of a text file; raises TwinError if it is missing, too large or not text."""
     return user_files.read_text(file, "", "a text file", most_bytes)
 
 
 def read_yaml(file: Path) -> dict[str, Any]:
-    """Returns the contents of a YAML file; files written by OpenCV (`%YAML:1.0`, matrices) are accepted.
-
-    Raises TwinError if the file is missing, too large, not valid YAML, or not a table (keys and values).
-    """
+    """Returns the table in a YAML file, also of OpenCV; raises TwinError if it is missing, too large or not valid."""
     text = re.sub(r"\A%YAML[: ][^\n]*\n", "", read_text(file, _MOST_YAML_BYTES))
     try:
         tree = yaml.load(text, Loader=_CalibrationLoader)  # a SafeLoader: it builds plain values only
@@ -102,11 +86,8 @@ def read_table(file: Path, columns: int) -> Array:
 def read_numbered_table(file: Path, columns: int, n_finite: int) -> tuple[list[int], Array]:
     """Returns the numbers of the lines of a text file, from 1, and their first columns as numbers (n, columns).
 
-    A text that is empty is NaN. Lines that are empty or begin with # are ignored.
-
-    Raises:
-        TwinError: the file cannot be read, a line has too few columns, or a value is not a number or, in the first
-            `n_finite` columns, not finite.
+    An empty text is NaN. Lines that are empty or begin with # are ignored. Raises TwinError if the file cannot be read,
+    a line has too few columns, or a value is not a number or, in the first `n_finite` columns, not finite.
     """
     lines, rows = [], []
     for number, parts in text_rows(file):
@@ -141,9 +122,8 @@ def text_rows(file: Path) -> list[tuple[int, list[str]]]:
 def inside(folder: Path, name: str, source: Path) -> Path:
     """Returns the path of a file in a folder, given its name in a data set; the file need not exist.
 
-    Raises:
-        TwinError: the path leads out of the folder, also by a link, or the name contains a null byte; the message names
-            `source`, the file or folder that contains the name.
+    Raises TwinError, which names `source`, the file or folder that contains the name, if the path leads out of the
+    folder, also by a link, or the name contains a null byte.
     """
     base = resolved(folder)
     if "\0" not in name and name == Path(name).name != ".." and not (base / name).is_symlink():

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.core.raster_files import open_raster
 from twin.core.records import Trajectory
+from twin.core.user_files import open_raster
 from twin.datasets import tum
 from twin.datasets.dataset import Dataset
 from twin.datasets.euroc import camera_truth
@@ -15,18 +15,14 @@ from twin.datasets.kitti import camera_poses
 from twin.datasets.text_files import text_rows
 from twin.errors import TwinError
 from twin.exchange.geotiff import MOST_CELLS, read_raster
-from twin.judge.true_map import TrueMap
+from twin.judge.recorded import TrueMap
 
 _ALLOWED = "TUM (8 columns), KITTI (12 columns) or EuRoC (timestamp in ns and 7 or more columns, by commas)"
 _HEIGHT_GRID = "a GeoTIFF of one band with heights [m], north up, in the frame of the true poses"
 
 
 def read_true_map(file: Path) -> TrueMap:
-    """Returns the true heights in a GeoTIFF: as `twin run` writes them (dem_truth.tif), or in the frame of the poses.
-
-    Raises:
-        TwinError: the file cannot be read, has several bands or too many cells, or knows no height.
-    """
+    """Returns the heights in a GeoTIFF, of `twin run` or in the frame of the poses; raises TwinError if unusable."""
     with open_raster(file, "", _HEIGHT_GRID) as source:
         size = source.width * source.height
         if source.count != 1 or size > MOST_CELLS or (source.crs is not None and source.crs.is_geographic):
@@ -42,11 +38,8 @@ def read_truth(file: Path, dataset: Dataset) -> Trajectory:
     """Returns the true poses of the left camera, in the clock of the data set.
 
     The file is EuRoC/ASL data.csv (poses of the body), KITTI poses (of camera 0, one line per frame, with or without a
-    left image), or TUM (poses of the left camera). If the pose of the left camera in the body or in camera 0 is
-    unknown, both are assumed to coincide.
-
-    Raises:
-        TwinError: the file cannot be read, is damaged, or is of none of these kinds.
+    left image), or TUM (poses of the left camera). Where the pose of the left camera in body or camera 0 is unknown,
+    both are assumed to coincide. Raises TwinError if the file is damaged or of none of these kinds.
     """
     rows = text_rows(file)
     if not rows:

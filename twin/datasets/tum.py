@@ -4,25 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
-
-from twin.core import geometry
 from twin.core.records import Trajectory
 from twin.datasets.dataset import trajectory_of
-from twin.datasets.image_copy import copy_image
+from twin.datasets.image_copy import copy_images
 from twin.datasets.run_contents import RunContents
 from twin.datasets.text_files import read_table
 from twin.errors import TwinError
 
 _FILES = {"truth": "groundtruth.txt"}  # names of files that are not those of their trajectories
+_IMAGES = {"left": "rgb", "right": "right"}  # folders of the cameras
 
 
 def read_trajectory(file: Path) -> Trajectory:
-    """Returns the poses in a file: time [s], x, y, z [m], quaternion x, y, z, w.
-
-    Raises:
-        TwinError: the file cannot be read, or a quaternion is not of unit length.
-    """
+    """Returns the poses in a file: time [s], x, y, z [m], quaternion x, y, z, w; raises TwinError if it is damaged."""
     rows = read_table(file, 8)
     found = trajectory_of(rows[:, 0], rows[:, 1:4], rows[:, [7, 4, 5, 6]])
     if found is None:
@@ -31,36 +25,23 @@ def read_trajectory(file: Path) -> Trajectory:
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes the trajectories of the left camera, and the images if any were recorded; returns the text files.
+    """Writes each trajectory of the left camera as NAME.txt, the truth as `groundtruth.txt`; returns the text files.
 
-    The truth is written to `groundtruth.txt`, each other trajectory to a file of its name, for example `final.txt`.
-    Images are written to the folders `rgb` (left) and `right`; `rgb.txt` and `right.txt` list them with times [s].
+    Images, if any were recorded, are written to `rgb` (left) and `right`; `rgb.txt` and `right.txt` list them with
+    times [s].
     """
-    written = [
-        _write_trajectory(folder / _FILES.get(name, f"{name}.txt"), path)
-        for name, path in contents.trajectories.items()
-        if len(path)
-    ]
-    lists = {name: ["# time [s], file\n"] for name in ("rgb", "right")} if contents.frames else {}
+    written = []
+    for name, path in contents.trajectories.items():
+        if len(path):
+            written.append(folder / _FILES.get(name, f"{name}.txt"))
+            path.save(written[-1], digits=12, header="# time x y z qx qy qz qw\n")
+    lists = {name: ["# time [s], file\n"] for name in _IMAGES.values()} if contents.frames else {}
     for name in lists:
         (folder / name).mkdir(exist_ok=True)
-    for k, frame in enumerate(contents.frames):
-        for name, file in (("rgb", frame.left), ("right", frame.right)):
-            if file is not None:
-                copied = copy_image(file, folder / name / f"{frame.time_s:.6f}", contents.jpeg_quality)
-                lists[name].append(f"{frame.time_s:.6f} {name}/{copied.name}\n")
-        contents.progress((k + 1) / len(contents.frames))
+    for image in copy_images(contents, lambda camera, frame: folder / _IMAGES[camera] / f"{frame.time_s:.6f}"):
+        name = _IMAGES[image.camera]
+        lists[name].append(f"{image.frame.time_s:.6f} {name}/{image.file.name}\n")
     for name, lines in lists.items():
         written.append(folder / f"{name}.txt")
         written[-1].write_text("".join(lines), encoding="utf-8")
     return written
-
-
-def _write_trajectory(file: Path, path: Trajectory) -> Path:
-    rows = np.column_stack([path.positions, geometry.quaternions_xyzw(path.world_from_camera[:, :3, :3])])
-    lines = ["# time x y z qx qy qz qw"] + [
-        f"{time_s:.6f} " + " ".join(f"{value:.12g}" for value in row)
-        for time_s, row in zip(path.times_s, rows, strict=True)
-    ]
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return file

@@ -43,7 +43,6 @@ def start_slurm_jobs(jobs: int) -> Iterator[DaskEngine]:
 
 
 def _slurm_cluster(jobs: int) -> Any:
-    """Returns a cluster of SLURM jobs with the settings jobqueue.slurm of the Dask configuration."""
     try:
         from dask_jobqueue.slurm import SLURMCluster
     except ImportError:
@@ -66,11 +65,7 @@ class DaskEngine:
     def run_many(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
     ) -> Iterator[Outcome[Task, Result]]:
-        """Runs `function` on every task; see `Engine.run_many`. The tasks of a lost Dask worker are resubmitted.
-
-        Raises:
-            TwinError: the connection to the scheduler was lost.
-        """
+        """See `Engine.run_many`; resubmits the tasks of a lost worker; raises TwinError if the connection is lost."""
         waiting, running = iter(tasks), {}
         arriving = as_completed(with_results=True, raise_errors=False)
 
@@ -87,7 +82,6 @@ class DaskEngine:
             submit()
 
     def _queue_size(self) -> int:
-        """Returns the number of tasks to keep submitted; it follows the size of the cluster."""
         if time.monotonic() - self._updated_s > _REFRESH_S:
             threads: Any = self.client.nthreads()
             self._queued = max(_MIN_QUEUED, _QUEUED_PER_THREAD * sum(threads.values()))
@@ -96,8 +90,6 @@ class DaskEngine:
 
 
 class _WorkerPoolPlugin(WorkerPlugin):
-    """Dask plugin that holds the worker pool of one Dask worker."""
-
     name = "twin-worker-pool"
 
     def setup(self, worker: Any = None) -> None:
@@ -108,7 +100,6 @@ class _WorkerPoolPlugin(WorkerPlugin):
 
 
 def _run_task(function: Callable[[Task], Result], task: Task, limits: TaskLimits) -> Outcome[Task, Result]:
-    """Runs a task in the worker pool of this Dask worker."""
     plugin: Any = get_worker().plugins[_WorkerPoolPlugin.name]
     return plugin.pool.run(function, task, limits)
 

@@ -5,10 +5,15 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from itertools import islice
 from typing import Any, Protocol
 
 from twin.engines.worker import Outcome, Result, Task, TaskLimits, WorkerPool
+from twin.errors import TwinError
+
+SLURM = "slurm"  #: scheduler that stands for new SLURM jobs
 
 
 class Engine(Protocol):
@@ -27,10 +32,7 @@ class Engine(Protocol):
 
 
 class LocalEngine:
-    """Engine that runs tasks in `jobs` worker processes on this machine, each pinned to a CPU core.
-
-    One thread per worker process waits for its results.
-    """
+    """Engine that runs tasks in `jobs` worker processes on this machine, each pinned to a CPU core."""
 
     def __init__(self, jobs: int):
         cores = sorted(os.sched_getaffinity(0))
@@ -39,7 +41,6 @@ class LocalEngine:
     def run_many(
         self, function: Callable[[Task], Result], tasks: Iterable[Task], limits: TaskLimits
     ) -> Iterator[Outcome[Task, Result]]:
-        """Runs `function` on every task; see `Engine.run_many`."""
         waiting, running = iter(tasks), set[Future[Any]]()
         with ThreadPoolExecutor(self.jobs) as threads:
             try:
@@ -53,6 +54,29 @@ class LocalEngine:
             finally:
                 if running:  # interrupted: a thread ends only after its worker has been killed
                     self.pool.close()
+
+
+@contextmanager
+def open_engine(jobs: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
+    """Yields an engine; the workers that it started are stopped when the context ends.
+
+    It has `jobs` (default: one per core) processes on this machine or, with the scheduler "slurm", SLURM jobs; any
+    other scheduler is the address of a running Dask scheduler, e.g. tcp://host:8786, whose workers must have this
+    package. Raises TwinError if the scheduler does not answer, or a package that it needs is not installed.
+    """
+    jobs = jobs or default_jobs()
+    if not scheduler:
+        engine = LocalEngine(jobs)
+        with closing(engine.pool):
+            yield engine
+        return
+    if find_spec("distributed") is None:
+        raise TwinError("--scheduler", "Dask is not installed", "pip install 'seabed-twin[cluster]'")
+    from twin.engines import dask_engine
+
+    slurm = scheduler == SLURM
+    with dask_engine.start_slurm_jobs(jobs) if slurm else dask_engine.connect_scheduler(scheduler) as engine:
+        yield engine
 
 
 def default_jobs() -> int:

@@ -43,8 +43,6 @@ class TaskLimits(NamedTuple):
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
-    """Outcome of one task."""
-
     task: Task
     result: Result | None  #: result of the function; None if the task failed
     failure: str  #: reason of the failure; "" if the task did not fail
@@ -52,8 +50,6 @@ class Outcome(NamedTuple, Generic[Task, Result]):
 
 
 class Reply(NamedTuple):
-    """Reply of a worker to one task."""
-
     #: "done" if the function returned a value; "raised" if it raised an exception; "timeout" if it ran too long;
     #: "killed" if the process ended or was killed
     kind: Literal["done", "raised", "timeout", "killed"]
@@ -102,7 +98,6 @@ class Worker:
         self._pipe.close()
 
     def _exit_reason(self) -> str:
-        """Returns how the process ended (signal or exit status), and a line of its output if there is any."""
         code = self._process.returncode
         how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"terminated with exit status {code}"
         self._output.seek(0)
@@ -113,8 +108,7 @@ class Worker:
 class WorkerPool:
     """Thread-safe pool of worker processes, one per concurrent task; idle workers are reused.
 
-    Args:
-        cores: CPU core of each of the first workers, to which it is pinned; further workers are not pinned.
+    The first workers are pinned to the CPU cores `cores`; further ones are not pinned.
     """
 
     def __init__(self, cores: Sequence[int | None] = ()) -> None:
@@ -176,10 +170,7 @@ def describe_exception(error: BaseException) -> str:
 
 
 def main(pipe: int, core: int | None) -> None:
-    """Main loop of the worker process: answers each pickled (function, task) with a `Reply`, until the pipe closes.
-
-    The process is pinned to the CPU core, if one is given.
-    """
+    """Main loop of the worker process: answers each pickled (function, task) with a `Reply`, until the pipe closes."""
     if core is not None:
         os.sched_setaffinity(0, {core})
     threading.Thread(target=_exit_with_parent, args=(os.getppid(),), daemon=True).start()
@@ -201,7 +192,6 @@ def _run_request(request: bytes) -> bytes:
 
 
 def _exit_with_parent(parent: int) -> None:
-    """Ends this process within about a second after its parent process has ended."""
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)

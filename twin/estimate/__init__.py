@@ -1,8 +1,4 @@
-"""Estimators as a library: trajectory of a stereo camera and elevation map, computed from frames alone.
-
-`Navigator` processes frames one by one and builds the map at the end; see docs/estimators.md. The package does not
-depend on the simulator, its scenarios or its missions.
-"""
+"""Estimators as a library, independent of the simulator; see docs/estimators.md."""
 
 from twin.core.records import (
     ElevationMap,

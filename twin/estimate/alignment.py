@@ -10,11 +10,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.records import SensorNoise, StereoRig
+from twin.core.records import Mask, SensorNoise, StereoRig
 from twin.estimate.adjustment.pose_graph import (
     FactorGraph,
     GraphState,
@@ -36,11 +35,8 @@ _HUBER = 3.0  # threshold of the Huber loss in standard deviations
 
 
 class AlignmentResult(NamedTuple):
-    """Result of a global alignment."""
-
     poses: Array  #: (n, 4, 4) aligned world_from_camera of the nodes
-    #: (n, 6, 6) marginal covariances of the poses, [rotation, translation] (rad, m) in camera axes; zeros for nodes
-    #: whose covariance was not requested.
+    #: (n, 6, 6) marginal covariances, [rotation, translation] (rad, m) in camera axes; zeros where not requested.
     covs: Array
     dropped: list[Link]  #: links that were removed as outliers
     link_chi2: float  #: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links
@@ -62,7 +58,6 @@ def align(
 
     Args:
         nodes: nodes of the window; their poses are the initial values.
-        links: motions between nodes of the window.
         anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
             prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
@@ -118,11 +113,10 @@ def _factor_graph(
     return FactorGraph(len(nodes), unary, [motions, displacements], noise.dvl_scale)
 
 
-def _outliers(graph: FactorGraph, chi2: Array) -> NDArray[np.bool_]:
+def _outliers(graph: FactorGraph, chi2: Array) -> Mask:
     """Returns a mask (n,) of the links to remove, given `chi2` (n,), the squared norms of their whitened residuals.
 
-    A link whose chi2 is below 1 % of the largest one is not removed in this round, because the link with the largest
-    chi2 may have distorted its residual. Links between consecutive nodes of the window are never removed.
+    Not those below 1 % of the largest, which may have distorted them, nor those between consecutive nodes.
     """
     motions = graph.binary[0]
     chi2 = np.where(motions.j - motions.i == 1, 0.0, chi2)
@@ -130,11 +124,7 @@ def _outliers(graph: FactorGraph, chi2: Array) -> NDArray[np.bool_]:
 
 
 def _mean_chi2(links: Links, chi2: Array) -> float:
-    """Returns the mean chi-square of the links per degree of freedom; 0 without links.
-
-    `chi2` (n,) was computed with inflated covariances (`link_selection.inflate_for_shared_noise`); the result refers to
-    the covariances before inflation.
-    """
+    """Returns the mean chi-square per degree of freedom by covariances before inflation; 0 without links."""
     return float(np.mean(chi2 * links.shared_by)) / 6 if len(chi2) else 0.0
 
 

@@ -6,17 +6,15 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Frame, Image, StereoRig
+from twin.core.records import Frame, Image, Map, StereoRig
 from twin.core.settings import EstimatorSettings
-from twin.estimate.mapping.map_builder import KeyframeImages, gray_levels
-from twin.estimate.mapping.mean_illumination import MeanIllumination
+from twin.estimate.mapping.map_builder import ImagePair, gray_levels
 from twin.estimate.vision import disparity, matching, stereo
 from twin.estimate.vision.disparity import Disparity
-from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
+from twin.estimate.vision.light_pattern import MeanIllumination, light_pattern, pattern_fit
 from twin.estimate.vision.stereo import StereoPoints
 
 _MIN_POINTS = 30  # smallest number of matched points from which anything is concluded
@@ -45,16 +43,13 @@ class FloorPlane(NamedTuple):
     normal: Array  #: (3,) unit normal that points from the floor to the side of the camera
     distance_m: float  #: distance of the camera from the plane [m]
     scatter_m: float  #: robust standard deviation of the points about the plane [m]
-    #: whether the plane was fitted to the points; otherwise it is perpendicular to the optical axis, at the median
-    #: depth of the points.
-    fitted: bool
+    fitted: bool  #: whether it was fitted; otherwise it is perpendicular to the optical axis at the median depth
 
     @property
     def world_from_camera(self) -> Array:
         """Returns the pose (4, 4) of the camera in a world whose plane z = 0 is the floor plane.
 
-        The origin is the foot of the perpendicular from the camera to the plane; x is the x axis of the camera,
-        projected onto the plane.
+        The origin is the foot of the perpendicular from the camera; x is that of the camera, projected onto the plane.
         """
         along = np.array([1.0, 0, 0]) - self.normal[0] * self.normal
         x = along / np.linalg.norm(along)
@@ -63,11 +58,7 @@ class FloorPlane(NamedTuple):
 
 
 def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | None = None) -> PairInspection:
-    """Matches the stereo pair of a frame over the widest range of disparities, and again with the two images exchanged.
-
-    The images count as swapped if, exchanged, at least 30 points are matched and three times as many as in the given
-    order.
-    """
+    """Matches a stereo pair over the widest range of disparities, and again exchanged (see `_SWAPPED_SHARE`)."""
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
     left, right = _square_images(frame, rig)
     dense, points = _matched(left, right, square, chosen)
@@ -76,11 +67,10 @@ def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | Non
     return PairInspection(left, right, square, dense, points, swapped)
 
 
-def _square_images(frame: Frame, rig: StereoRig) -> KeyframeImages:
-    """Returns the images of a frame, resampled to square pixels (`rig.with_square_pixels()`)."""
+def _square_images(frame: Frame, rig: StereoRig) -> ImagePair:
     assert frame.right is not None
     scale = rig.fx_px / rig.fy_px
-    return KeyframeImages(matching.scaled_rows(frame.left, scale), matching.scaled_rows(frame.right, scale))
+    return matching.scaled_rows(frame.left, scale), matching.scaled_rows(frame.right, scale)
 
 
 def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> tuple[Disparity, StereoPoints]:
@@ -88,7 +78,7 @@ def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSetti
     widest_px = disparity.SearchRange(rig).max_disparity_px
     bytes_left, bytes_right = (np.round(gray).astype(np.uint8) for gray in grays)
     dense = disparity.dense_disparity(bytes_left, bytes_right, widest_px)
-    return dense, stereo.match_stereo_points(*grays, dense.disparity_px, rig, settings.points, settings.patch_px)
+    return dense, stereo.match_stereo_points(*grays, dense.disparity_px, rig, settings)
 
 
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
@@ -109,7 +99,6 @@ def floor_plane(points: StereoPoints) -> FloorPlane | None:
 
 
 def _fitted_plane(xyz: Array) -> FloorPlane:
-    """Returns the plane fitted to points (n, 3) [m]."""
     rng, best = np.random.default_rng(_SEED), (np.inf, np.array([0.0, 0.0, -1.0]), 0.0)
     for _ in range(_TRIALS):
         a, b, c = xyz[rng.choice(len(xyz), 3, replace=False)]
@@ -129,15 +118,12 @@ def _fitted_plane(xyz: Array) -> FloorPlane:
 
 
 class LightInspection(NamedTuple):
-    """Light of a stereo camera, from n stereo pairs, and a pair whose light was made uniform.
-
-    Lamps, vignetting and backscatter belong to the cameras and stay in the mean of many pairs; the floor averages out.
-    """
+    """Light of a stereo camera (lamps, vignetting, backscatter), the mean of n pairs, and a pair made uniform by it."""
 
     n_pairs: int  #: number of pairs n
     #: mean_left, mean_right: (H, W) mean grey levels of the pairs.
-    mean_left: NDArray[np.float32]
-    mean_right: NDArray[np.float32]
+    mean_left: Map
+    mean_right: Map
     even_left: Image  #: (H, W, 3) left image with the gain that the colours of the map get
     subtracted: bool  #: whether the estimators subtract a light pattern before dense matching (`light_pattern`)
     #: dense disparity of the left image as the map uses it: without the light pattern if it is subtracted.
@@ -145,13 +131,7 @@ class LightInspection(NamedTuple):
 
 
 def inspect_light(pair: PairInspection, frames: Iterable[Frame], rig: StereoRig) -> LightInspection:
-    """Returns the light of the cameras, and what the estimators make of it in one pair.
-
-    Args:
-        pair: the pair to show.
-        frames: frames with both images in chronological order, best spread over the whole recording; at least one.
-        rig: believed calibration of the frames.
-    """
+    """Returns the light of the cameras in frames of the whole recording, in their order, and its effect on one pair."""
     illumination, fits = MeanIllumination(pair.rig), []
     mean = np.zeros((2, pair.rig.height_px, pair.rig.width_px), np.float32)
     for frame in frames:
@@ -159,12 +139,12 @@ def inspect_light(pair: PairInspection, frames: Iterable[Frame], rig: StereoRig)
         grays = gray_levels(images)
         mean += np.array(grays)
         fits.append(pattern_fit(grays))
-        illumination.add(images.left)
+        illumination.add(images[0])
     pattern = light_pattern(fits, mean.shape[1:])
     dense = pair.disparity
     if pattern is not None:
-        left, right = gray_levels(KeyframeImages(pair.left, pair.right))
+        left, right = gray_levels((pair.left, pair.right))
         widest_px = disparity.SearchRange(pair.rig).max_disparity_px
-        dense = disparity.dense_disparity(left - pattern.left, right - pattern.right, widest_px)
+        dense = disparity.dense_disparity(left - pattern[0], right - pattern[1], widest_px)
     even = np.clip(np.round(pair.left * illumination.gain()), 0, 255).astype(np.uint8)
     return LightInspection(len(fits), mean[0] / len(fits), mean[1] / len(fits), even, pattern is not None, dense)

@@ -18,11 +18,9 @@ from twin.kernels import kernel
 _SAME_SWATH = 2  # number of immediately preceding nodes to link, as in Negahdaripour & Madjidi 2003
 _LARGEST_OVERLAP = 0.95  # larger overlaps occur where the vehicle keeps station, not along a path
 #: Sum of the covariances between the errors of a patch in different links, as a fraction of the sum for errors that are
-#: equal in all links over the patch: 0.15 to 0.32 in eight surveys at five places of a reef (`horseshoe`), measured
-#: against the truth.
+#: equal in all links over the patch: 0.15 to 0.32 against the truth in eight surveys at five places of `horseshoe`.
 RECURRENCE = 0.25
-#: Standard error of `Motion.residual` times the root of the number of points: 1 / (2 f(m) m), with f the density of the
-#: chi distribution with three degrees of freedom and m its median.
+#: Standard error of `Motion.residual` sqrt(n): 1 / (2 f(m) m), m the median of the density f of chi with 3 dof.
 _RESIDUAL_STANDARD_ERROR = 0.562
 _NEAREST_M = 1e-3  # smallest depth of a visible point
 
@@ -30,8 +28,8 @@ _NEAREST_M = 1e-3  # smallest depth of a visible point
 def overlaps(node: Keyframe, poses: Array, rig: StereoRig, patch_px: int) -> Array:
     """Returns the overlap (n,), 0 to 1, of a node with the left image at each of the poses (n, 4, 4).
 
-    The overlap is the fraction of the node's matched points that project into the other image, at least half a patch
-    from its border; 0 without points. It is predicted from poses and depths, without the assumption of a flat floor.
+    It is the fraction of the node's matched points that project into the other image, at least half a patch from its
+    border; 0 without points. It is predicted from poses and depths, without the assumption of a flat floor.
     """
     if node.points is None or len(node.points.xyz) == 0:
         return np.zeros(len(poses))
@@ -67,16 +65,12 @@ def _overlaps(world, position, poses, reach, camera):
 def choose_links(
     node: Keyframe, earlier: Sequence[Keyframe], poses: Array, rig: StereoRig, settings: EstimatorSettings
 ) -> list[tuple[Keyframe, float]]:
-    """Returns the earlier nodes to which a new node is linked, with their overlaps.
+    """Returns the nodes, of the `earlier` ones in their order at poses (n, 4, 4), to link a new node to, with overlaps.
 
     Up to `max_links` candidates with an overlap of at least `min_overlap` are chosen, in this order: the two previous
     nodes; the oldest node of the same swath, for the greatest distance along the path; the oldest node of all other
-    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap, where those that directly precede
-    or follow one chosen before come last. The same swath is the unbroken series of candidates before the two previous
-    nodes.
-
-    Args:
-        earlier, poses: candidate nodes in chronological order, and their poses (n, 4, 4).
+    swaths, to close loops; the remaining nodes of other swaths by decreasing overlap, where neighbours of one chosen
+    before come last. The same swath is the unbroken series of candidates before the two previous nodes.
     """
     shares = overlaps(node, poses, rig, settings.patch_px)
     linked = np.flatnonzero(shares >= settings.min_overlap)[::-1].tolist()
@@ -92,10 +86,7 @@ def choose_links(
 
 
 def _spread(others: list[int], earlier: Sequence[Keyframe]) -> list[int]:
-    """Returns the indices `others` of earlier nodes in their order, but neighbours of nodes before them come last.
-
-    Between neighbours there is no other node: their keyframe numbers differ by the smallest difference of candidates.
-    """
+    """Returns the indices `others` of earlier nodes in their order, but neighbours of nodes before them come last."""
     numbers = np.array([node.number for node in earlier])
     stride = np.diff(numbers).min(initial=numbers[-1] + 1) if others else 1
     chosen: list[int] = []
@@ -106,7 +97,6 @@ def _spread(others: list[int], earlier: Sequence[Keyframe]) -> list[int]:
 
 
 def to_link(node: Keyframe, other: Keyframe, overlap: float, motion: Motion) -> Link:
-    """Returns the link from the earlier node `other` to `node`, given their overlap and the measured motion."""
     ends, share = (other.number, node.number), floor_share(motion)
     return Link(*ends, motion.a_from_b, motion.cov, overlap, motion.n_points, 1.0, motion.closed_form, share)
 
@@ -135,8 +125,7 @@ def _links_over_a_footprint(links: Sequence[Link]) -> float:
 def floor_share(motion: Motion) -> float:
     """Returns the fraction of a motion's variance that the image noise of its points does not explain, 0 to 1.
 
-    1 - 1 / r^2 with r the relative residual (`Motion.residual`); 0 if r does not exceed 1 by two standard errors of
-    0.56 / sqrt(n).
+    1 - 1 / r^2 with r the relative residual (`Motion.residual`); 0 if r does not exceed 1 by two standard errors.
     """
     limit = 1 + 2 * _RESIDUAL_STANDARD_ERROR / max(motion.n_points, 1) ** 0.5
     return 1 - motion.residual**-2 if motion.residual > limit else 0.0

@@ -1,5 +1,3 @@
-"""The keyframe network: keyframes, links between those that are nodes, and the global alignment of the nodes."""
-
 from __future__ import annotations
 
 import time
@@ -52,33 +50,17 @@ class AlignmentHistory:
     #: link_residuals, disparity_offsets: those of all `LinkAttempt`s; offsets that are None are left out.
     link_residuals: list[float] = field(default_factory=list[float])
     disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
-    #: standard deviations (3-D) of the positions of keyframes relative to the previous keyframe, by frame-to-frame
-    #: motion alone [m], where they are known.
+    #: standard deviations (3-D) of positions relative to the previous keyframe, by F2F alone [m], where known.
     frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0  #: number of nodes whose link to the previous node is the F2F motion
     independent_errors: float | None = None  #: see `AlignmentResult`, of the final alignment; None before it
-
-
-class _PendingLinks(NamedTuple):
-    """Links of a node whose measurement may be in progress."""
-
-    measure: Callable[[], list[LinkAttempt]]  #: waits for the links to earlier nodes but the last one
-    chain: LinkAttempt | None  #: link to the last node; None for the first node
-    bridge: Link | None  #: F2F motion in place of a chain that failed
-
-    def attempts(self) -> list[LinkAttempt]:
-        """Returns all measured links of the node."""
-        return self.measure() + ([] if self.chain is None else [self.chain])
 
 
 class KeyframeNetwork:
     """Keyframes of a survey, those of them that are nodes, and the measured motions that link the nodes.
 
     Links are measured in a separate thread if `vision.runs_in_background`, otherwise when they are collected.
-
-    Attributes:
-        reference_cov: (6, 6) prior covariance of the first node [rotation, translation] (rad, m); by default it is
-            negligible, because the first pose defines the world frame.
+    `reference_cov` (6, 6) is the first node's prior covariance [rotation, translation] (rad, m), by default negligible.
     """
 
     def __init__(
@@ -91,7 +73,8 @@ class KeyframeNetwork:
         self.history = AlignmentHistory()
         self._node_poses = np.empty((64, 4, 4))  # capacity grows by doubling
         self._executor = ThreadPoolExecutor(1) if vision.runs_in_background else None
-        self._pending: deque[_PendingLinks] = deque()
+        #: for each pending node: waits for its links, link to the last node, F2F motion in its place.
+        self._pending: deque[tuple[Callable[[], list[LinkAttempt]], list[LinkAttempt], list[Link]]] = deque()
         self._alignable = True
         self.reference_cov = _REFERENCE_COV
 
@@ -103,20 +86,15 @@ class KeyframeNetwork:
 
     @property
     def poses(self) -> Array:
-        """Returns the world_from_camera (n, 4, 4) of all keyframes."""
         return np.array([k.world_from_camera for k in self.keyframes]).reshape(-1, 4, 4)
 
     def add(self, keyframe: Keyframe) -> None:
-        """Adds a keyframe, and releases the matched points of the previous keyframe."""
         if self.keyframes:
             self.keyframes[-1].points = None  # links start from the points of the newer node
         self.keyframes.append(keyframe)
 
-    def overlap_with_last(self, world_from_camera: Array) -> float:
-        """Returns the predicted overlap (`link_selection.overlaps`) of the last keyframe with the image at a pose."""
-        return self._overlap(self.keyframes[-1], world_from_camera)
-
-    def _overlap(self, keyframe: Keyframe, world_from_camera: Array) -> float:
+    def overlap(self, keyframe: Keyframe, world_from_camera: Array) -> float:
+        """Returns the predicted overlap (`link_selection.overlaps`) of a keyframe with the image at a pose."""
         return float(link_selection.overlaps(keyframe, world_from_camera[None], self.rig, self.settings.patch_px)[0])
 
     def link_to_last_node(self, node: Keyframe) -> LinkAttempt | None:
@@ -124,10 +102,9 @@ class KeyframeNetwork:
         if not self.nodes:
             return None
         last = self.nodes[-1]
-        return self._measure(node, [(last, self._overlap(node, last.world_from_camera))])[0]
+        return self._measure(node, [(last, self.overlap(node, last.world_from_camera))])[0]
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[LinkAttempt]:
-        """Measures the links from earlier nodes, given with their overlaps."""
         motions = self.vision.measure_motions(node, [other for other, _ in others])
         return [
             LinkAttempt(None)
@@ -145,8 +122,7 @@ class KeyframeNetwork:
 
         Args:
             chain: link from the last node (`link_to_last_node`).
-            bridge: link from the last node that consists of the F2F motion, fused with the DVL, in place of a chain
-                that could not be measured; otherwise None.
+            bridge: F2F motion since the last node, fused with the DVL, in place of a chain that could not be measured.
             displacement: displacement since the last node, measured by the DVL; None if it was not measured.
 
         Raises:
@@ -162,7 +138,7 @@ class KeyframeNetwork:
         # a copy, because the points of the node are released before its links are measured
         measure = partial(self._measure, replace(node), others)
         started = self._executor.submit(measure).result if self._executor else measure
-        self._pending.append(_PendingLinks(started, chain, bridge))
+        self._pending.append((started, [chain] if chain else [], [bridge] if bridge else []))
         self.history.nodes_bridged += bridge is not None
         self._collect_links(all_but=_MOST_PENDING)
         node.dvl_displacement = displacement if chain and chain.link else None  # `bridge` already includes it
@@ -177,30 +153,25 @@ class KeyframeNetwork:
         After any error of a measurement, nothing is pending, the network is incomplete and `align_all` returns None.
         """
         while len(self._pending) > all_but:
+            measure, chain, bridge = self._pending[0]
             try:
-                attempts = self._pending[0].attempts()
+                attempts = measure() + chain
                 measured = [attempt.link for attempt in attempts if attempt.link is not None]
                 links = link_selection.inflate_for_shared_noise(measured)
             except Exception:
                 self.abandon_alignment()
                 raise
-            bridge = self._pending.popleft().bridge
-            self.links.add(links if bridge is None else [*links, bridge])
-            offsets = [attempt.disparity_offset for attempt in attempts]
+            self._pending.popleft()
+            self.links.add(links + bridge)
             self.history.link_residuals += [attempt.residual for attempt in attempts]
-            self.history.disparity_offsets += [offset for offset in offsets if offset is not None]
+            self.history.disparity_offsets += [a.disparity_offset for a in attempts if a.disparity_offset is not None]
 
     def align_window(self, track: int) -> Array | None:
         """Aligns the nodes of the window of tracks that ends with `track`, and rebuilds the mosaic from this track.
 
-        Returns:
-            (6, 6) marginal covariance of the pose of the last node [rotation, translation] (rad, m), in its camera
-            axes; None if the global alignment is switched off, there are fewer than two nodes, or none of the nodes
-            lies in the window.
-
-        Raises:
-            SurveyAborted: the alignment failed.
-            OSError: images could not be read or written.
+        Returns the marginal covariance (6, 6) of the pose of the last node [rotation, translation] (rad, m), in its
+        camera axes; None if the global alignment is switched off, or with fewer than two nodes or none in the window.
+        Raises SurveyAborted if the alignment failed, OSError if images could not be read or written.
         """
         first = track - self.settings.window_tracks
         if not self.settings.use_ga or len(self.nodes) < 2 or self.nodes[-1].track < first:
@@ -220,13 +191,8 @@ class KeyframeNetwork:
     def align_all(self) -> Array | None:
         """Aligns all nodes by the links in the network. Call `truncate` first, which adds the links in progress.
 
-        Returns:
-            (n_keyframes, 6, 6) for each keyframe, the marginal covariance of the pose of the latest node up to this
-            keyframe. None if the global alignment is switched off or abandoned, if an earlier alignment or a
-            measurement failed, or if there are fewer than two nodes.
-
-        Raises:
-            SurveyAborted: the alignment failed; a second call returns None.
+        Returns, for each keyframe, the marginal covariance (6, 6) of the pose of the latest node up to it. None if the
+        alignment is switched off, abandoned or failed before, or with fewer than two nodes. Raises SurveyAborted.
         """
         if not (self.settings.use_ga and self._alignable and len(self.nodes) >= 2):
             return None
@@ -244,10 +210,8 @@ class KeyframeNetwork:
     def truncate(self, n_frames: int) -> None:
         """Adds the links in progress, and removes keyframes, nodes and links of frames after the first `n_frames`.
 
-        Keyframes of later frames exist if an interrupt stopped the processing of a frame.
-
-        Raises:
-            OSError: images could not be read or written; the network is incomplete and `align_all` returns None.
+        Keyframes of later frames exist if an interrupt stopped the processing of a frame. Raises OSError if images
+        could not be read or written; the network is then incomplete and `align_all` returns None.
         """
         self._collect_links()
         self.keyframes = [k for k in self.keyframes if k.row < n_frames]
@@ -258,13 +222,8 @@ class KeyframeNetwork:
         """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
 
         Older nodes that are linked to the given nodes are held fixed; they are the first ones of the result. Links
-        rejected as outliers are removed from the network.
-
-        Args:
-            marginals: numbers of the nodes whose marginal covariances are computed; None for all nodes.
-
-        Raises:
-            SurveyAborted: the alignment failed.
+        rejected as outliers are removed from the network. Marginal covariances are those of the nodes `marginals`,
+        None: all. Raises SurveyAborted.
         """
         first = nodes[0].number
         links = self.links.select(self.links.j >= first)

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.interrupts import StageGuard
 from twin.core.links import Link
 from twin.core.ortho_tiles import OrthoTile
 from twin.core.quality import EstimationQuality
@@ -36,9 +35,7 @@ from twin.core.records import (
 from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import StageTimer, Stopwatch
-from twin.errors import SurveyAborted
-from twin.estimate import disparity_offset
-from twin.estimate.length_scale import length_scales
+from twin.estimate.calibration_errors import disparity_offset, length_scales, mean_views
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
@@ -66,8 +63,7 @@ class Navigator:
             origin with its optical axis along -z of the world. If the frames have readings of height or attitude, the
             z axis of the world must point up.
         readings_noise: believed noise of the navigation sensors whose readings come with the frames.
-        vision: source of the visual measurements, closed by the caller; by default, they are computed from the images
-            of the frames.
+        vision: source of the visual measurements, closed by the caller; by default, the images of the frames.
         folder: folder for keyframe images and the mosaic while the survey runs; by default a temporary folder.
         stopwatch: function that returns a context manager which times the stage of a given name.
     """
@@ -94,7 +90,6 @@ class Navigator:
         self.log = PoseLog()
 
     def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
-        """Returns a source of visual measurements from images, which `close` closes."""
         if folder is None:
             folder = Path(self._resources.enter_context(TemporaryDirectory(prefix="twin-")))
         vision = StereoVision(self.rig, self.settings, folder, stopwatch=self.stopwatch, noise=noise)
@@ -115,31 +110,26 @@ class Navigator:
 
         Args:
             cov: (6, 6) covariance of the start [rotation, translation] in camera axes (rad, m), for the online pose.
-            prior_cov: (6, 6) covariance of the prior factor of the first node in the alignments. It should be large in
-                the directions that the readings at all nodes determine: these readings are factors of the alignment,
-                and a prior computed from them would count them twice.
+            prior_cov: (6, 6) covariance of the prior factor of the first node in the alignments: large in the
+                directions that the readings at all nodes determine, which are factors and would count twice.
         """
         self.filter.cov = cov
         self.network.reference_cov = prior_cov
 
     def update(self, frame: Frame, track: int = 1) -> Estimate:
-        """Processes one frame and returns its online estimate.
+        """Processes one frame, later than all previous ones, and returns its online estimate.
 
         A frame with a stereo pair becomes a keyframe if `frame.keyframe` is True. If `frame.keyframe` is None, it
         becomes one if there is no keyframe yet, if tracking failed, or if the next pair is expected to overlap with the
         last keyframe by less than `settings.keyframe_overlap`. In no case does a pair with too few matched points
-        become a keyframe.
-
-        Args:
-            frame: images and sensor readings of the frame; later than all previous frames.
-            track: number of the track to which the frame belongs, from 1 (see `align_track`).
+        become a keyframe. `track` is the number of its track, from 1 (see `align_track`).
 
         Raises:
             ValueError: the frame is not later than the last one, or an image is not of the size that the calibration
                 states; the frame is ignored.
             OSError: images could not be read or written.
         """
-        interval_s = self._interval_s(frame.time_s)
+        interval_s = self.interval_s(frame.time_s)
         motion, status = self.vision.track_frame(frame)
         is_measured = status in ("ok", RIGHT_REPEATS)
         self.log.n_lost += not is_measured
@@ -151,7 +141,7 @@ class Navigator:
         if status in REPEATS:
             self.log.repeats.setdefault(status, []).append(len(self.log))
             self.filter.fuse_position_fixes(frame.readings)
-        elif self._is_keyframe(frame, status):
+        elif self.is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.filter.f2f
         self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
@@ -159,11 +149,8 @@ class Navigator:
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
 
-    def _interval_s(self, time_s: float) -> float:
-        """Returns the time since the last frame [s]: the nominal one at the first frame and up to rounding errors.
-
-        Raises ValueError if the frame is not later than the last one.
-        """
+    def interval_s(self, time_s: float) -> float:
+        """Returns the time since the last frame [s], nominal at first or within rounding; ValueError if <= 0."""
         nominal_s = 1 / self.rig.frame_rate_hz
         interval_s = time_s - self.log.times_s.array[-1] if len(self.log) else nominal_s
         if not interval_s > 0:
@@ -171,11 +158,8 @@ class Navigator:
             raise ValueError(f"time_s: {time_s} s is not later than the last frame, at {last_s} s")
         return nominal_s if abs(interval_s / nominal_s - 1) < _SAME_INTERVAL else float(interval_s)
 
-    def _is_keyframe(self, frame: Frame, status: str) -> bool:
-        """Returns whether a frame is to become a keyframe by the rules of `update`, before its points are matched.
-
-        The next pair is expected after a motion equal to that since the last pair.
-        """
+    def is_keyframe(self, frame: Frame, status: str) -> bool:
+        """Returns whether a frame is to become a keyframe (`update`), if the next motion equals the last one."""
         if frame.right is None or frame.keyframe is not None:
             return bool(frame.keyframe) and frame.right is not None
         since_pair = geometry.inverse(self._f2f_at_pair) @ self.filter.f2f
@@ -183,16 +167,13 @@ class Navigator:
         if status != "ok" or not self.network.keyframes:
             return True
         next_pair = self.filter.world_from_camera @ since_pair
-        return self.network.overlap_with_last(next_pair) < self.settings.keyframe_overlap
+        return self.network.overlap(self.network.keyframes[-1], next_pair) < self.settings.keyframe_overlap
 
     def _add_keyframe(self, frame: Frame, track: int, status: str) -> str:
         """Processes a keyframe (stereo, motion since the last node, F2M, mosaic, network) and restarts F2F tracking.
 
-        If too few points are matched in stereo, the frame does not become a keyframe and only position fixes are fused.
-
-        Returns:
-            `status`, or the reason why the frame did not become a keyframe. With `settings.wide_search`, "ok" if the
-            link from the last node measures the motion of a frame at which tracking failed.
+        Returns `status`, or the reason why the frame did not become a keyframe; only position fixes are then fused.
+        With `settings.wide_search`, "ok" if the link from the last node measures the motion although tracking failed.
         """
         points = self.vision.observe_stereo(frame, len(self.log))
         if points is None:
@@ -231,11 +212,7 @@ class Navigator:
             keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
 
     def _follow_chain(self, node: Keyframe, chain: Link) -> None:
-        """Replaces the F2F motion since the last node in the online pose by the measured link.
-
-        It is more accurate than accumulated F2F (Negahdaripour & Madjidi 2003, section IV-5). Corrections of the pose
-        since the last node, by navigation sensors and by F2M, are kept.
-        """
+        """Replaces the F2F motion since the last node by the more accurate link; corrections since then are kept."""
         last = self.network.nodes[-1]
         correction = geometry.inverse(last.world_from_camera @ self.filter.since_node) @ self.filter.world_from_camera
         cov = geometry.transport_covariance(self.filter.cov_at_node, chain.i_from_j) + chain.cov
@@ -271,13 +248,9 @@ class Navigator:
         self.network.connect(node, chain, bridge, self.filter.start_from_node(node.number))
 
     def align_track(self, track: int) -> None:
-        """Aligns the window of tracks that ends with `track`, and corrects the online pose.
+        """Aligns the window of tracks that ends with `track`; the online pose is corrected as the last keyframe is.
 
-        The online pose receives the same correction as the last keyframe.
-
-        Raises:
-            SurveyAborted: the alignment failed.
-            OSError: images could not be read or written.
+        Raises SurveyAborted if the alignment failed, OSError if images could not be read or written.
         """
         keyframes = self.network.keyframes
         before = keyframes[-1].world_from_camera if keyframes else np.eye(4)
@@ -293,14 +266,9 @@ class Navigator:
         self.network.abandon_alignment()
 
     def finish(self) -> SurveyResult:
-        """Runs the final global alignment over all nodes, unless it is switched off or abandoned.
+        """Returns the result after the final global alignment of all nodes, unless it is switched off or abandoned.
 
-        Returns:
-            The trajectories, the keyframes with their covariances, the links, and the quality of the estimation.
-
-        Raises:
-            SurveyAborted, OSError: the alignment or the measurement of links failed. A second call skips these steps
-                and returns the result without them.
+        Raises SurveyAborted or OSError if this fails; a second call returns the result without it.
         """
         self.network.truncate(len(self.log))
         keyframes, history, log = self.network.keyframes, self.network.history, self.log
@@ -331,8 +299,8 @@ class Navigator:
         residuals, alignments = np.array(history.link_residuals), history.alignments
         failed, counts = np.isnan(residuals), self.filter.gates.counts
         poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
-        n_views = disparity_offset.mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
-        offset = disparity_offset.combine(history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px)
+        n_views = mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
+        offset = disparity_offset(history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px)
         across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
             frames_lost=self.log.n_lost,
@@ -359,62 +327,42 @@ class Navigator:
         """Builds the elevation map along the final trajectory, from all keyframes but `SurveyResult.unlinked`.
 
         Heights are measured along z of the world if the optical axis of the first keyframe is within 45 degrees of
-        straight down, otherwise along this axis, towards the camera (`ElevationMap.map_from_world`).
+        straight down, otherwise along this axis, towards the camera (`ElevationMap.map_from_world`). None without a
+        keyframe; raises OSError if an image could not be read.
 
         Args:
             result: result of the survey (`finish`).
             grid: grid of the map; by default it covers the images of all keyframes.
             progress: called with the fraction of the keyframes processed so far, 0 to 1.
-
-        Returns:
-            The map, or None if there is no keyframe.
-
-        Raises:
-            OSError: an image could not be read.
         """
         if not len(result.keyframe_rows):
             return None
         turned, linked, map_from_world = _linked_in_map(result)
-
-        def report(n_done: int) -> None:
-            if progress is not None:
-                progress(n_done / len(linked))
-
-        grid = grid or footprint_grid(turned, self.rig)
-        found = self.vision.build_map(turned, grid, steps_between(result.step_cov, linked), report)
+        grid, report = grid or footprint_grid(turned, self.rig), progress or _ignore
+        steps = steps_between(result.step_cov, linked)
+        found = self.vision.build_map(turned, grid, steps, lambda n_done: report(n_done / len(linked)))
         return replace(found, map_from_world=map_from_world)
 
     def build_tiles(
         self, result: SurveyResult, progress: Callable[[float], None] | None = None
     ) -> Iterator[tuple[MapTile, ElevationMap]]:
-        """Builds the elevation map in tiles of cells that are not enlarged, if `build_map` has enlarged its cells.
+        """Yields each tile that images show, with its map, if `build_map` has enlarged the cells (not those of tiles).
 
         Memory is that of one tile. A keyframe at the border of tiles is processed for each of them. Together the tiles
-        are the map of `build_map` on their common grid, except that the light pattern is that of the keyframes of a
-        tile, and that depth is propagated between these keyframes only.
-
-        Args:
-            result: result of the survey (`finish`).
-            progress: called with the fraction of the tiles built so far, 0 to 1.
-
-        Yields:
-            Each tile that images show, with its map; nothing if `build_map` has not enlarged the cells.
-
-        Raises:
-            OSError: an image could not be read.
+        are the map of `build_map` on their common grid, except that light pattern and propagation of depth are those of
+        the keyframes of a tile. Raises OSError if an image could not be read.
         """
         if not len(result.keyframe_rows):
             return
         turned, linked, map_from_world = _linked_in_map(result)
-        tiles = footprint_tiles(turned, self.rig)
+        tiles, report = footprint_tiles(turned, self.rig), progress or _ignore
         for k, tile in enumerate(tiles):
             part, steps = _of_keyframes(turned, tile.keyframes), steps_between(result.step_cov, linked[tile.keyframes])
-            found = self.vision.build_map(part, with_margin(tile.grid, _TILE_MARGIN), steps, lambda _: None)
+            found = self.vision.build_map(part, with_margin(tile.grid, _TILE_MARGIN), steps, _ignore)
             inner = np.s_[_TILE_MARGIN:-_TILE_MARGIN, _TILE_MARGIN:-_TILE_MARGIN]
             layers = found.height_m[inner], found.sigma_m[inner], found.mosaic[inner]
             yield tile, ElevationMap(tile.grid, *layers, map_from_world)
-            if progress is not None:
-                progress((k + 1) / len(tiles))
+            report((k + 1) / len(tiles))
 
     def orthomosaic(
         self,
@@ -426,10 +374,7 @@ class Navigator:
         """Returns an iterator over the tiles of the orthomosaic of the keyframe images; None if there are no images.
 
         Args:
-            result: result of the survey (`finish`).
-            elevation: map of the survey (`build_map`).
-            restore: function that removes the effects of lamps and water from an image; None: colours as seen, at equal
-                exposure.
+            restore: removes the effects of lamps and water from an image; None: colours as seen, at equal exposure.
             progress: called with the finished fraction, 0 to 1.
 
         Raises:
@@ -448,7 +393,11 @@ class Navigator:
         exposures = {k.row: k.exposure for k in self.network.keyframes}
         poses = elevation.map_from_world @ result.final.world_from_camera[rows]
         views = Views(poses, result.keyframe_depth_m, [exposures[int(row)] for row in rows], load)
-        return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress)
+        return orthomosaic(views, elevation, self.rig.with_square_pixels(), restore, progress or _ignore)
+
+
+def _ignore(_: float) -> None:
+    """Progress that nobody follows."""
 
 
 def _linked_in_map(result: SurveyResult) -> tuple[SurveyResult, NDArray[np.int64], Array]:
@@ -467,18 +416,3 @@ def _of_keyframes(result: SurveyResult, chosen: NDArray[np.int64]) -> SurveyResu
         node_cov=result.node_cov[chosen],
         keyframe_depth_m=result.keyframe_depth_m[chosen],
     )
-
-
-def finish_in_stage(navigator: Navigator, guard: StageGuard) -> SurveyResult:
-    """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted.
-
-    The alignment is the stage "alignment" of the guard. Why it failed is stored in `guard.cause`, unless a cause is set
-    already; an interrupt adds the stage to `guard.skipped`.
-    """
-    try:
-        if (result := guard.attempt("alignment", navigator.finish)) is not None:
-            return result
-    except (SurveyAborted, OSError) as error:
-        guard.cause = guard.cause or str(error)
-    navigator.abandon_alignment()
-    return navigator.finish()

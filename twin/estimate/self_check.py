@@ -31,20 +31,13 @@ _COVERED = 3.0  # largest effect of a calibration error that the standard deviat
 
 
 def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap | None = None) -> list[Finding]:
-    """Returns the findings of all checks; an empty list if every check passes.
-
-    The findings are in the order of tracking, navigation sensors, stereo, rectification and consistency.
-
-    Args:
-        elevation: map of the survey; None if none was built.
-    """
+    """Returns the failed checks: tracking, navigation sensors, stereo, rectification and consistency, in this order."""
     damage = _Damage(result, rig, elevation)
     checks = _tracking(result), _stereo(result), _rectification(result, damage), _consistency(result, damage)
     return [finding for findings in checks for finding in findings]
 
 
 def _above(check: str, value: float | None, limit: float, text: str) -> list[Finding]:
-    """Returns a finding if a value is known and not up to its limit, otherwise none."""
     return [] if value is None or value <= limit else [Finding(check, value, limit, text)]
 
 
@@ -88,7 +81,6 @@ def _largest_sigma_m(result: SurveyResult, initial: float) -> float:
 
 
 def _tracking(result: SurveyResult) -> Iterator[Finding]:
-    """Yields the findings on tracking and on the readings of the navigation sensors."""
     quality, n = result.quality, len(result.online)
     text = f"the motion of {quality.frames_lost} of {n} frames was predicted, not measured"
     yield from _above("frames_lost", quality.frames_lost / max(n, 1), MAX_FRAMES_LOST, text)
@@ -120,7 +112,6 @@ def _stereo(result: SurveyResult) -> Iterator[Finding]:
 
 
 def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
-    """Yields a finding for each rectification error above its limit: row offset, yaw, pattern of row differences."""
     offset = _median(pair.row_offset_px for pair in result.stereo_observations)
     if offset is not None:
         text = f"the rows of the right image are offset by {offset:+.2f} px"
@@ -143,7 +134,6 @@ def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
 
 
 def _consistency(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
-    """Yields a finding for each quantity that shows inconsistent links or a large uncertainty."""
     quality, residual, chi2 = result.quality, result.quality.link_residual, result.quality.link_chi2
     text = f"residuals of points matched between keyframes are {residual or 0:.1f} times their noise"
     yield from _above("link_residual", residual, MAX_LINK_RESIDUAL, text)

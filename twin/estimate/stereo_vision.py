@@ -1,5 +1,3 @@
-"""Visual measurements from recorded or rendered stereo images: an implementation of `vision_interface.Vision`."""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -18,6 +16,7 @@ from twin.core.records import (
     ElevationMap,
     Frame,
     Image,
+    Map,
     MapGrid,
     SensorNoise,
     StereoObservation,
@@ -26,7 +25,7 @@ from twin.core.records import (
 )
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
-from twin.estimate.mapping.map_builder import KeyframeImages, KeyframePath, build_map, gray_levels
+from twin.estimate.mapping.map_builder import ImagePair, KeyframePath, build_map, gray_levels
 from twin.estimate.vision import disparity, epipolar_calibration, matching, stereo, wide_search
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
@@ -44,7 +43,7 @@ _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern
 
 
 class StereoVision:
-    """Visual measurements from images, binned as `stereo.choose_binning` tells at the first keyframe.
+    """`Vision` from recorded or rendered stereo images, binned as `stereo.choose_binning` tells at the first keyframe.
 
     Use as a context manager, or call `close`.
 
@@ -96,13 +95,11 @@ class StereoVision:
         self.close()
 
     def close(self) -> None:
-        """Ends the threads of the image spool and of the matcher."""
         self.spool.close()
         self.matcher.close()
 
     @cached_property
     def mosaic(self) -> Mosaic:
-        """Returns the mosaic; it is created at the first access, which requires a keyframe."""
         assert self._points is not None
         cell_m = self._cell_m or float(np.median(self._points.xyz[:, 2])) / self.full_rig.focal_px
         return Mosaic(cell_m * self.binning, self._folder / "mosaic")
@@ -118,7 +115,6 @@ class StereoVision:
             return motion, status if frozen == "ok" else frozen
 
     def _set_image(self, left: Image) -> None:
-        """Makes an image (H, W, 3) the current left image: computes its grey levels and its normalised image."""
         self._gray = matching.gray(left, self.binning)
         self._image = matching.normalise(self._gray)
 
@@ -152,24 +148,20 @@ class StereoVision:
             self._set_image(left)
             self.f2f.step(self._image)
 
-    def _match_pair(self, right: Image) -> tuple[Image, matching.Gray, NDArray[np.float32], StereoPoints]:
+    def _match_pair(self, right: Image) -> tuple[Image, matching.Gray, Map, StereoPoints]:
         """Matches the current left image with a right image, from which known rectification errors are removed.
 
-        Returns:
-            Corrected right image, its grey levels at the image scale, disparity by semi-global matching, and points.
+        Returns the corrected right image, its grey levels at the image scale, its disparity, and points.
         """
         right = self.calibration.rectify(right, self.full_rig)
-        gray, s = matching.gray(right, self.binning), self.settings
+        gray = matching.gray(right, self.binning)
         dense_px = disparity.search(self._image, matching.normalise(gray), self.search_range.max_disparity_px)
         self.search_range.update(dense_px)
-        points = stereo.match_stereo_points(self._gray, gray, dense_px, self.rig, s.points, s.patch_px)
+        points = stereo.match_stereo_points(self._gray, gray, dense_px, self.rig, self.settings)
         return right, gray, dense_px, points
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
-        """Returns the matched points, the image quality and the row differences of a stereo pair.
-
-        Row differences are in pixels of the full image with square pixels; `left` (H, W, 3) is not resampled.
-        """
+        """Returns the quality of a stereo pair; row differences are in pixels of the full image with square pixels."""
         seen = contrast(self._gray), saturated_fraction(left)
         repeated = repetition(self._image, self.settings.patch_px)
         if not len(points.xyz):
@@ -202,7 +194,7 @@ class StereoVision:
         self._depth_of_keyframe[number] = self._depth_m.astype(np.float16)
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
-        self.mosaic.clear()
+        self.mosaic.cells.clear()
         self._depth_of_keyframe = {k.number: self._depth_of_keyframe[k.number] for k in keyframes}
         for key in keyframes:
             image = matching.normalise(self.spool.gray(key.row)[0])
@@ -210,14 +202,15 @@ class StereoVision:
             self.mosaic.add(key.number, image, depth_m, self._on_plane(key.world_from_camera), self.rig)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
+        motions = self._match_and_measure(node, others)
+        found = zip(others, motions, strict=True)
+        return [self._search_widely(node, other) if motion is None else motion for other, motion in found]
+
+    def _match_and_measure(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
         with self.stopwatch("flow"):
             matches = self.matcher.match(node, others)
-        motions: list[Motion | None] = []
-        for other, matched in zip(others, matches, strict=True):
-            with self.stopwatch("network"):
-                motion = None if matched is None else self.matcher.motion(node, other, matched)
-            motions.append(self._search_widely(node, other) if motion is None else motion)
-        return motions
+        with self.stopwatch("network"):
+            return [self.matcher.motion(node, other, pair) for other, pair in zip(others, matches, strict=True)]
 
     def _search_widely(self, node: Keyframe, other: Keyframe) -> Motion | None:
         """Returns the motion from `other` to `node`, predicted from features of the whole images and then measured.
@@ -236,9 +229,7 @@ class StereoVision:
             if other_from_node is None:
                 return None
             moved = replace(other, world_from_camera=node.world_from_camera @ geometry.inverse(other_from_node))
-            matched = self.matcher.match(node, [moved])[0]
-        with self.stopwatch("network"):
-            motion = None if matched is None else self.matcher.motion(node, moved, matched)
+        motion = self._match_and_measure(node, [moved])[0]
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         if motion is None or anywhere or wide_search.agrees(motion.a_from_b, motion.cov, predicted, predicted_cov):
             return motion
@@ -255,13 +246,13 @@ class StereoVision:
     ) -> ElevationMap:
         rows = result.keyframe_rows
         images = (self._binned(*self.spool.pair(int(row))) for row in rows)
-        path = KeyframePath(result.final.world_from_camera[rows], result.node_cov, step_cov)
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
         pattern = light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
-        return build_map(images, path, self.rig, grid, progress, pattern=pattern)
+        path = KeyframePath(result.final.world_from_camera[rows], result.node_cov, step_cov)
+        return build_map(images, path, self.rig, grid, progress, pattern)
 
-    def _binned(self, left: Image, right: Image) -> KeyframeImages:
-        return KeyframeImages(matching.binned(left, self.binning), matching.binned(right, self.binning))
+    def _binned(self, left: Image, right: Image) -> ImagePair:
+        return matching.binned(left, self.binning), matching.binned(right, self.binning)
 
     def left_image(self, row: int) -> Image | None:
         return self.spool.left(row)
@@ -270,8 +261,8 @@ class StereoVision:
 def half_window_m(points: StereoPoints, rig: StereoRig) -> float:
     """Returns half the side of the square of the mosaic that is used for registration [m].
 
-    This is 0.6 times the width of the footprint at the 90th percentile of the depths of the points. The largest depth
-    is not used: one mismatch with a disparity of 0.5 px would make the square so large that it needs 20 GB of memory.
+    This is 0.6 times the width of the footprint at the 90th percentile of the depths of the points: one mismatch with a
+    disparity of 0.5 px would make the square of the largest depth need 20 GB of memory.
     """
     return 0.6 * float(np.quantile(points.xyz[:, 2], 0.9)) * rig.width_px / rig.focal_px
 

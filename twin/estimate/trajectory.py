@@ -37,7 +37,6 @@ class PoseLog:
         return len(self.times_s)
 
     def append(self, times_s: float | Array, f2f: Array, online: Array, steps: Array, variances: Array) -> None:
-        """Appends one frame, or n frames with a leading axis n."""
         self.times_s.append(times_s)
         self.f2f.append(f2f)
         self.online.append(online)
@@ -50,13 +49,9 @@ def interpolate_between_keyframes(
 ) -> Array:
     """Returns the poses (n, 4, 4) of all frames from those of the keyframes (m, 4, 4) and the steps between frames.
 
-    Between two keyframes, the misclosure of the steps is distributed over them by least squares, weighted by their
-    variances: a step that failed takes nearly all of it. Frames before the first and after the last keyframe follow the
-    steps without correction.
-
-    Args:
-        steps, variances: those of `PoseLog`; the first step is not used.
-        rows: (m,) indices of the frames that are keyframes, ascending; m > 0.
+    Between two keyframes, with indices `rows` (m,), the misclosure of the steps is distributed over them by least
+    squares, weighted by their variances: a step that failed takes nearly all of it. Frames before the first and after
+    the last keyframe follow the steps without correction. `steps` and `variances` are those of `PoseLog`; m > 0.
     """
     motions, variances = _motions(steps), np.maximum(variances, _LEAST_VARIANCE)
     between = zip(rows, rows[1:], keyframe_poses, keyframe_poses[1:], strict=False)

@@ -1,9 +1,3 @@
-"""Interface between the estimation pipeline and the source of visual measurements.
-
-`pipeline.Navigator` uses only this interface, so its measurements can come from images (`stereo_vision.StereoVision`)
-or be sampled from an error model.
-"""
-
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
@@ -18,33 +12,26 @@ from twin.estimate.vision.two_view_motion import Motion
 
 
 class Vision(Protocol):
-    """Source of visual measurements. Poses are (4, 4) world_from_camera of the left camera.
+    """Visual measurements for `pipeline.Navigator`: from images (`stereo_vision.StereoVision`), or an error model.
 
-    The methods raise OSError if images or the mosaic could not be read from disk or written to it.
+    Poses are (4, 4) world_from_camera, left. Methods raise OSError if images or the mosaic cannot be read or written.
     """
 
     runs_in_background: bool  #: whether `measure_motions` takes long enough to justify a separate thread
     stereo_observations: list[StereoObservation]  #: image quality and number of points of every stereo pair so far
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        """Returns the frame-to-frame motion (F2F) since the last frame, and "ok" or the reason why tracking failed.
-
-        Raises ValueError if an image is not of the size that the calibration states; the frame is ignored.
-        """
+        """Returns the F2F motion since the last frame, and "ok" or why it failed; ValueError for a wrong image size."""
         ...
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
-        """Returns the matched points of a stereo pair; None if there are too few for a keyframe.
-
-        `row` is the index of the frame in the trajectories.
-        """
+        """Returns the matched points of the pair at frame index `row`; None if there are too few for a keyframe."""
         ...
 
     def tracking_cov(self) -> Array | None:
-        """Returns the covariance (6, 6) of the pose of the last frame relative to the last keyframe, by F2F alone.
+        """Returns the covariance (6, 6) of the last frame's pose in the last keyframe by F2F; None where unknown.
 
-        Errors are motions [rotation, translation] (rad, m) in the axes of the last frame. None before the first
-        keyframe and where the covariance is unknown.
+        Errors are motions [rotation, translation] (rad, m) in the axes of the last frame.
         """
         ...
 
@@ -65,10 +52,7 @@ class Vision(Protocol):
         ...
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Returns, for each of the other nodes, the motion from it to `node`; None where it cannot be measured.
-
-        May be called from another thread.
-        """
+        """Returns the motion from each of the other nodes to `node`, None where it fails; also from another thread."""
         ...
 
     def epipolar_error(self) -> EpipolarError | None:
@@ -76,7 +60,7 @@ class Vision(Protocol):
         ...
 
     def discard(self, numbers: range) -> None:
-        """Frees the memory of the keyframes with these numbers; `measure_motions` must not be called for them later."""
+        """Frees the memory of the keyframes with these numbers, for which `measure_motions` is not called any more."""
         ...
 
     def build_map(

@@ -1,8 +1,8 @@
 """GeoTIFF files of maps. Row 0 is the northernmost row; the nodata value of float layers is NaN.
 
-Without a georeference, files are in scene coordinates [m]. With a georeference (that of a measured DEM, or one given by
-the user), they are in its coordinate reference system (CRS), and elevations are metres above its vertical datum,
-positive upwards. Tags then hold the scene origin, from which `scene_placement` computes scene coordinates.
+Without a georeference, files are in scene coordinates [m]. With one (that of a measured DEM, or given by the user),
+they are in its coordinate reference system (CRS), with elevations above its vertical datum [m], and tags hold the scene
+origin, from which `scene_placement` computes scene coordinates.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from rasterio.warp import transform
 
 from twin.core.georeference import Georeference
 from twin.core.ortho_tiles import OrthoTile
-from twin.core.raster_files import open_raster
 from twin.core.records import ElevationMap, Image, MapGrid
+from twin.core.user_files import open_raster
 from twin.errors import TwinError
 
 Layer = NDArray[np.float32]
@@ -78,7 +78,6 @@ def write_elevations(
 def write_layer(
     path: Path, values: Layer, grid: MapGrid, description: str, georeference: Georeference | None = None
 ) -> None:
-    """Writes one layer (rows, cols) as float32; the nodata value is NaN."""
     _write(path, values[None].astype(np.float32), grid, georeference, (description,), nodata=np.nan, predictor=3)
 
 
@@ -90,7 +89,6 @@ def write_masks(
 
 
 def write_mosaic(path: Path, mosaic: Image, grid: MapGrid, georeference: Georeference | None = None) -> None:
-    """Writes the orthomosaic (rows, cols, 3) as RGB; the nodata value is 0 (black)."""
     _write(path, np.moveaxis(mosaic, 2, 0), grid, georeference, nodata=0, photometric="RGB")
 
 
@@ -116,10 +114,7 @@ def _write(
 
 
 class OrthomosaicFile:
-    """GeoTIFF of an orthomosaic, written tile by tile: R, G, B and alpha, in the CRS of the map files.
-
-    A context manager; if an exception leaves it, the incomplete file is removed.
-    """
+    """GeoTIFF of an orthomosaic (RGBA), written by tiles; a context manager, which removes it after an exception."""
 
     def __init__(self, path: Path, grid: MapGrid, georeference: Georeference | None = None):
         self._path = path
@@ -137,7 +132,6 @@ class OrthomosaicFile:
             self._path.unlink(missing_ok=True)
 
     def write(self, tile: OrthoTile) -> None:
-        """Writes the pixels of a tile at its row and column of the file."""
         rows, cols = tile.rgba.shape[:2]
         window = (tile.row, tile.row + rows), (tile.col, tile.col + cols)
         self._file.write(np.moveaxis(tile.rgba, 2, 0), window=window)
@@ -146,10 +140,8 @@ class OrthomosaicFile:
 def scene_placement(source: rasterio.DatasetReader) -> tuple[MapGrid, float]:
     """Returns the grid of an open raster in scene coordinates, and the offset [m] to subtract from its values.
 
-    The offset is the elevation of the scene origin if the values are elevations by the tags of the raster, otherwise 0.
-
-    Raises:
-        ValueError: the raster is rotated, its cells are not square, or its tags are damaged.
+    The offset is the elevation of the scene origin if its tags say that values are elevations, otherwise 0. Raises
+    ValueError if the raster is rotated, its cells are not square, or its tags are damaged.
     """
     t = source.transform
     if t.b or t.d or t.a <= 0 or not np.isclose(t.a, -t.e, rtol=1e-6):
@@ -175,10 +167,7 @@ def _origin(source: rasterio.DatasetReader) -> Georeference | None:
 
 
 def read_georeference(path: Path) -> Georeference | None:
-    """Returns the position of the scene in the CRS of a map file, None if the file is in scene coordinates.
-
-    Raises TwinError if the file cannot be read, or its tags are damaged.
-    """
+    """Returns the position of the scene in the CRS of a map file, None without one; raises TwinError if damaged."""
     with open_raster(path, "", "a map file, written by `twin run`") as source:
         return _origin(source)
 
@@ -186,9 +175,8 @@ def read_georeference(path: Path) -> Georeference | None:
 def read_raster(file: Path) -> Raster:
     """Reads a GeoTIFF; in one band, cells without data become NaN, and elevations become heights in the scene.
 
-    Raises:
-        TwinError: the file is not a readable GeoTIFF or has more than MOST_CELLS cells, the raster is rotated, its
-            cells are not square, or its tags are damaged.
+    Raises TwinError if the file is not a readable GeoTIFF or has more than MOST_CELLS cells, the raster is rotated, its
+    cells are not square, or its tags are damaged.
     """
     with open_raster(file) as source:
         n_cells, n_bytes = source.width * source.height, file.stat().st_size
@@ -222,10 +210,8 @@ def read_mosaic(file: Path, most_side_px: int | None = None) -> Raster:
 def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeference:
     """Returns the georeference of a scene whose origin is at (easting, northing, elevation [m]) in a projected CRS.
 
-    `crs` is `EPSG:CODE`, WKT or PROJ text; its unit may be the metre or another unit of length.
-
-    Raises:
-        TwinError: the CRS is unknown or not projected, or the origin is outside the area in which it is defined.
+    `crs` is `EPSG:CODE`, WKT or PROJ text; its unit may be any unit of length. Raises TwinError if the CRS is unknown
+    or not projected, or the origin is outside the area in which it is defined.
     """
     try:
         known = CRS.from_user_input(crs)
@@ -239,7 +225,6 @@ def georeference_in(crs: str, origin: tuple[float, float, float]) -> Georeferenc
 
 
 def _is_on_earth(crs: CRS, origin: tuple[float, float, float]) -> bool:
-    """Returns whether the position (easting, northing, elevation) in a projected CRS has a latitude and a longitude."""
     try:
         (longitude,), (latitude,) = transform(crs, CRS.from_epsg(4326), [origin[0]], [origin[1]])[:2]
     except Exception:  # rasterio raises errors of GDAL, which it does not export
@@ -254,7 +239,6 @@ def crs_of(georeference: Georeference | None) -> CRS:
 
 
 def profile(grid: MapGrid, bands: int, dtype: str, georeference: Georeference | None) -> dict[str, Any]:
-    """Returns the rasterio profile of a GeoTIFF file on a grid."""
     origin = georeference or Georeference(0.0, 0.0)
     west, north = (float(value) for value in origin.from_scene(grid.west_m, grid.north_m))
     cell = grid.cell_m / origin.metres_per_unit

@@ -24,9 +24,8 @@ def surface(
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.uint8]]:
     """Returns the surface of a map: triangles that connect the centres of its cells, about `max_vertices` at most.
 
-    Returns:
-        Vertices (n, 3) in the frame of the map [m], without those of no triangle; triangles (m, 3), which face up in
-        this frame; colours (n, 3) of the vertices.
+    These are vertices (n, 3) in the frame of the map [m], without those of no triangle; triangles (m, 3), which face up
+    in this frame; colours (n, 3) of the vertices.
     """
     stride = max(1, int(np.ceil(np.sqrt(elevation_map.height_m.size / max_vertices))))
     x, y = elevation_map.grid.centres()
@@ -46,7 +45,6 @@ def map_mesh(elevation_map: ElevationMap, max_vertices: int = MAX_VERTICES) -> t
 
 
 def write_glb(path: Path, elevation_map: ElevationMap) -> None:
-    """Writes the mesh of a map (`map_mesh`) as GLB."""
     path.write_bytes(glb(map_mesh(elevation_map)))
 
 

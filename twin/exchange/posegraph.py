@@ -1,7 +1,7 @@
 """Writer of the keyframe network as a pose graph in g2o format.
 
 As in GTSAM, the information of a rotation refers to the rotation vector [1/rad^2]. In g2o itself it refers to the
-vector part of the quaternion (for small rotations half the rotation vector), so its values are four times as large.
+vector part of the quaternion (half the rotation vector, if small), so its values are four times as large.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ _UPPER = np.triu_indices(6)
 def write(path: Path, result: SurveyResult) -> None:
     """Writes the final keyframe poses and the links as VERTEX_SE3:QUAT and EDGE_SE3:QUAT lines (g2o).
 
-    Quaternions are ordered xyzw. Information matrices are those of [translation, rotation vector] and are written as
-    upper triangles, row by row.
+    Quaternions are xyzw. Information matrices, of [translation, rotation vector], are upper triangles, row by row.
     """
     poses = result.final.world_from_camera[result.keyframe_rows]
     vertices = "".join(f"VERTEX_SE3:QUAT {k} {pose}\n" for k, pose in enumerate(_pose_texts(poses)))
@@ -42,6 +41,5 @@ def _pose_texts(poses: Array) -> list[str]:
 
 
 def _row_texts(rows: Array, number_format: str) -> list[str]:
-    """Returns the text of each row of an array (n, k): its numbers in a printf format, separated by spaces."""
     line = " ".join([number_format] * rows.shape[1]) + "\n"
     return (line * len(rows) % tuple(rows.ravel().tolist())).splitlines()

@@ -16,10 +16,7 @@ _COLOURS = ("Red", "Green", "Blue")
 
 
 class TiledMapFolder:
-    """Writer of a map in tiles, in local metres: `dem_ROW_COL.tif` etc. for each tile, and `dem.vrt` etc. for all.
-
-    The folder is created with the first tile.
-    """
+    """Writer of a map in tiles, in local metres: `dem_ROW_COL.tif` etc. for each tile, and `dem.vrt` etc. for all."""
 
     def __init__(self, folder: Path):
         self.folder, self._tiles = folder, dict[str, MapGrid]()
@@ -37,18 +34,15 @@ class TiledMapFolder:
 
     @property
     def n_tiles(self) -> int:
-        """Returns the number of written tiles."""
         return len(self._tiles)
 
     def finish(self) -> None:
-        """Writes the virtual rasters of all tiles; raises OSError if it cannot. Without tiles, writes nothing."""
         for layer, bands in LAYERS.items():
             if self._tiles:
                 (self.folder / f"{layer}.vrt").write_text(_virtual_raster(layer, bands, self._tiles), encoding="utf-8")
 
 
 def _virtual_raster(layer: str, bands: tuple[str, ...], tiles: dict[str, MapGrid]) -> str:
-    """Returns the text of a GDAL VRT that shows one layer of all tiles, whose cells have the same size."""
     cell = next(iter(tiles.values())).cell_m
     west, north = min(t.west_m for t in tiles.values()), max(t.north_m for t in tiles.values())
     places = {name: (round((t.west_m - west) / cell), round((north - t.north_m) / cell)) for name, t in tiles.items()}

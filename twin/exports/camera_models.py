@@ -21,14 +21,10 @@ _RANGES = (0.6, 1.0, 1.4)  # depths of the points for the fit, as multiples of t
 def true_calibration(scenario: Scenario) -> StereoCalibration:
     """Returns the true calibration of the delivered images, which are rectified with the believed calibration.
 
-    The true pixel of a point is computed by `TrueCameras.project`, which models port, lens and rectification. Camera
-    matrix, distortion (k1, k2, p1, p2, k3) and, for the right camera, its rotation are fitted to the images of points
-    at depths of 0.6, 1 and 1.4 times the planned altitude by least squares; `residual_px` is the RMS distance that
-    remains. For cameras without lens distortion, port and calibration errors (except that of the baseline), the result
-    is exact, and `residual_px` is zero.
-
-    Raises:
-        TwinError: the cameras of the scenario are invalid, see `make_true_cameras`.
+    Camera matrix, distortion (k1, k2, p1, p2, k3) and, for the right camera, its rotation are fitted by least squares
+    to the true pixels (`TrueCameras.project`: port, lens, rectification) of points at 0.6, 1 and 1.4 times the planned
+    altitude; `residual_px` is the RMS distance that remains. It is zero, and the result exact, for cameras without lens
+    distortion, port and calibration errors (except that of the baseline). Raises TwinError as `make_true_cameras` does.
     """
     cameras = make_true_cameras(scenario)
     rig = scenario.believed_rig()
@@ -56,7 +52,7 @@ def _fitted(cameras: TrueCameras, side: int, points_m: Array, rig: StereoRig) ->
     """Returns the model fitted to one camera, its rotation (3, 3) camera_from_rendered, and the residuals (2 n,) [px].
 
     The rotation of the left camera (`side` 0) is the identity: its axes are those of the true poses. Points (n, 3) in
-    the axes of the rendered camera without an image are left out. `rig` has the image size and is the start of the fit.
+    the axes of the rendered camera without an image are left out. `rig` is the start of the fit.
     """
     seen = cameras.project(points_m, side)
     known = np.isfinite(seen).all(axis=1)

@@ -14,7 +14,7 @@ import rasterio
 import rasterio.shutil
 
 from twin.core.georeference import Georeference
-from twin.core.raster_files import open_raster
+from twin.core.user_files import open_raster
 from twin.datasets.run_contents import RunContents
 from twin.exchange import geotiff
 
@@ -22,35 +22,33 @@ _OPTIONS = {"compress": "DEFLATE", "bigtiff": "IF_SAFER"}
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes dem.tif, dem_sigma.tif, dem_error.tif and orthomosaic.tif, and returns these files.
+    """Writes dem.tif, dem_sigma.tif, dem_error.tif (if the true elevations are known) and orthomosaic.tif.
 
-    dem_error.tif is written only if the true elevations are known. Without a file of the orthomosaic, orthomosaic.tif
-    has one pixel per map cell, with the colours of `ElevationMap.mosaic`.
-
-    Raises:
-        OSError: the folder cannot be written.
-        ValueError: a georeference is given, and the orthomosaic is rotated, its pixels are not square, or its tags are
-            damaged.
+    Without a file of the orthomosaic, orthomosaic.tif has one pixel per map cell, with the colours of
+    `ElevationMap.mosaic`. Raises ValueError if a georeference is given, and the orthomosaic is rotated, its pixels are
+    not square, or its tags are damaged.
     """
     elevation, origin = contents.elevation, contents.georeference
     assert elevation is not None  # by `ExportFormat.needs`
-    grid, files = elevation.grid, [folder / "dem.tif", folder / "dem_sigma.tif"]
-    with _optimised(files[0], predictor="FLOATING_POINT") as file:
-        geotiff.write_elevations(file, elevation.height_m, grid, "elevation [m]", origin)
-    with _optimised(files[1], predictor="FLOATING_POINT") as file:
-        geotiff.write_layer(file, elevation.sigma_m, grid, "standard deviation [m]", origin)
+    layers = {
+        "dem.tif": (geotiff.write_elevations, elevation.height_m, "elevation [m]"),
+        "dem_sigma.tif": (geotiff.write_layer, elevation.sigma_m, "standard deviation [m]"),
+        "dem_error.tif": (geotiff.write_layer, contents.error_m, "estimated minus true elevation [m]"),
+    }
+    files = []
+    for name, (write, values, description) in layers.items():
+        if values is not None:
+            files.append(folder / name)
+            with _optimised(files[-1], predictor="FLOATING_POINT") as file:
+                write(file, values, elevation.grid, description, origin)
     contents.progress(0.3)
-    if contents.error_m is not None:
-        files.append(folder / "dem_error.tif")
-        with _optimised(files[-1], predictor="FLOATING_POINT") as file:
-            geotiff.write_layer(file, contents.error_m, grid, "estimated minus true elevation [m]", origin)
     files.append(folder / "orthomosaic.tif")
     if contents.orthomosaic is not None and origin is None:
         _optimise(contents.orthomosaic, files[-1])
     else:
         with _optimised(files[-1]) as file:
             if contents.orthomosaic is None or origin is None:
-                geotiff.write_mosaic(file, elevation.mosaic, grid, origin)
+                geotiff.write_mosaic(file, elevation.mosaic, elevation.grid, origin)
             else:
                 _place(contents.orthomosaic, file, origin)
     contents.progress(1.0)
@@ -78,6 +76,5 @@ def _optimised(path: Path, **options: str) -> Iterator[Path]:
 
 
 def _optimise(source: Path, path: Path, **options: str) -> None:
-    """Copies a GeoTIFF with GDAL's COG driver; `options` are further options of the driver."""
     with open_raster(source) as original:
         rasterio.shutil.copy(original, path, driver="COG", **_OPTIONS, **options)

@@ -18,7 +18,7 @@ from twin.app.outputs import new_folder
 from twin.core.georeference import Georeference
 from twin.core.output_folder import sole_writer
 from twin.core.records import ElevationMap, Image
-from twin.datasets.run_contents import POSES, RecordedFrame, RunContents, TrueLayers
+from twin.datasets.run_contents import POSES, RecordedFrame, RunContents
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.geotiff import Raster
@@ -28,7 +28,6 @@ from twin.exports.recorded_frames import missing_files, recorded_frames, recorde
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.scenario.file import load_scenario
-from twin.scenario.model import Scenario
 
 
 class ExportOptions(NamedTuple):
@@ -48,26 +47,19 @@ def export(
     progress: Callable[[str, float], None] = lambda _, __: None,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, list[Path]]:
-    """Writes a run in several formats, each into the subfolder of `out` with the name of the format.
+    """Writes a run in several formats, each into the subfolder of `out` with the name of the format; returns the files.
 
-    A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`
-    in `out`, which an error or an interrupt removes.
+    A subfolder appears when its format is complete; until then its files are in a hidden folder `.FORMAT.partial`,
+    which an error or an interrupt removes.
 
     Args:
-        folder: the run folder.
-        names: names of formats (`formats.chosen_formats`).
         progress: called with the name of a format and the completed fraction of it, 0 to 1.
         warn: called with each sentence on a file that is missing in the run folder (`RunContents.notes`).
 
-    Returns:
-        The files or folders written, by format.
-
     Raises:
-        TwinError: a format is unknown, an option is not valid, the folder is not that of a run, the run lacks contents
-            that a format needs, or a subfolder is not empty or cannot be written; nothing was written. Or a package is
-            not installed, an image or the true poses of the run are damaged, or a file has the name of the hidden
-            folder; the formats before the affected one were written.
-        OSError: a file cannot be written.
+        TwinError: a format, an option or the run folder is not valid, the run lacks contents that a format needs, or a
+            subfolder is not empty or cannot be written; nothing was written. Or a package is missing, an image or the
+            true poses are damaged, or a file has the name of the hidden folder; earlier formats were written.
     """
     chosen = chosen_formats(names)
     contents = run_contents(folder, options)
@@ -87,10 +79,7 @@ def export(
 
 @contextmanager
 def _completed(folder: Path) -> Iterator[Path]:
-    """Yields a hidden folder next to `folder`, which is renamed to `folder` at the end, or removed after an exception.
-
-    A hidden folder that a killed export has left is removed first; raises TwinError if a file has its name.
-    """
+    """Yields a hidden folder, which is renamed to `folder` at the end, or removed after an exception."""
     unfinished = folder.with_name(f".{folder.name}.partial")
     if unfinished.is_symlink() or unfinished.is_file():
         raise TwinError("--out", f"{unfinished} is in the way", "a folder without this file")
@@ -106,26 +95,21 @@ def _completed(folder: Path) -> Iterator[Path]:
 
 
 def format_rows() -> list[tuple[str, ...]]:
-    """Returns the rows of the list of formats: name, description, and the contents that the format needs."""
     return [("format", "contents", "needs")] + [
         (name, form.description, ", ".join(sorted(form.needs))) for name, form in FORMATS.items()
     ]
 
 
 def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunContents:  # noqa: B008 (immutable)
-    """Returns the contents of a run folder for the writers.
-
-    Raises:
-        TwinError: the folder is not that of a run, a file of it is damaged, or an option is not valid.
-    """
+    """Returns the contents of a run folder for the writers; raises TwinError if folder or options are not valid."""
     if options.jpeg_quality is not None and not 1 <= options.jpeg_quality <= 100:
         raise TwinError("--jpeg", f"{options.jpeg_quality} is not a quality", "1 to 100")
     run = load_run(folder)
     rig = replayed_rig(run.scenario)
     scenario = None if rig is not None else load_scenario(folder / SCENARIO_FILE, allow_plugins=True)
-    if scenario is not None:
-        rig = scenario.believed_rig()
+    rig = rig if scenario is None else scenario.believed_rig()
     assert rig is not None
+    rendered = scenario is not None and scenario.imaging.fidelity == "rendered"
     frames = recorded_frames(run)
     _check_poses(run, frames)
     elevation = _elevation(run)
@@ -143,9 +127,10 @@ def run_contents(folder: Path, options: ExportOptions = ExportOptions()) -> RunC
         true_map=folder / "dem_truth.tif" if "dem_truth" in run.rasters else None,
         orthomosaic=folder / "mosaic.tif" if "mosaic" in run.rasters else None,
         georeference=_georeference(folder, options),
-        true_layers=_true_layers(folder, scenario, frames, options.allow_plugins),
         jpeg_quality=options.jpeg_quality,
         notes=() if scenario is None else tuple(missing_files(run, scenario, frames)),
+        renders_again=rendered and (folder / "frames" / "truth.npz").is_file(),
+        allow_plugins=options.allow_plugins,
     )
 
 
@@ -162,23 +147,7 @@ def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
                 raise TwinError(file, "has times that do not increase", "an undamaged file, written by `twin run`")
 
 
-def _true_layers(
-    folder: Path, scenario: Scenario | None, frames: tuple[RecordedFrame, ...], allow_plugins: bool
-) -> Callable[[], TrueLayers] | None:
-    """Returns the function that renders the true layers; None without a rendered world or recorded true poses."""
-    if scenario is None or scenario.imaging.fidelity != "rendered" or not (folder / "frames" / "truth.npz").is_file():
-        return None
-    from twin.exports import true_layers
-
-    def layers() -> TrueLayers:
-        given = load_scenario(folder / SCENARIO_FILE, allow_plugins=allow_plugins)
-        return true_layers.true_layers(folder, given, frames)
-
-    return layers
-
-
 def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
-    """Returns the georeference given by the options, otherwise that of dem.tif; None if there is neither."""
     if options.origin is None and options.crs is None:
         file = folder / "dem.tif"
         return geotiff.read_georeference(file) if file.is_file() else None
@@ -195,7 +164,6 @@ def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
 
 
 def _elevation(run: Run) -> ElevationMap | None:
-    """Returns the elevation map of a run with the colours of the orthomosaic at its cells; None if there is none."""
     if "dem" not in run.rasters:
         return None
     grid, height_m = run.rasters["dem"]
@@ -207,10 +175,7 @@ def _elevation(run: Run) -> ElevationMap | None:
 
 
 def _colours(mosaic: Raster | None, dem: Raster) -> Image:
-    """Returns the mean colour (rows, cols, 3) of the orthomosaic around the centre of each cell; black without data.
-
-    The mean is taken over a square about as large as a cell. Without an orthomosaic, all cells are black.
-    """
+    """Returns the mean colour (rows, cols, 3) of the orthomosaic over about each cell's area; black without data."""
     if mosaic is None:
         return np.zeros((*dem.values.shape, 3), np.uint8)
     if mosaic.grid == dem.grid:
@@ -226,7 +191,6 @@ def _colours(mosaic: Raster | None, dem: Raster) -> Image:
 
 
 def _layer(run: Run, name: str, elevation: ElevationMap | None) -> NDArray[np.float32] | None:
-    """Returns the layer of a run with a given name; None if the run has none on the grid of its elevation map."""
     raster = run.rasters.get(name)
     if raster is None or elevation is None or raster.grid != elevation.grid:
         return None

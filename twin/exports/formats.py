@@ -54,45 +54,32 @@ _TABLE = (
 FORMATS = {name: ExportFormat(text, tuple(needs.split()), writer) for name, needs, writer, text in _TABLE}
 
 
-class _Need(NamedTuple):
-    """Contents that a format may need."""
-
-    is_met: Callable[[RunContents], bool]
-    problem: str  #: of a run that lacks them
-    allowed: str  #: a run that has them
-
-
-_NEEDS = {
-    "images": _Need(
+#: What a format may need: whether a run has it, the problem of one that has not, and a run that has it.
+_NEEDS: dict[str, tuple[Callable[[RunContents], bool], str, str]] = {
+    "images": (
         lambda run: bool(run.frames),
         "has no images",
         'a run of a scenario with record = "all" (every frame) or "keyframes"',
     ),
-    "pairs": _Need(
-        lambda run: bool(run.pairs),
-        "has no stereo pairs",
-        'a run of a scenario with record = "all" or "keyframes"',
+    "pairs": (
+        lambda run: bool(run.pairs), "has no stereo pairs", 'a run of a scenario with record = "all" or "keyframes"',
     ),
-    "poses": _Need(
+    "poses": (
         lambda run: not run.trajectories.keys().isdisjoint(POSES),
         "has neither a true nor a final trajectory",
         "a run with trajectory_truth.tum or trajectory_final.tum",
     ),
-    "map": _Need(lambda run: run.elevation is not None, "has no elevation map", "a run with dem.tif"),
-    "world": _Need(
-        lambda run: run.true_layers is not None,
+    "map": (lambda run: run.elevation is not None, "has no elevation map", "a run with dem.tif"),
+    "world": (
+        lambda run: run.renders_again,
         "has no simulated world or no frames/truth.npz",
         "a run of `twin run` with rendered images, whose record is not none",
     ),
-}
+}  # fmt: skip
 
 
 def chosen_formats(names: Sequence[str]) -> list[str]:
-    """Returns the names of the requested formats without repetitions; a name may be several, separated by commas.
-
-    Raises:
-        TwinError: a name is unknown, or no format is named.
-    """
+    """Returns the formats in names, each once; a name may list several with commas; raises TwinError if unknown."""
     parts = [part.strip() for name in names for part in name.split(",") if part.strip()]
     for part in parts:
         if part not in FORMATS:
@@ -105,7 +92,6 @@ def chosen_formats(names: Sequence[str]) -> list[str]:
 
 
 def check_needs(name: str, contents: RunContents) -> None:
-    """Raises TwinError if the run lacks contents that the format called `name` needs."""
     for need in sorted(FORMATS[name].needs):
         is_met, problem, allowed = _NEEDS[need]
         if not is_met(contents):

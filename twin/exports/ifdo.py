@@ -17,7 +17,7 @@ from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
 from twin.datasets.calibration import RecordedCamera
-from twin.datasets.image_copy import copy_images
+from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RecordedFrame, RunContents
 from twin.exports.attitude import yaw_pitch_roll_deg
 
@@ -56,19 +56,16 @@ _LOCAL = (
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes ifdo.json and the folder of the images, and returns both.
 
-    The file has the calibration of the left camera, and position, attitude and hash of each image. Positions and
-    attitudes are those of the final trajectory or, without one, the true ones. Latitude and longitude (EPSG:4326),
-    which iFDO requires, and poses in UTM are written if the export has a projected CRS; otherwise, the abstract says
-    that the file has only poses in scene coordinates.
-    Times count from 1970-01-01, because a run has no date.
-
-    For a replay, the file states that the images are recorded; their platform, licence and copyright are "unknown".
+    Positions and attitudes are those of the final trajectory or, without one, the true ones. Latitude and longitude
+    (EPSG:4326), which iFDO requires, and poses in UTM are written if the export has a projected CRS; otherwise, the
+    abstract says that the file has only poses in scene coordinates. Times count from 1970-01-01, because a run has no
+    date. For a replay, the images are recorded ones of "unknown" platform, licence and copyright.
     """
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
     items, place = dict[str, Any](), _place(contents.georeference)
-    for image in copy_images(contents, folder / "images", contents.rig.left_from_right):
-        pose = path.world_from_camera[image.frame.index] @ image.left_from_camera
-        items[image.name] = _item(place, image.frame, folder / "images" / image.name, pose)
+    for image in copy_all(contents, folder / "images"):
+        pose = path.world_from_camera[image.frame.index] @ contents.believed.left_from(image.camera)
+        items[image.file.name] = _item(place, image.frame, image.file, pose)
     target = folder / "ifdo.json"
     text = json.dumps({"image-set-header": _header(contents, place), "image-set-items": items}, indent=1)
     target.write_text(text, encoding="utf-8")
@@ -76,7 +73,6 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
 
 def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
-    """Returns the fields that hold for the whole image set."""
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
     header: dict[str, Any] = {
         "image-set-name": contents.name,
@@ -105,7 +101,6 @@ def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
 
 
 def _illumination(scenario: Mapping[str, Any]) -> str:
-    """Returns iFDO's term for the light of a scenario: "mixed light", "artificial light" or "sunlight"."""
     lamps, sun = bool(scenario.get("lamps")), scenario.get("sun", {}).get("illuminance_lx", 0.0) > 0
     return "mixed light" if lamps and sun else "artificial light" if lamps else "sunlight"
 
@@ -125,7 +120,6 @@ def _calibration(camera: RecordedCamera) -> dict[str, Any]:
 
 
 def _item(place: _Place | None, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
-    """Returns the fields of one image, given its frame, its file and the pose (4, 4) of its camera in the world."""
     digest = hashlib.sha256(read_bytes(image, most_bytes=MOST_IMAGE_BYTES)).hexdigest()
     time = _START + timedelta(seconds=frame.time_s)
     turn = np.eye(3) if place is None else place.north_from_scene
@@ -142,8 +136,6 @@ def _item(place: _Place | None, frame: RecordedFrame, image: Path, pose: Array) 
 
 
 class _Place(NamedTuple):
-    """Place of a scene on the Earth."""
-
     origin: Georeference  #: position of the scene in its CRS
     zone: str  #: UTM zone, for example "33N"
     epsg: int  #: EPSG code of the zone on WGS 84
@@ -151,13 +143,8 @@ class _Place(NamedTuple):
     north_from_scene: Array
     utm_from_scene: Array
 
-    def transformed(self, easting: ArrayLike, northing: ArrayLike, target: str) -> Array:
-        """Returns the coordinates (n, 2) in a CRS of points in the CRS of the scene."""
-        return _transformed(self.origin.crs_wkt or "", target, easting, northing)
-
 
 def _transformed(source: str, target: str, x: ArrayLike, y: ArrayLike) -> Array:
-    """Returns the coordinates (n, 2) in the CRS `target` of points in the CRS `source`."""
     from rasterio.warp import transform
 
     return np.column_stack(transform(source, target, np.atleast_1d(x), np.atleast_1d(y))[:2])
@@ -195,10 +182,10 @@ def _position(place: _Place | None, pose: Array) -> dict[str, Any]:
     if place is None:
         settings = {"local-position-meters": [x, y, z], "local-orientation-matrix": pose[:3, :3].tolist()}
         return {"image-acquisition-settings": settings}
-    scene = place.origin.from_scene(x, y)
+    scene, crs = place.origin.from_scene(x, y), place.origin.crs_wkt or ""
     altitude_m = z + place.origin.elevation_m
-    longitude, latitude = place.transformed(*scene, _WGS84)[0]
-    easting_m, northing_m = place.transformed(*scene, f"EPSG:{place.epsg}")[0]
+    longitude, latitude = _transformed(crs, _WGS84, *scene)[0]
+    easting_m, northing_m = _transformed(crs, f"EPSG:{place.epsg}", *scene)[0]
     return {
         "image-latitude": round(float(latitude), 9),
         "image-longitude": round(float(longitude), 9),

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from twin.core.georeference import Georeference
-from twin.core.records import Trajectory
-from twin.datasets.image_copy import CopiedImage, copy_images
+from twin.core.records import Array
+from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RunContents
 from twin.exports.attitude import yaw_pitch_roll_deg
 
@@ -20,21 +20,21 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     coordinates [m]; angles are in degrees (`yaw_pitch_roll_deg`).
     """
     origin = contents.georeference or Georeference(0.0, 0.0)
-    images = list(copy_images(contents, folder / "images", contents.rig.left_from_right))
+    images = copy_all(contents, folder / "images")
     written = [folder / "images"]
     for name in ("truth", "final"):
         if name in contents.trajectories:
             file = folder / f"reference_{name}.csv"
-            lines = [_line(image, contents.trajectories[name], origin) for image in images]
+            poses, rig = contents.trajectories[name].world_from_camera, contents.believed
+            found = ((image.file.name, poses[image.frame.index] @ rig.left_from(image.camera)) for image in images)
+            lines = [_line(label, pose, origin) for label, pose in found]
             file.write_text("\n".join([_HEADER, *lines]) + "\n", encoding="utf-8")
             written.append(file)
     return written
 
 
-def _line(image: CopiedImage, path: Trajectory, origin: Georeference) -> str:
-    """Returns the line of one image, given the trajectory of the left camera in the world."""
-    pose = path.world_from_camera[image.frame.index] @ image.left_from_camera
+def _line(label: str, pose: Array, origin: Georeference) -> str:
     x, y, z = pose[:3, 3]
     easting, northing = origin.from_scene(x, y)
     angles = ",".join(f"{angle:.8f}" for angle in yaw_pitch_roll_deg(pose))
-    return f"{image.name},{float(easting):.6f},{float(northing):.6f},{z + origin.elevation_m:.6f},{angles}"
+    return f"{label},{float(easting):.6f},{float(northing):.6f},{z + origin.elevation_m:.6f},{angles}"

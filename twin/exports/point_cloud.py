@@ -1,7 +1,6 @@
 """The elevation map as a point cloud with colour and standard deviation: PLY (binary) and LAZ (LAS 1.4).
 
-Points are the centres of the mapped cells, in the coordinate reference system (CRS) of the georeference or, without
-one, in scene coordinates [m] (x east, y north, z up).
+Points are the centres of the mapped cells, in the CRS of the georeference or, without one, in scene coordinates [m].
 """
 
 from __future__ import annotations
@@ -56,10 +55,8 @@ def point_cloud(contents: RunContents) -> PointCloud:
 def export_ply(contents: RunContents, folder: Path) -> list[Path]:
     """Writes map.ply (binary) with x, y, z, red, green, blue, sigma [m]; a comment in the header has the CRS as WKT."""
     cloud, path = point_cloud(contents), folder / "map.ply"
-    rows = np.empty(len(cloud.points), dtype=[(name, kind) for name, kind, _ in _PLY_FIELDS])
-    columns = [*cloud.points.T, *cloud.colours.T, cloud.sigma_m]
-    for (name, _, _), column in zip(_PLY_FIELDS, columns, strict=True):
-        rows[name] = column
+    fields = [(name, kind) for name, kind, _ in _PLY_FIELDS]
+    rows = np.rec.fromarrays([*cloud.points.T, *cloud.colours.T, cloud.sigma_m], dtype=fields)
     crs = " ".join(cloud.crs_wkt.split())
     lines = ["ply", "format binary_little_endian 1.0", f"comment crs {crs}", f"element vertex {len(rows)}"]
     lines += [f"property {kind} {name}" for name, _, kind in _PLY_FIELDS]
@@ -70,11 +67,8 @@ def export_ply(contents: RunContents, folder: Path) -> list[Path]:
 def export_laz(contents: RunContents, folder: Path) -> list[Path]:
     """Writes map.laz (LAS 1.4, point format 7) with the extra dimension `sigma` and the CRS as WKT.
 
-    LAS stores coordinates as integer multiples of a resolution. This is 1e-6 units of the CRS, or coarser by a power of
-    ten for clouds of more than about 1074 units extent.
-
-    Raises:
-        TwinError: the package laspy is not installed.
+    LAS stores coordinates as integer multiples of a resolution: 1e-6 units of the CRS, or coarser by a power of ten for
+    clouds of more than about 1074 units extent. Raises TwinError if laspy is not installed.
     """
     cloud, path = point_cloud(contents), folder / "map.laz"
     laspy = optional("laspy", "exchange", "--to laz")

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from twin.core.records import Array, Exposure, ImuReadings, Readings
+from twin.core.records import Array, ImuReadings, Readings
 from twin.core.user_files import read_text, reading
 from twin.datasets.run_contents import ImuNoise, RecordedFrame, RecordedImu
 from twin.errors import TwinError
-from twin.report.frame_recorder import EXPOSURE_COLUMNS, IMU_COLUMNS, READING_COLUMNS
+from twin.report.frame_recorder import IMU_COLUMNS, READING_COLUMNS
 from twin.report.run_folder import SCENARIO_FILE, Run
 from twin.scenario.model import Scenario
 from twin.world.mission import motion_rate_hz
@@ -26,10 +26,8 @@ def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
     """Returns the frames of a run whose left image was recorded, in the order of time.
 
     Without frames.csv, as in a replay, these are the keyframes with a recorded image; their times are those of the
-    online trajectory or, if the run has none, of the true one.
-
-    Raises:
-        TwinError: frames.csv is damaged or lacks a keyframe.
+    online trajectory or, if the run has none, of the true one. Raises TwinError if frames.csv is damaged or lacks a
+    keyframe.
     """
     keyframes = set(run.keyframes.frames.tolist())
     folder = run.folder / "frames"
@@ -41,20 +39,19 @@ def recorded_frames(run: Run) -> tuple[RecordedFrame, ...]:
     else:
         path = next((run.trajectories[key] for key in ("online", "truth") if key in run.trajectories), None)
         times = [] if path is None else path.times_s.tolist()
-        listed = [(k, times[k], None, Readings()) for k in sorted(keyframes) if k < len(times)]
+        listed = [(k, times[k], Readings()) for k in sorted(keyframes) if k < len(times)]
     found = []
-    for index, time_s, exposure, readings in listed:
+    for index, time_s, readings in listed:
         left, right = (folder / side / f"{index:06d}.png" for side in ("left", "right"))
         if not left.is_file() and index in keyframes:
             left, right = (run.image_file(index, side) for side in ("left", "right"))
         if left.is_file():
             right = right if right.is_file() else None
-            found.append(RecordedFrame(index, time_s, left, right, index in keyframes, readings, exposure))
+            found.append(RecordedFrame(index, time_s, left, right, index in keyframes, readings))
     return tuple(found)
 
 
-def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
-    """Returns index, time, exposure and readings of each line of frames.csv; raises TwinError if it is damaged."""
+def _listed(table: Path) -> list[tuple[int, float, Readings]]:
     with reading(table, "", "an undamaged file, written by `twin run`"):
         lines = io.StringIO(read_text(table), newline="")
         rows = [_frame_row(row) for row in csv.DictReader(lines, strict=True)]
@@ -64,7 +61,6 @@ def _listed(table: Path) -> list[tuple[int, float, Exposure | None, Readings]]:
 
 
 def _check_order(name: str, values: Sequence[float]) -> None:
-    """Raises ValueError unless the values of a column of a table are 0 to `_LARGEST` and increase from line to line."""
     column = np.array(values, np.float64)
     wrong = np.flatnonzero(~((np.diff(column, prepend=-1.0) > 0) & (column >= 0) & (column <= _LARGEST)))
     if len(wrong):
@@ -72,26 +68,20 @@ def _check_order(name: str, values: Sequence[float]) -> None:
         raise ValueError(f"line {wrong[0] + 2}: {name} is {shown}, not larger than before and from 0 to {_LARGEST:g}")
 
 
-def _frame_row(row: dict[str, str]) -> tuple[int, float, Exposure | None, Readings]:
-    """Returns index, time, exposure and readings of a line of frames.csv; raises ValueError if it is damaged."""
-    missing = [name for name in ("index", "time_s", *EXPOSURE_COLUMNS, *READING_COLUMNS) if name not in row]
+def _frame_row(row: dict[str, str]) -> tuple[int, float, Readings]:
+    """Returns index, time and readings of a line of frames.csv; raises ValueError if it is damaged."""
+    missing = [name for name in ("index", "time_s", *READING_COLUMNS) if name not in row]
     if missing:
         raise ValueError(f"the column {missing[0]} is missing")
     if None in row or None in row.values():
         raise ValueError(f"the line of frame {row['index'][:20]} is incomplete")
     cells = [row[name] for name in READING_COLUMNS]  # neither beacons nor readings of the IMU
     height, attitude, velocity, position = (_finite(cells[k:n]) for k, n in ((0, 1), (1, 4), (4, 7), (7, 10)))
-    exposure = _finite([row[name] for name in EXPOSURE_COLUMNS])
-    return (
-        int(row["index"]),
-        float(row["time_s"]),
-        None if exposure is None else (float(exposure[0]), float(exposure[1]), float(exposure[2])),
-        Readings(None if height is None else float(height[0]), attitude, velocity, position),
-    )
+    readings = Readings(None if height is None else float(height[0]), attitude, velocity, position)
+    return int(row["index"]), float(row["time_s"]), readings
 
 
 def _finite(cells: list[str]) -> Array | None:
-    """Returns the numbers in cells, None if the first one is empty; raises ValueError if one is not finite."""
     if not cells[0]:
         return None
     for cell in cells:
@@ -121,8 +111,7 @@ def missing_files(run: Run, scenario: Scenario, frames: Sequence[RecordedFrame])
 def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
     """Returns the readings of the IMU in frames/imu.csv with their rate and noise; None if there is no such file.
 
-    Raises:
-        TwinError: the file is damaged, or the scenario has no IMU.
+    Raises TwinError if the file is damaged, or the scenario has no IMU.
     """
     file = folder / "frames" / "imu.csv"
     if not file.is_file():
@@ -140,7 +129,6 @@ def recorded_imu(folder: Path, scenario: Scenario) -> RecordedImu | None:
 
 
 def _imu_table(file: Path) -> Array:
-    """Returns the numbers (n, 7) in imu.csv, in the order of `IMU_COLUMNS`; raises ValueError if it is damaged."""
     header, *lines = read_text(file).splitlines() or [""]
     if header != ",".join(IMU_COLUMNS):
         raise ValueError(f"its first line is {header[:60]!r}")

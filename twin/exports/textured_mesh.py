@@ -1,9 +1,8 @@
 """The elevation map as a triangle mesh with the orthomosaic as its texture: GLB (binary glTF) and OBJ.
 
-Both are in scene coordinates [m], because most programs read coordinates of meshes in single precision, which is too
-coarse for coordinates in a coordinate reference system (CRS). In GLB, x is east, y up and z south, as glTF is y-up; in
-OBJ, x is east, y north and z up. With a georeference, the extras of the GLB scene and the comments of the OBJ file
-state the position of the scene origin in the CRS.
+Both are in scene coordinates [m], because most programs read meshes in single precision, too coarse for coordinates in
+a CRS. In GLB, x is east, y up and z south; in OBJ, x is east, y north and z up. With a georeference, the extras of the
+GLB scene and the comments of the OBJ file state the position of the scene origin in the CRS.
 """
 
 from __future__ import annotations
@@ -27,7 +26,6 @@ _MOST_TEXTURE_PX = 8192  # largest side of a texture [px], which common graphics
 
 
 def export_glb(contents: RunContents, folder: Path) -> list[Path]:
-    """Writes map.glb and returns its path, as a list of one."""
     path, (surface, uv, image) = folder / "map.glb", _textured(contents)
     material = PBRMaterial(baseColorTexture=image, metallicFactor=0.0, roughnessFactor=1.0)
     surface.visual = TextureVisuals(uv, material)
@@ -70,6 +68,5 @@ def _textured(contents: RunContents) -> tuple[trimesh.Trimesh, Array, PillowImag
 
 
 def _origin(georeference: Georeference | None) -> dict[str, str]:
-    """Returns the position of the scene origin in the CRS, and the CRS, as texts; empty without a georeference."""
     tags = geotiff.placement_tags(georeference)
     return tags | {"CRS": geotiff.crs_of(georeference).to_wkt()} if tags else {}

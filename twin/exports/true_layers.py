@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import NamedTuple
 from zipfile import is_zipfile
 
 import cv2
@@ -14,7 +15,7 @@ from twin.core import geometry
 from twin.core.records import Array, Image, StereoRig
 from twin.core.timing import Stopwatch
 from twin.core.user_files import MOST_TEXT_BYTES, reading
-from twin.datasets.run_contents import FrameTruth, RecordedFrame, TrueLayers
+from twin.datasets.run_contents import RecordedFrame
 from twin.errors import TwinError
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.scene.facets import Heights
@@ -29,19 +30,51 @@ _HIDDEN = 1.02  # a point is hidden in the next image if its depth exceeds this 
 _LIGHT = {"lamp": "floor_lx", "direct": "direct", "forward": "forward", "veil": "backscatter", "snow": "snow"}
 
 
-def true_layers(folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, ...]) -> TrueLayers:
-    """Returns the true layers of the recorded frames of a run folder, which has the true poses in frames/truth.npz.
+class FrameTruth(NamedTuple):
+    """True layers of one recorded left image: those of a pinhole camera with the believed calibration at its true pose.
+
+    They are aligned with the recorded image if the scenario has no calibration error, lens distortion or port;
+    otherwise, the image deviates from them by the error of its rectification.
+    """
+
+    frame: RecordedFrame  #: the recorded frame
+    depth_m: NDArray[np.float32]  #: (H, W) depth along the optical axis; inf where there is neither floor nor object
+    #: (H, W, 3) unit normals of floor and objects, towards the camera, in the axes of the left camera; zero where there
+    #: is neither.
+    normals: NDArray[np.float32]
+    albedo: Image  #: (H, W, 3), 255 = white
+    clean: Image  #: (H, W, 3) image in clear water without marine snow, by the same lamps and sensor, without noise
+    #: components (H, W, 3) of the light by name, for the bands R, G, B: "lamp" (illuminance of the floor by lamps and
+    #: daylight [lx]; NaN where there is no floor or the water transmits too little light to compute it), and the
+    #: radiances [cd/m2] "direct" (light from the floor, not scattered on its way to the camera), "forward" (scattered
+    #: on its way), "veil" (backscatter) and "snow" (change by marine snow). "forward" and "snow" exist only if the
+    #: scenario has forward scatter and marine snow.
+    light: Mapping[str, NDArray[np.float32]]
+    labels: NDArray[np.uint16]  #: (H, W) number of the object at each pixel, from 1; 0: the floor, or nothing
+    #: (H, W, 2) displacement (columns, rows) of each point to the next recorded image; NaN where there is no point, or
+    #: it is outside the next image, hidden in it, or belongs to a swaying object; None for the last frame.
+    flow_px: NDArray[np.float32] | None
+    #: RMS of the recorded image minus f times the image rendered again without noise [grey levels], with the factor of
+    #: exposure f that makes it smallest; values at full scale are left out.
+    difference: float
+    #: whether the image rendered again with its noise equals the recorded image; None if this was not compared.
+    identical: bool | None
+
+
+def true_layers(
+    folder: Path, scenario: Scenario, frames: tuple[RecordedFrame, ...]
+) -> tuple[list[str], Iterator[FrameTruth]]:
+    """Returns the names of the objects, by label from 1, and the layers of the recorded frames, rendered when iterated.
 
     Raises:
-        TwinError: the file of the true poses is damaged, or the scenario can no longer be prepared. The iterator
-            `TrueLayers.frames` raises it if a recorded image cannot be read or does not have the size of the images
-            of the run.
+        TwinError: frames/truth.npz, which has the true poses, is damaged, or the scenario can no longer be prepared;
+            while iterating: a recorded image cannot be read or has another size than those of the run.
     """
     poses, twists = _true_motion(folder / "frames" / "truth.npz", max(frame.index for frame in frames))
     mission = prepare(scenario)
     kinds = [entry.shape for entry in scenario.objects]
-    names = tuple(f"{kinds[item.group]} (objects.{item.group})" for item in mission.objects)
-    return TrueLayers(names, _layers(mission, frames, poses, twists))
+    names = [f"{kinds[item.group]} (objects.{item.group})" for item in mission.objects]
+    return names, _layers(mission, frames, poses, twists)
 
 
 def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
@@ -65,10 +98,7 @@ def _true_motion(file: Path, last: int) -> tuple[Array, Array]:
 
 
 def _layers(mission: Mission, frames: tuple[RecordedFrame, ...], poses: Array, twists: Array) -> Iterator[FrameTruth]:
-    """Yields the true layers of the frames in their order, given poses and velocities at all frames (`_true_motion`).
-
-    The layers of a frame are yielded after the next frame has been rendered, because the optical flow needs both.
-    """
+    """Yields the true layers of the frames, each after the next frame is rendered, which the optical flow needs."""
     sways = np.array([False, *(item.model.sways for item in mission.objects)])
     with RenderedWorld(mission, Stopwatch()) as world:
         clear = _camera_in_clear_water(mission, world)
@@ -124,8 +154,8 @@ def _truth(
 def _difference(recorded: Image, noise_free: Image) -> float:
     """Returns the RMS of the recorded image minus a factor times the image rendered again [grey levels].
 
-    Only values below full scale in both images count; the result is 0 if there are none. The factor, which makes the
-    RMS smallest, is needed because auto-exposure follows the light with a delay, which the image rendered again lacks.
+    Only values below full scale in both images count; 0 without any. The factor, which makes the RMS smallest, stands
+    for the delay of auto-exposure, which the image rendered again lacks.
     """
     below = (recorded < 255) & (noise_free < 255)
     seen, rendered = recorded[below].astype(np.float64), noise_free[below].astype(np.float64)
@@ -136,7 +166,6 @@ def _difference(recorded: Image, noise_free: Image) -> float:
 
 
 def _camera_in_clear_water(mission: Mission, world: RenderedWorld) -> StereoCamera:
-    """Returns a camera like that of the world, in clear water without marine snow."""
     from twin.imaging.light.illumination import illumination_of
 
     clear = {"water": WaterConfig(jerlov="clear"), "snow": SnowConfig()}
@@ -152,8 +181,8 @@ def floor_normals(
 ) -> NDArray[np.float32]:
     """Returns the unit normals (H, W, 3) of the floor in the axes of the camera; zero where there is no floor.
 
-    A point of the floor lies in the south-eastern or the north-western triangle of its cell of the height grid; the
-    normal is that of this triangle. `depth_m` (H, W) is inf where there is no floor.
+    A point of the floor lies in the south-eastern or the north-western triangle of its cell of the height grid.
+    `depth_m` (H, W) is inf where there is no floor.
     """
     known = np.isfinite(depth_m)
     points = geometry.transform(world_from_camera, _points(np.where(known, depth_m, 1.0), rig).reshape(-1, 3))
@@ -173,15 +202,11 @@ def floor_normals(
 def optical_flow(
     depth_m: NDArray[np.float32], next_depth_m: NDArray[np.float32], next_from_camera: Array, rig: StereoRig
 ) -> NDArray[np.float32]:
-    """Returns the displacements of the points of a static scene from this image to the next one.
+    """Returns the displacements (H, W, 2) (columns, rows) [px] of the points of a static scene to the next image.
 
-    Args:
-        depth_m, next_depth_m: (H, W) depths in this and in the next image; inf where there is nothing.
-        next_from_camera: (4, 4) pose of this camera in the axes of the next one.
-
-    Returns:
-        (H, W, 2) displacements (columns, rows) [px]; NaN where there is nothing, where the point is outside the next
-        image, and where it is hidden there, i.e. more than 2 % deeper than all 3 x 3 pixels around it.
+    They are NaN where there is nothing (depth inf), where the point is outside the next image, and where it is hidden
+    there, i.e. more than 2 % deeper than all 3 x 3 pixels around it. `next_from_camera` (4, 4) is the pose of this
+    camera in the next.
     """
     shape = depth_m.shape
     known = np.isfinite(depth_m).ravel()
@@ -207,12 +232,10 @@ def _points(depth_m: NDArray[np.floating], rig: StereoRig) -> Array:
 
 
 def _uint8(image: Image) -> Image:
-    """Returns an image as 8-bit values; NaN becomes black."""
     return np.clip(np.round(np.nan_to_num(image, nan=0.0)), 0, 255).astype(np.uint8)
 
 
 def _read(file: Path, rig: StereoRig) -> Image:
-    """Returns an image file as RGB (H, W, 3); raises TwinError if it cannot be read or has the wrong size."""
     image = read_rgb(file)
     if image is None:
         raise TwinError(str(file), "cannot be read", "a PNG, written by `twin run`")

@@ -8,7 +8,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from twin.datasets.run_contents import FrameTruth, RunContents
+from twin.datasets.run_contents import RunContents
+from twin.exports.true_layers import FrameTruth, true_layers
+from twin.report.run_folder import SCENARIO_FILE
+from twin.scenario.file import load_scenario
 
 _MOST_MM = 65535  # largest value of a 16-bit PNG
 
@@ -20,33 +23,21 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     light are 32-bit TIFF, `depth_mm` is a 16-bit PNG in millimetres (0: no surface, or farther than 65.5 m), `flow` is
     a Middlebury .flo file, `normals` is a 32-bit TIFF with x, y, z in its channels R, G, B, `albedo` and `clean` are
     8-bit PNG, and `labels` is a 16-bit PNG. `index.json` has the camera matrix, the names of the objects, and for each
-    frame the difference between the recorded image and the image rendered again.
-
-    Returns:
-        `folder` and the path of index.json.
-
-    Raises:
-        TwinError: the true poses are damaged, the scenario can no longer be prepared, or an image cannot be read.
-        OSError: a file cannot be written.
+    frame the difference between the recorded image and the image rendered again. Raises TwinError as `true_layers`
+    does.
     """
-    assert contents.true_layers is not None
-    layers = contents.true_layers()
+    scenario = load_scenario(contents.folder / SCENARIO_FILE, allow_plugins=contents.allow_plugins)
+    names, layers = true_layers(contents.folder, scenario, contents.frames)
     frames = []
-    for k, truth in enumerate(layers.frames):
+    for k, truth in enumerate(layers):
         _write(truth, folder)
-        frames.append(
-            {
-                "index": truth.frame.index,
-                "time_s": truth.frame.time_s,
-                "rms_difference": round(truth.difference, 4),
-                "identical": truth.identical,
-            }
-        )
+        difference = {"rms_difference": round(truth.difference, 4), "identical": truth.identical}
+        frames.append({"index": truth.frame.index, "time_s": truth.frame.time_s, **difference})
         contents.progress((k + 1) / len(contents.frames))
     compared = [frame["identical"] for frame in frames if frame["identical"] is not None]
-    contents_of_index = {
+    tree = {
         "camera_matrix": contents.rig.matrix.tolist(),
-        "objects": {str(k + 1): name for k, name in enumerate(layers.object_names)},
+        "objects": {str(k + 1): name for k, name in enumerate(names)},
         "rerendered": {
             "compared_with_noise": len(compared),
             "identical": sum(compared),
@@ -55,12 +46,11 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
         "frames": frames,
     }
     index = folder / "index.json"
-    index.write_text(json.dumps(contents_of_index, indent=1), encoding="utf-8")
+    index.write_text(json.dumps(tree, indent=1), encoding="utf-8")
     return [folder, index]
 
 
 def _write(truth: FrameTruth, folder: Path) -> None:
-    """Writes the layers of one frame; raises OSError if a file cannot be written."""
     number = f"{truth.frame.index:06d}"
     millimetres = np.where(truth.depth_m * 1000 < _MOST_MM, np.round(truth.depth_m * 1000), 0).astype(np.uint16)
     files = {

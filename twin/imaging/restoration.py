@@ -18,18 +18,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry, height_field
-from twin.core.records import ElevationMap, Exposure, Image, StereoRig
+from twin.core.records import Array, Depth, ElevationMap, Exposure, Image, Radiance, StereoRig
 from twin.errors import TwinError
 from twin.imaging.camera.photons import vignetting
 from twin.imaging.camera.tone import linear_of
 from twin.imaging.light.illumination import Illumination
-from twin.imaging.light.optics import Depth, FloorView, Optics, Radiance, calm_surface
+from twin.imaging.light.optics import Optics, SceneView, calm_surface
 from twin.imaging.light.shadows import Shadows, direction_to_casting_sun
 from twin.imaging.scene.facets import Facets
 from twin.scenario.model import Scenario
 from twin.terrains.load import fill_holes
-
-Array = NDArray[np.float64]
 
 DEPTH_STEP_PX = 4  # spacing of the pixels whose depth is computed; light depends on depth smoothly
 STEPS = 2  # number of corrections of the blur
@@ -66,13 +64,14 @@ class Restoration:
         return np.float32(255) * self._albedo(radiance, depth, map_from_camera)
 
     def _albedo(self, radiance: Radiance, depth: Depth, map_from_camera: Array) -> Radiance:
-        """Returns the albedo (H, W, 3), 1 = white, of a floor at this depth (H, W) [m] in an image of this radiance."""
-        lit = None if self._shadows is None else self._shadows.lit(depth, map_from_camera, 0)
-        floor = FloorView(self._facets.seen_from(map_from_camera), lit)
-        surface = None
+        """Returns the albedo (H, W, 3), 1 = white, of a floor at this depth in an image of this radiance."""
+        scene = SceneView(self._facets.seen_from(map_from_camera))
+        if self._shadows is not None:
+            scene = scene._replace(lit=self._shadows.lit(depth, map_from_camera, 0))
         if self._sunny:
             surface = calm_surface(self._world_from_map @ map_from_camera, self._reference_depth_m)
-        white = self._optics.white_floor(depth, 0, floor, surface)
+            scene = scene._replace(surface=surface)
+        white = self._optics.white_floor(depth, 0, scene)
         light = np.maximum(radiance - white.backscatter, 0)
         dark = white.floor < _DARK * white.floor.max()
         divisor = np.where(dark, np.float32(np.inf), white.floor)
@@ -107,15 +106,12 @@ class Restoration:
 
 
 def estimated_floor(elevation: ElevationMap) -> height_field.HeightField:
-    """Returns the heights of a map with at least one height; each hole has the height of the nearest cell.
-
-    The heights are not smoothed: smoothing tilts the facets at every edge, where the light depends on them most.
-    """
+    """Returns the heights of a map, not smoothed, as this tilts facets; a hole has the height of the nearest cell."""
     height, _ = fill_holes(elevation.height_m.astype(np.float64))
     return height_field.map_height_field(height.astype(np.float32), elevation.grid)
 
 
 def linear_signal(scenario: Scenario) -> NDArray[np.float32]:
-    """Returns the linear signal (256,) of each level of an image, 1 at full scale: the inverse of the tone curve."""
+    """Returns the linear signal (256,) of each level of an image, 1 at full scale."""
     curve = "linear" if scenario.sensor is None else scenario.sensor.tone_curve
     return np.array([linear_of(level / 255, curve) for level in range(256)], np.float32)

@@ -13,21 +13,17 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import StereoRig
+from twin.core.records import Array, Depth, Radiance, StereoRig
 from twin.core.threads import in_row_bands
 from twin.imaging.camera.lens_psf import Defocus
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.light.lamp_light import LampLight
-from twin.imaging.light.optics import Depth, Radiance
 from twin.imaging.light.shading import FAR_M
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 from twin.scenario.model import SnowConfig
-
-Array = NDArray[np.float64]
 
 BOX_M = 5.0  # side of the periodic box; along each world axis, snow is visible up to half a side from the left camera
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
@@ -37,8 +33,6 @@ FOOTPRINT_PX = 4096  # most pixels of a footprint whose weights are stored; thos
 
 
 class VisibleParticles(NamedTuple):
-    """Particles in view of a camera."""
-
     pixel: Array  # (n, 2) column and row [px]
     points_m: Array  # (n, 3) positions in the axes of the camera
     radiance: Array  # (n, 3) radiance per colour band [cd/m2]
@@ -46,15 +40,11 @@ class VisibleParticles(NamedTuple):
 
     @property
     def depth_m(self) -> Array:
-        """Returns the depths (n,) [m]."""
         return np.ascontiguousarray(self.points_m[:, 2])
 
 
 class MarineSnow:
-    """Marine snow particles of one survey, which move with the current (3,).
-
-    Without `defocus`, the lens has an aperture of `APERTURE_M` and is focused at infinity.
-    """
+    """Marine snow, which moves with the current (3,). Without `defocus`, the lens is focused at infinity."""
 
     def __init__(
         self, snow: SnowConfig, current_mps: Array, rig: StereoRig, water: Medium, lamp_light: list[LampLight],
@@ -68,15 +58,10 @@ class MarineSnow:
         largest = float(self._diameter_m.max(initial=0.0))
         self._margin_px = float(_width_px(rig.focal_px, largest, NEAREST_M, self._defocus))
 
-    def positions(self, centre_m: Array, time_s: float) -> Array:
-        """Returns the particle positions (n, 3) in the world [m], in the box around a centre (3,)."""
-        low = centre_m - BOX_M / 2
-        return low + np.mod(self._start_m + self._current_mps * time_s - low, BOX_M)
-
     def visible_particles(
         self, world_from_left: Array, camera: int, time_s: float, reach_m: float = 0.0, farthest_m: float = np.inf
     ) -> VisibleParticles:
-        """Returns the particles in view of a camera (0 left, 1 right) with their radiance."""
+        """Returns the particles in view of a camera (0 left, 1 right)."""
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
         low, middle = world_from_left[:3, 3] - BOX_M / 2, (rig.cx_px, rig.cy_px)
@@ -120,10 +105,7 @@ class MarineSnow:
     def _paths(
         self, seen: VisibleParticles, depth: Depth, world_from_left: Array, camera: int, motion: ExposureMotion
     ) -> tuple[Array, Array]:
-        """Returns the middle (n, 2) of each particle's path in the image, and the vector (n, 2) from start to end [px].
-
-        `seen` are the particles in view; the other arguments are those of `draw`.
-        """
+        """Returns middle (n, 2) of the paths in the image, and vectors (n, 2) from their starts to their ends [px]."""
         left_from_camera = self._rig.left_from_right if camera else np.eye(4)
         drift = (world_from_left @ left_from_camera)[:3, :3].T @ self._current_mps
         rig, centre, path = self._rig, np.empty_like(seen.pixel), np.empty_like(seen.pixel)
@@ -132,10 +114,7 @@ class MarineSnow:
         return centre, path
 
     def _radiance(self, points: Array, lamps: LampLight, height_m: float) -> Array:
-        """Returns the radiance (n, 3) per colour band [cd/m2] of particles at `points` (n, 3) in camera axes [m].
-
-        Light scattered between particle and camera is lost; daylight decreases along the optical axis.
-        """
+        """Returns the radiance (n, 3) [cd/m2] of particles in camera axes; light scattered on the way is lost."""
         day, loss_per_m = lamps.sources.daylight, self._water.attenuation_per_m
         below_plan_m = day.reference_depth_m - height_m - day.camera_depth_m
         x, y, z = points.T
@@ -158,7 +137,6 @@ def diameters(snow: SnowConfig, n: int, rng: np.random.Generator) -> Array:
 
 
 def _width_px(focal_px: float, diameter_m: Array | float, depth_m: Array | float, defocus: Defocus) -> Array:
-    """Returns the diameter of the image of a particle with the given diameter and depth [m], including blur [px]."""
     z = np.asarray(depth_m)
     return np.sqrt((focal_px * diameter_m / z) ** 2 + defocus.confusion_px(focal_px, z) ** 2 + PIXEL_BLUR_PX**2)
 
@@ -195,10 +173,7 @@ def _image_velocity(x, y, z, focal, drift, twist):
 
 @kernel
 def _into_camera(start, shift, low, pose, points):
-    """Computes the positions (3, n) of particles [m] in the axes of the camera, of pose camera_from_world (4, 4).
-
-    Positions in the world are `low` + mod(`start` + `shift`, BOX_M).
-    """
+    """Computes the positions (3, n) of particles in camera axes; in the world: low + mod(start + shift, BOX_M)."""
     per_box, flat, xs, ys, zs = 1 / BOX_M, start.reshape(-1), points[0], points[1], points[2]
     (px, py, pz), (lx, ly, lz) = (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
@@ -216,11 +191,7 @@ def _into_camera(start, shift, low, pose, points):
 
 @kernel
 def _test_view(points, view, seen):
-    """Fills `seen` (n,) with whether each of `points` (3, n) is in view; a loop that the compiler can vectorize.
-
-    In view are depths between NEAREST_M and `farthest_m` and projections up to `margin_px` + `reach_px_m` / depth
-    outside the image.
-    """
+    """Fills `seen` (n,) with whether `points` (3, n) are in view, up to `margin_px` + `reach_px_m` / depth outside."""
     focal, cx, cy, width, height, margin_px, reach_px_m, farthest_m = view
     xs, ys, zs = points[0], points[1], points[2]
     for k in range(seen.size):
@@ -233,7 +204,6 @@ def _test_view(points, view, seen):
 
 @kernel
 def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
-    """Draws each particle into rows `first` to `end` - 1 of `light`, except where the floor is nearer."""
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5

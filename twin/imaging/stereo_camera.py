@@ -7,37 +7,30 @@ import functools
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import Exposure, Image
+from twin.core.records import Array, Depth, Exposure, Image, Radiance
 from twin.core.threads import in_pair
 from twin.core.timing import StageTimer
 from twin.imaging.camera.lens_psf import LensPsf
 from twin.imaging.camera.photo_sensor import PhotoSensor, Sensor, sensor_of
 from twin.imaging.camera.pixels import Raw
-from twin.imaging.camera.sensor import ExposureSetting, Radiance
+from twin.imaging.camera.sensor import ExposureSetting
 from twin.imaging.camera.shutter import integrate
 from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
-from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
+from twin.imaging.image_formation import ImageFormation, RadianceComponents, RenderedView, StampedPose
 from twin.imaging.scene.mesh_raster import ObjectView
 from twin.scenario.model import Scenario
 
 if TYPE_CHECKING:
     from twin.imaging.scene.renderer import Renderer
 
-Array = NDArray[np.float64]
-Depth = NDArray[np.float32]
 
 AT_REST: Array = np.zeros(6)
 
 
 class StereoCapture(NamedTuple):
-    """One exposure of the stereo camera: images (H, W, 3) uint8 RGB, and true depths (H, W) [m] for the evaluation.
-
-    The right image and its depth are None if only the left camera was used. `exposure` is that of both images, as the
-    cameras report it (`Frame.exposure`).
-    """
+    """One exposure: images (H, W, 3), and true depths (H, W) [m]; the right ones are None without stereo."""
 
     left: Image
     right: Image | None
@@ -54,34 +47,13 @@ class DecomposedImage(NamedTuple):
     components: RadianceComponents  # direct signal, backscatter and other components of the radiance
     setting: ExposureSetting  # exposure, metered on this image
     noise_free: Image  # (H, W, 3) image without noise
-    # digital numbers of the physical sensor, including the noise that the next capture will have; (h, w) with a Bayer
-    # filter, otherwise (h, w, 3), the size of the raw image; None for the plain sensor
-    raw: Raw | None
+    raw: Raw | None  # digital numbers of the physical sensor, with the noise of the next capture; None: plain sensor
     linear: bool  # whether the image is proportional to the radiance: linear tone curve, white balance for white light
     objects: ObjectView | None = None  # normals and labels (H, W) of the objects in the image; None without objects
 
-    @property
-    def gain(self) -> float:
-        """Image signal per unit of radiance on the optical axis [1 / (cd/m2)], see `ExposureSetting.gain`."""
-        return self.setting.gain
-
-
-class _View(NamedTuple):
-    """Rendered view of one camera: the arguments of `ImageFormation.radiance`."""
-
-    albedo: Image
-    depth: Depth
-    camera: int
-    pose: StampedPose
-    objects: ObjectView | None
-
 
 class StereoCamera:
-    """Stereo camera: both cameras share one auto-exposure; their noise is independent.
-
-    Args:
-        true_cameras: geometry of the true cameras; None = as defined by the scenario.
-    """
+    """Stereo camera: both cameras share one auto-exposure; their noise is independent."""
 
     def __init__(
         self,
@@ -108,9 +80,7 @@ class StereoCamera:
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
         """Returns the image of the left camera and, if `stereo`, of the right one; advances the time by one frame.
 
-        Args:
-            world_from_left: (4, 4) pose of the left camera at mid-exposure.
-            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
+        The pose (4, 4) and the true [angular, linear] velocity of the body (6,) are those at mid-exposure.
         """
         pose = StampedPose(world_from_left, self._n_captures / self._frame_rate_hz)
         self._n_captures += 1
@@ -119,7 +89,7 @@ class StereoCamera:
             setting = self._sensor.setting
             metered = setting is not None
             if setting is None:  # metered on the first left image at rest
-                setting = self._meter(self._sensor, self._image_formation.radiance(*views[0]), views[0].depth)
+                setting = self._meter(self._sensor, self._image_formation.radiance(views[0]), views[0].depth)
             expose = functools.partial(self._expose, twist_body=twist_body, setting=setting)
             if stereo:
                 (left, light), (right, _) = in_pair(lambda: expose(views[0]), lambda: expose(views[1]))
@@ -148,13 +118,10 @@ class StereoCamera:
         return self._camera_from_body_twist[camera] @ twist_body
 
     def decompose(self, world_from_left: Array, twist_body: Array = AT_REST, time_s: float = 0.0) -> DecomposedImage:
-        """Returns the left image at a pose and time with intermediate results; has no effect on later captures.
-
-        The motion affects the image and the digital numbers, not the components.
-        """
+        """Returns the left image with intermediate results, the components at rest; no effect on later captures."""
         cameras, sensor = self._cameras, sensor_of(self._scenario, self._cameras.raw_rig)
-        view = self._rendered(StampedPose(world_from_left, time_s), 0)
-        components = self._image_formation.components(*view)
+        view = self._render(StampedPose(world_from_left, time_s), 0)
+        components = self._image_formation.components(view)
         setting = self._meter(sensor, components.total, view.depth)
         light = self._at_raw_pixels(view, sensor, twist_body, setting)
         noise_free = cameras.rectify(sensor.image(light, setting, None))
@@ -166,35 +133,30 @@ class StereoCamera:
             raw, self._linear, objects,
         )  # fmt: skip
 
-    def _render(self, pose: StampedPose, camera: int) -> _View:
-        with self._stopwatch("render"):
-            return self._rendered(pose, camera)
-
-    def _rendered(self, pose: StampedPose, camera: int) -> _View:
-        """Returns the rendered view of a camera, with the objects."""
+    def _render(self, pose: StampedPose, camera: int) -> RenderedView:
         world_from_camera = pose.world_from_left @ self._left_from_right if camera else pose.world_from_left
-        albedo, depth = self._renderer.render(world_from_camera)
-        return _View(albedo, depth, camera, pose, self._image_formation.draw_objects(albedo, depth, camera, pose))
+        with self._stopwatch("render"):
+            return self._image_formation.view_of(self._renderer.render(world_from_camera), camera, pose)
 
-    def _expose(self, view: _View, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
-        """Returns the image of one camera, and the radiance (h, w, 3) at its raw pixels."""
+    def _expose(self, view: RenderedView, twist_body: Array, setting: ExposureSetting) -> tuple[Image, Radiance]:
         light = self._at_raw_pixels(view, self._sensor, twist_body, setting)
         return self._cameras.rectify(self._sensor.image(light, setting, self._rngs[view.camera])), light
 
     def _meter(self, sensor: Sensor, light: Radiance, depth: Depth) -> ExposureSetting:
-        """Returns the exposure metered on the light (H, W, 3) in the left camera at rest."""
         return sensor.meter(self._cameras.sample(light, depth, 0))
 
-    def _at_raw_pixels(self, view: _View, sensor: Sensor, twist_body: Array, setting: ExposureSetting) -> Radiance:
+    def _at_raw_pixels(
+        self, view: RenderedView, sensor: Sensor, twist_body: Array, setting: ExposureSetting
+    ) -> Radiance:
         """Returns the radiance (h, w, 3) at the raw pixels of a moving camera.
 
         Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.
         """
-        _, depth, camera, pose, _ = view
-        motion = sensor.motion(self.twist_of_camera(camera, twist_body), setting, len(depth))
-        light = self._psf.out_of_focus(self._image_formation.radiance_without_snow(*view), depth)
+        depth = view.depth
+        motion = sensor.motion(self.twist_of_camera(view.camera, twist_body), setting, len(depth))
+        light = self._psf.out_of_focus(self._image_formation.radiance_without_snow(view), depth)
         if motion is not None:
             motion = motion._replace(rolls_later=self._cameras.sampling is not None)
             light = integrate(light, depth, self._focal_px, motion)
-        self._image_formation.add_snow(light, depth, camera, pose, motion)
-        return self._cameras.sample(self._psf.transfer(light), depth, camera, motion=motion)
+        self._image_formation.add_snow(light, view, motion)
+        return self._cameras.sample(self._psf.transfer(light), depth, view.camera, motion=motion)

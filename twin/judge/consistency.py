@@ -10,14 +10,16 @@ from twin.judge.map_error import normalised_error
 from twin.judge.summary_statistics import mean
 from twin.judge.trajectory_errors import anchor
 
+#: Share of the surveys with consistent covariances whose mean NEES lies in the interval.
+CONSISTENT_SHARE = 0.99
+
 
 def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
     """Returns `consistency.*` of metrics.json.
 
-    For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors
-    within two sigma is 0.954. The mean NEES of 99 % of the surveys with consistent covariances lies between
-    `nees_position_low` and `nees_position_high`; they are None without a final alignment. `within_2sigma_position` is
-    the fraction over the three camera axes of the keyframes, `within_2sigma_map` that over the map cells with an error.
+    For consistent covariances and normal errors the mean NEES of the positions is 3 and the fraction of errors within
+    two sigma 0.954. `nees_position_low` and `_high` are those of `nees_interval`. `within_2sigma_position` is over the
+    three camera axes of the keyframes, `within_2sigma_map` over the map cells with an error.
     """
     error, cov = _keyframe_errors(result, truth)
     low, high = nees_interval(result.quality.independent_errors) or (None, None)
@@ -35,8 +37,7 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
 def _keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
     """Returns errors (n, 3) [m] and estimated covariances (n, 3, 3) of the final keyframes, both in camera axes.
 
-    The first keyframe is left out because it is anchored at the truth, and so are keyframes without a positive definite
-    covariance.
+    Without the first keyframe, anchored at the truth, and those without a positive definite covariance.
     """
     n = min(len(result.keyframe_rows), len(result.node_cov))
     frames = result.keyframe_rows[1:n]
@@ -60,15 +61,15 @@ def nees(error: Array, cov: Array) -> Array:
     return np.einsum("ni,ni->n", error, np.linalg.solve(cov, error[..., None])[..., 0])
 
 
-def nees_interval(independent_errors: float | None, share: float = 0.99) -> tuple[float, float] | None:
-    """Returns the bounds between which the mean NEES of the positions lies for a share of consistent surveys.
+def nees_interval(independent_errors: float | None) -> tuple[float, float] | None:
+    """Returns the bounds between which the mean NEES of the positions of 99 % of consistent surveys lies.
 
-    The mean NEES is distributed as chi-square with 3 k degrees of freedom, divided by k (Bar-Shalom, Li & Kirubarajan
-    2001, section 5.4.2), for k independent errors. A survey is equivalent to few of them, because its errors are
-    correlated along the path. The number k need not be whole; None gives None.
+    It is distributed as chi-square with 3 k degrees of freedom, divided by k (Bar-Shalom, Li & Kirubarajan 2001,
+    section 5.4.2), for k independent errors (not necessarily whole), to which the errors correlated along the path are
+    equivalent.
     """
     if independent_errors is None:
         return None
-    tail = (1 - share) / 2
+    tail = (1 - CONSISTENT_SHARE) / 2
     low, high = chi2.ppf([tail, 1 - tail], 3 * independent_errors) / independent_errors
     return float(low), float(high)

@@ -20,10 +20,7 @@ INFINITE_WITH_HOLES = ("map.le90_area_m",)
 
 
 def height_error(elevation: ElevationMap, truth: Truth) -> Array:
-    """Returns estimated minus true height (rows, cols) [m].
-
-    NaN in cells that were not observed, and in cells without an estimated or without a true height.
-    """
+    """Returns estimated minus true height (rows, cols) [m]; NaN in cells not observed, or without one of the two."""
     error = elevation.height_m.astype(float) - truth.height_m
     return np.where(truth.seen, error, np.nan)
 
@@ -31,14 +28,12 @@ def height_error(elevation: ElevationMap, truth: Truth) -> Array:
 def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float | None]:
     """Returns `map.*` of metrics.json; every value is None without a map.
 
-    completeness is the fraction of observed cells that have an estimate. For height errors e, NMAD is
-    1.4826 median |e - median e|, and LE90 is the 90th percentile of |e| (linear error at 90 %). sigma_ratio is the
-    sigma calibration: the RMS of error / sigma, which is 1 if the estimated standard deviations are correct.
-    completeness_area is the fraction of the cells of the asked area that have an estimate. le90_area_m is the 90th
-    percentile of |e| over these cells, where a cell without an estimate (a hole) counts as an infinite error; an
-    infinite percentile is given as None. median_m is the median of |e|, and gross_share the fraction of cells with
-    |e| > GROSS_M. floor_* and objects_* are median, LE90 and fraction of gross errors over the cells whose highest
-    surface is the floor or an object; without objects, all cells are floor and objects_* are None.
+    completeness is the fraction of observed cells that have an estimate. For height errors e, NMAD is 1.4826 median |e
+    - median e|, and LE90 the 90th percentile of |e| (linear error at 90 %). sigma_ratio is the RMS of error / sigma, 1
+    for correct standard deviations. completeness_area and le90_area_m are over the cells of the asked area, where a
+    cell without an estimate (a hole) counts as an infinite error; an infinite percentile is None. median_m is the
+    median of |e|, and gross_share the fraction of cells with |e| > GROSS_M. floor_* and objects_* are over the cells
+    whose highest surface is the floor or an object; without objects, all cells are floor and objects_* are None.
     """
     if elevation is None:
         return dict.fromkeys(KEYS)
@@ -68,7 +63,6 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
 
 
 def _of_surface(name: str, size: Array) -> dict[str, float | None]:
-    """Returns the metrics of the absolute errors (n,) over a kind of surface."""
     return {
         f"{name}_median_m": percentile(size, 50),
         f"{name}_le90_m": percentile(size, 90),
@@ -77,25 +71,19 @@ def _of_surface(name: str, size: Array) -> dict[str, float | None]:
 
 
 def completeness_metric(metric: str) -> str | None:
-    """Returns the completeness metric to report with a statistic of the height errors; None for other metrics.
-
-    It shows how many cells have no height: most of these statistics leave them out, so none is reported alone.
-    """
+    """Returns the completeness metric to report with a statistic of the height errors; None for other metrics."""
     if not metric.startswith("map.") or metric.startswith("map.completeness") or metric == "map.cell_m":
         return None
     return "map.completeness_area" if "_area" in metric else "map.completeness"
 
 
 def with_completeness(metrics: Iterable[str]) -> list[str]:
-    """Returns the given names of metrics and those of the completeness metrics to report with them, each once."""
+    """Returns names of metrics and those of the completeness metrics to report with them, each once."""
     return list(dict.fromkeys(name for metric in metrics for name in (metric, completeness_metric(metric)) if name))
 
 
 def percentile_with_holes(size: Array, percent: float) -> float | None:
-    """Returns a percentile (0 to 100) of absolute errors (n,), linearly interpolated; NaN counts as an infinite error.
-
-    Returns None if no value is finite or the percentile is infinite.
-    """
+    """Returns a percentile of absolute errors (n,), linearly interpolated; NaN counts as infinite; None if infinite."""
     known = np.isfinite(size)
     if not known.any():
         return None
@@ -113,8 +101,5 @@ def normalised_error(elevation: ElevationMap, truth: Truth) -> Array:
 
 
 def nmad(error: Array) -> float | None:
-    """Returns the normalised median absolute deviation of errors (n,); None if there are none.
-
-    It estimates the standard deviation of normal errors and is robust against outliers (Höhle & Höhle 2009).
-    """
+    """Returns the normalised median absolute deviation of errors (n,) (Höhle & Höhle 2009); None if there are none."""
     return finite_float(1.4826 * np.median(np.abs(error - np.median(error)))) if len(error) else None

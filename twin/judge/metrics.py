@@ -12,18 +12,22 @@ from twin.core.quality import ActionTimes
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.judge.consistency import consistency_metrics
-from twin.judge.flown_path import control_metrics
 from twin.judge.map_error import map_metrics
 from twin.judge.network_errors import NETWORK_KEYS, link_metrics, network_residuals, stage_metrics
 from twin.judge.orthomosaic_errors import OrthomosaicJudge
-from twin.judge.overlap import overlap_metrics
-from twin.judge.recorded import RecordedTruth, associate, recorded_errors, truth_warnings
-from twin.judge.require import check_metric_names, judge_requirements
+from twin.judge.recorded import (
+    RecordedTruth,
+    associate,
+    recorded_errors,
+    recorded_map_metrics,
+    truth_warnings,
+    truth_without_flight,
+)
 from twin.judge.summary_statistics import finite_float, finite_tree
 from twin.judge.survey_quality import self_check_metrics, stereo_quality
+from twin.judge.swaths import control_metrics, overlap_metrics
 from twin.judge.trajectory_errors import path_errors, track_metrics, trajectory_metrics
-from twin.judge.true_map import recorded_map_metrics, truth_without_flight
-from twin.judge.warnings import metric_warnings
+from twin.judge.verdict import check_metric_names, judge_requirements, metric_warnings
 
 SCHEMA = "twin.metrics/2"
 #: `replay` of a replay that was not evaluated, besides the description of its data set.
@@ -58,12 +62,9 @@ class EvaluationInput:
 def evaluate(survey: EvaluationInput) -> dict[str, Any]:
     """Returns the contents of metrics.json. A value that cannot be computed is None, never NaN.
 
-    The metrics of a replay that need more than its recorded truth has (links, control, etc.) are None, 0 or empty. Its
-    key `replay` holds the description of the data set, the alignment, the number of frames with a true pose, and the
-    consistency of the network (`network_residuals`).
-
-    Raises:
-        TwinError: `require` names a metric that does not exist.
+    The metrics of a replay that need more than its recorded truth are None, 0 or empty; its key `replay` holds the
+    description of the data set, the alignment, the number of frames with a true pose, and `network_residuals`. Raises
+    TwinError if `require` names a metric that does not exist.
     """
     if isinstance(survey.truth, Truth):
         return _contents(survey, _sections(survey, survey.truth))
@@ -73,22 +74,16 @@ def evaluate(survey: EvaluationInput) -> dict[str, Any]:
 
 
 def unevaluated(survey: EvaluationInput) -> dict[str, Any]:
-    """Returns the metrics of a survey that was not compared with the truth.
+    """Returns the metrics of a survey that was not compared with the truth; raises TwinError like `evaluate`.
 
     They hold schema, identity, timing, description of the data set, warnings, idealisations and requirements; all other
     metrics are None, 0 or empty. A requirement on a metric that is None fails.
-
-    Raises:
-        TwinError: `require` names a metric that does not exist.
     """
     return _contents(survey, {})
 
 
 def _contents(survey: EvaluationInput, sections: dict[str, Any], warnings: Sequence[str] = ()) -> dict[str, Any]:
-    """Returns metrics.json with some evaluated sections; all others are None, 0 or empty.
-
-    The given warnings are added to those of the survey and to those that follow from the metrics.
-    """
+    """Returns metrics.json with some evaluated sections and more warnings; all other sections are None, 0 or empty."""
     known = {key: survey.identity.get(key) for key in _IDENTITY}
     known["timing"] = _timing(survey.timing, len(survey.result.online), len(survey.result.keyframe_rows))
     if survey.source is not None:
@@ -104,7 +99,6 @@ def _contents(survey: EvaluationInput, sections: dict[str, Any], warnings: Seque
 
 
 def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
-    """Returns the sections of metrics.json of a survey whose whole truth is known."""
     result, elevation = _completed(survey.result, truth), survey.elevation
     grid = None if elevation is None else elevation.grid
     return {
@@ -123,7 +117,6 @@ def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
 
 
 def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str, Any]:
-    """Returns the sections of metrics.json that a replay has."""
     result, elevation, empty, true = survey.result, survey.elevation, empty_metrics(), truth.trajectory
     errors = {} if true is None else {k: recorded_errors(p, true, truth.alignment) for k, p in _paths(result).items()}
     heights = {"cell_m": None if elevation is None else elevation.grid.cell_m}
@@ -144,16 +137,11 @@ def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str,
 
 
 def _paths(result: SurveyResult) -> dict[str, Trajectory]:
-    """Returns the estimated trajectories, by key in metrics.json."""
     return {"f2f": result.f2f, "online": result.online, "final": result.final}
 
 
 def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
-    """Returns the result without keyframes, links and stereo observations of frames that are not fully recorded.
-
-    A frame is fully recorded if it has an online and a final estimate, a true pose and a reference position; the last
-    frames of an aborted survey may lack some of these.
-    """
+    """Returns the result without frames that are not fully recorded, as the last ones of an aborted survey may be."""
     n_frames = min(len(result.online), len(result.final), len(truth.trajectory), len(truth.reference))
     n = int(np.searchsorted(result.keyframe_rows, n_frames))
     return replace(
@@ -168,11 +156,7 @@ def _completed(result: SurveyResult, truth: Truth) -> SurveyResult:
 
 
 def check_require(names: Mapping[str, float]) -> None:
-    """Checks before the survey that every name in the scenario's `[require]` table is a metric.
-
-    Raises:
-        TwinError: a name is not a metric.
-    """
+    """Raises TwinError if a name in the scenario's `[require]` table is not a metric."""
     check_metric_names(names, empty_metrics())
 
 
@@ -194,7 +178,6 @@ def empty_metrics() -> dict[str, Any]:
 
 
 def _timing(timing: Mapping[str, Any], n_frames: int, n_keyframes: int) -> dict[str, Any]:
-    """Returns `timing` of metrics.json, from `EvaluationInput.timing` and the numbers of frames and keyframes."""
     wall, simulated = timing.get("wall_s"), timing.get("simulated_s")
     return {
         "wall_s": finite_float(wall),

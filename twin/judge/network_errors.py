@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +28,7 @@ NETWORK_KEYS = ("links", "loops", "loop_translation_m", "loop_rotation_deg", "lo
 def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
     """Returns `links` of metrics.json: errors of links to the two previous nodes (along) and of all others (across).
 
-    `bridged` is the number of links that consist of frame-to-frame motion because their measurement failed. The errors
-    of these links are not evaluated.
+    `bridged` links consist of frame-to-frame motion, as their measurement failed; their errors are not evaluated.
     """
     along, across = _measured_links(result)
     true = truth.trajectory.world_from_camera[result.keyframe_rows]
@@ -42,14 +40,12 @@ def link_metrics(result: SurveyResult, truth: Truth) -> dict[str, Any]:
 
 
 def _measured_links(result: SurveyResult) -> tuple[Links, Links]:
-    """Returns the measured links to one of the two previous nodes, and all others."""
     measured = result.links.select(result.links.n_points > 0)
     near = _node_distance(measured, _linked_nodes(result.links)) <= _ALONG_NODES
     return measured.select(near), measured.select(~near)
 
 
 def _linked_nodes(links: Links) -> NDArray[np.int64]:
-    """Returns the numbers of the keyframes that have at least one link, in increasing order."""
     return np.unique(np.concatenate([links.i, links.j]))
 
 
@@ -59,10 +55,10 @@ def _node_distance(links: Links, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _link_errors(links: Links, world_from_keyframe: Array) -> dict[str, float | int | None]:
-    """Returns number, RMS errors and mean NEES of links, and the RMS errors of their closed-form motions.
+    """Returns number, RMS errors and mean NEES of links, and the RMS errors of closed-form motions.
 
-    The error of a motion is log(T^-1 E) of the true motion T and the estimated motion E. Links without a closed-form
-    motion are left out of the closed-form errors. The mean NEES is 6 for consistent covariances.
+    The error of a motion is log(T^-1 E) of the true motion T and the estimated motion E. The mean NEES is 6 for
+    consistent covariances.
     """
 
     def errors_of(some: Links, motions: Array) -> Array:
@@ -89,7 +85,6 @@ def _motion_errors(true_i, true_j, estimates):
 
 
 def _rmse(errors: Array) -> dict[str, float | None]:
-    """Returns the RMS angle [deg] and RMS translation [m] of twists (n, 6)."""
     return {
         "rotation_rmse_deg": rms(np.rad2deg(np.linalg.norm(errors[:, :3], axis=1))),
         "translation_rmse_m": rms(np.linalg.norm(errors[:, 3:], axis=1)),
@@ -99,11 +94,10 @@ def _rmse(errors: Array) -> dict[str, float | None]:
 def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
     """Returns `replay.network` of metrics.json: residuals of the links at the final poses of their keyframes.
 
-    `links` is the number of links with matched points, `loops` the number of those whose nodes are more than two nodes
-    apart. The residual of a link is log(M^-1 T), with M its measured motion and T the motion between the final poses.
-    `loop_translation_m` and `loop_rotation_deg` are the medians over the loops of the norms of the translation and of
-    the rotation in their residuals. `loop_chi2` is the mean of r' C^-1 r / 6 over their residuals r, with C the
-    covariance of the measurement; it is below about 1 for consistent covariances. These three values are None without
+    `links` is the number of links with matched points, `loops` that of those whose nodes are more than two nodes apart.
+    The residual of a link is log(M^-1 T), with M its measured motion and T that between the final poses.
+    `loop_translation_m` and `loop_rotation_deg` are medians of their norms over the loops, `loop_chi2` the mean of r'
+    C^-1 r / 6 with C the covariance of the measurement, below about 1 for consistent covariances; all None without
     loops. They are not errors: an error that all links have in common does not appear in them.
     """
     along, loops = _measured_links(result)
@@ -120,10 +114,7 @@ def network_residuals(result: SurveyResult) -> dict[str, float | int | None]:
 
 
 def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, float | None]]:
-    """Returns `stages` of metrics.json: position errors of the same network nodes after each positioning stage.
-
-    All stages are anchored at the first node. The errors of a stage that lacks a node are None.
-    """
+    """Returns `stages` of metrics.json: errors of the same nodes, anchored at the first; None if one is missing."""
     nodes = _linked_nodes(result.links)
     frames = result.keyframe_rows[nodes]
     paths = {name: getattr(result, name).world_from_camera[frames] for name in ("f2f", "online", "final")}
@@ -138,11 +129,7 @@ def stage_metrics(result: SurveyResult, truth: Truth) -> dict[str, dict[str, flo
 
 
 def compose_chain(links: Links, nodes: NDArray[np.int64]) -> Array:
-    """Returns the poses (n, 4, 4) of the nodes relative to the first, by composing the links of consecutive nodes.
-
-    Returns an empty array (0, 4, 4) if a link between consecutive nodes is missing, and one identity matrix (1, 4, 4)
-    without nodes.
-    """
+    """Returns node poses (n, 4, 4) relative to the first, composed of consecutive links; empty if one is missing."""
     chain = links.select(_node_distance(links, nodes) == 1)
     motions = dict(zip(zip(chain.i.tolist(), chain.j.tolist(), strict=True), chain.i_from_j, strict=True))
     poses = [np.eye(4)]
@@ -151,22 +138,3 @@ def compose_chain(links: Links, nodes: NDArray[np.int64]) -> Array:
             return np.zeros((0, 4, 4))
         poses.append(poses[-1] @ motions[pair])
     return np.array(poses)
-
-
-class StageError(NamedTuple):
-    """Keyframe error after one positioning stage."""
-
-    stage: str  #: one of `STAGES`
-    rmse_m: float  #: RMS position error
-    gain: float | None  #: error of the preceding stage that has one / this error; None without one, or if an error is 0
-
-
-def stage_errors(metrics: Mapping[str, Any]) -> list[StageError]:
-    """Returns the positioning stages of metrics.json that have an error, each with its gain over the preceding one."""
-    rows: list[StageError] = []
-    for stage in STAGES:
-        rmse_m = ((metrics.get("stages") or {}).get(stage) or {}).get("ate_rmse_m")
-        if rmse_m is not None:
-            before_m = rows[-1].rmse_m if rows else None
-            rows.append(StageError(stage, rmse_m, before_m / rmse_m if before_m and rmse_m else None))
-    return rows

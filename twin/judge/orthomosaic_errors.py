@@ -33,12 +33,7 @@ _HIGHEST_FREQUENCY, _LEAST_TRANSFER = 0.4, 0.1
 
 
 class OrthomosaicJudge:
-    """Compares an orthomosaic with the true one.
-
-    Args:
-        restored: whether the colours of the orthomosaic are restored albedo; if not, they are the colours of the
-            images, and are not compared.
-    """
+    """Compares an orthomosaic with the true one; its colours only if they are `restored` to albedo."""
 
     def __init__(self, restored: bool):
         self._restored = restored
@@ -52,11 +47,8 @@ class OrthomosaicJudge:
     def add(self, tile: OrthoTile, albedo: NDArray[np.float32], asked: NDArray[np.bool_]) -> None:
         """Adds the errors of a tile.
 
-        Args:
-            tile: part of the orthomosaic.
-            albedo: (rows, cols, 3) true albedo of its pixels, 255 = white; NaN where there is no floor or an object
-                lies on it.
-            asked: (rows, cols) bool, whether each pixel lies in the asked area.
+        `albedo` (rows, cols, 3) is the true one, 255 = white, NaN where there is no floor or an object lies on it;
+        `asked` (rows, cols) marks the pixels in the asked area.
         """
         self._pixel_m = tile.grid.cell_m
         self._n_asked += int(asked.sum())
@@ -67,20 +59,13 @@ class OrthomosaicJudge:
         self._match(tile.rgba[..., :3] @ _LUMINANCE, np.nan_to_num(albedo) @ _LUMINANCE, known)
 
     def _compare_colours(self, rgb: NDArray[np.uint8], albedo: NDArray[np.float32], known: NDArray[np.bool_]) -> None:
-        """Adds the colour differences of known pixels, every `_COLOUR_STEP_PX`-th per row and column, to the histogram.
-
-        Arguments: colours and true albedo (rows, cols, 3), and whether a pixel has both.
-        """
+        """Adds the colour differences of some known pixels to the histogram."""
         some = np.s_[::_COLOUR_STEP_PX, ::_COLOUR_STEP_PX]
         colours = (lab_of(picture[some][known[some]] / 255.0) for picture in (rgb, albedo))
         self._colours += np.histogram(np.minimum(ciede2000(*colours), _BINS[-1]), _BINS)[0]
 
     def _match(self, shown: Layer, true: Layer, known: NDArray[np.bool_]) -> None:
-        """Counts the patches that can be compared, and adds the displacement and the spectra of those that are found.
-
-        A patch can be compared if all pixels within the search range around it are known. Arguments: luminance of the
-        orthomosaic and of the true albedo (rows, cols), and whether a pixel has both.
-        """
+        """Counts the patches that are known over the search range; adds displacement and spectra of those found."""
         n, m = PATCH_PX, SEARCH_PX
         for row in range(m, len(shown) - n - m + 1, n):
             for col in range(m, shown.shape[1] - n - m + 1, n):
@@ -101,13 +86,12 @@ class OrthomosaicJudge:
     def metrics(self) -> dict[str, float | None]:
         """Returns `orthomosaic.*` of metrics.json; every value is None without an orthomosaic.
 
-        pixel_m is the side of a pixel, and coverage_area the fraction of the asked area that has a colour. ce90_m and
-        ce90_px are the 90th percentile of the horizontal displacement of patches against the true orthomosaic (circular
-        error at 90 %), bias_east_m and bias_north_m the medians of its components, and matched the fraction of the
-        patches that were found in the true orthomosaic. colour_difference_median and _p90 are percentiles of CIEDE2000
-        between restored and true albedo; None without restoration. edge_width_m is the distance over which the image of
-        an edge of albedo rises from 10 % to 90 %, for the Gaussian blur that best fits the modulation transfer function
-        between the true orthomosaic and this one.
+        pixel_m is the side of a pixel, coverage_area the fraction of the asked area that has a colour. ce90_m and
+        ce90_px are the 90th percentile of the horizontal displacement of patches (circular error at 90 %), bias_east_m
+        and bias_north_m the medians of its components, matched the fraction of the patches that were found.
+        colour_difference_median and _p90 are percentiles of CIEDE2000 between restored and true albedo; None without
+        restoration. edge_width_m is the distance over which the image of an edge of albedo rises from 10 % to 90 %, for
+        the Gaussian blur that best fits the modulation transfer function between the true orthomosaic and this one.
         """
         pixel_m, shift = self._pixel_m, np.array(self._shifts).reshape(-1, 2)
         ce90_px = percentile(np.hypot(*shift.T), 90)
@@ -130,13 +114,9 @@ class OrthomosaicJudge:
 def _edge_width_px(cross: Array, power: Array) -> float | None:
     """Returns the 10 % to 90 % edge width [px] of the Gaussian blur that best fits a modulation transfer function.
 
-    The measured transfer function of the frequency f [1/px] is `cross` / `power`, each summed over all directions. The
-    function gain * exp(-2 (pi sigma f)^2) is fitted to it, with sigma the standard deviation of the blur [px]. Returns
-    None if fewer than four frequencies have a usable ratio.
-
-    Args:
-        cross: (n, n) sum of the cross-spectra of the patches with the true patches.
-        power: (n, n) sum of the power spectra of the true patches.
+    The function gain * exp(-2 (pi sigma f)^2) of the frequency f [1/px] is fitted to the ratio of `cross` and `power`
+    (n, n), the sums of the (cross-)spectra of the patches, over all directions. None with fewer than four usable
+    frequencies.
     """
     n = len(power)
     f = np.hypot(np.fft.fftfreq(n), np.fft.fftfreq(n)[:, None])
@@ -163,7 +143,6 @@ def _percentile_of_counts(counts: NDArray[np.int64], percent: float) -> float | 
 
 
 def _times(value: float | None, factor: float | None) -> float | None:
-    """Returns the product; None if a factor is None."""
     return None if value is None or factor is None else value * factor
 
 
@@ -177,15 +156,10 @@ class PatchShift(NamedTuple):
 def patch_shift(patch: Layer, around: Layer, least_correlation: float) -> PatchShift | None:
     """Returns the displacement of a patch (n, n) of the first image against the second image.
 
-    The peak of the correlation is interpolated by a parabola through three values along each axis. Returns None if the
-    patch or the part of the second image has no texture, if the peak is below `least_correlation`, if it lies at the
-    border of the search range of m pixels, or if the correlation exceeds 90 % of the peak more than three rows or
-    columns away from it.
-
-    Args:
-        patch: (n, n) part of the first image.
-        around: (n + 2 m, n + 2 m) part of the second image with the same centre.
-        least_correlation: smallest accepted peak of the normalised cross-correlation.
+    `around` (n + 2 m, n + 2 m) is the part of the second image with the same centre. The peak of the correlation is
+    interpolated by a parabola along each axis. None if one of the two has no texture, if the peak is below
+    `least_correlation` or at the border of the search range of m pixels, or if the correlation exceeds 90 % of the peak
+    more than three rows or columns away from it.
     """
     if min(patch.std(), around.std()) < 1e-3:
         return None
@@ -212,8 +186,8 @@ def _vertex(before: float, at: float, after: float) -> float:
 def transfer(patch: Layer, true: Layer, shift: PatchShift) -> tuple[Array, Array]:
     """Returns the cross-spectrum (n, n) of a patch and the true patch, and the power spectrum (n, n) of the true patch.
 
-    Both patches are weighted by a Hann window. The cross-spectrum is corrected for the displacement `shift`, and its
-    real part is returned. The ratio of the spectra is the modulation transfer function.
+    Both are weighted by a Hann window. The cross-spectrum is corrected for the displacement `shift`; its real part is
+    returned. The ratio is the modulation transfer function.
     """
     n = len(patch)
     hann = np.hanning(n + 2)[1:-1]

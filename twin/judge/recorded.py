@@ -1,4 +1,4 @@
-"""Comparison of a replay with a recorded truth: association by time, alignment, and truth that does not fit."""
+"""Comparison of a replay with its recorded truth: path (association by time, alignment, misfit) and map."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from twin.core import geometry
-from twin.core.records import Array, Trajectory
+from twin.core.records import Array, ElevationMap, MapGrid, Trajectory, Truth
 from twin.core.series import nearest_index
+from twin.judge.map_error import KEYS, map_metrics
 from twin.judge.trajectory_errors import PathErrors, anchor, pose_errors
 
 #: How an estimate is moved to the truth before the comparison. se3: by the rigid motion that minimises the squared
@@ -24,6 +26,12 @@ _MAX_AXIS_DEG, _MAX_EXTENT_RATIO = 5.0, 2.0
 _MAX_AXIS_SIGMA_DEG = 10.0  # where the turn is less certain, it is not judged: along a line or noise, any turn fits
 _SIGNIFICANT = 3.0  # standard deviations of the turn of the axes
 _BLOCKS = 4  # parts of the path, left out one at a time for the standard deviation of the turn
+_MOST_STEPS = 20
+_CONVERGED_M = 1e-5
+_LEAST_COSINE = 0.7  # of the angle between the axes of height; a map of a wall is not compared with a height grid
+_ROWS_PER_CALL = 256
+#: Metrics of the map that need to know which cells the cameras saw, which area was asked for or where objects are.
+_UNKNOWN = [key for key in KEYS if key.startswith(("completeness", "le90_area", "floor_", "objects_"))]
 
 
 class RecordedTruth(NamedTuple):
@@ -44,8 +52,8 @@ class Associated(NamedTuple):
 def associate(estimated_s: Array, true_s: Array) -> Associated:
     """Associates the poses of two trajectories by time as evo does (`evo.core.sync.associate_trajectories`).
 
-    Each pose of the shorter trajectory is associated with the pose of the longer one whose time is nearest, if the two
-    times (n,) and (m,) [s] differ by at most `MAX_DIFFERENCE_S`.
+    Each pose of the shorter trajectory goes with the nearest of the longer one, at times (n,) and (m,) [s] that differ
+    by at most `MAX_DIFFERENCE_S`.
     """
     truth_longer = len(true_s) > len(estimated_s)
     short, long = (estimated_s, true_s) if truth_longer else (true_s, estimated_s)
@@ -58,10 +66,7 @@ def associate(estimated_s: Array, true_s: Array) -> Associated:
 
 
 def rigid_alignment(estimated: Array, true: Array) -> Array:
-    """Returns true_from_estimated (4, 4), the rigid motion with the smallest squared errors of associated positions.
-
-    The positions are (n, 3) [m] (Umeyama 1991).
-    """
+    """Returns true_from_estimated (4, 4) with the least squared errors of positions (n, 3) (Umeyama 1991)."""
     centre, true_centre = estimated.mean(axis=0), true.mean(axis=0)
     u, _, vt = np.linalg.svd((true - true_centre).T @ (estimated - centre))
     rotation = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
@@ -69,10 +74,7 @@ def rigid_alignment(estimated: Array, true: Array) -> Array:
 
 
 def true_from_world(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> Array:
-    """Returns the transform (4, 4) that moves an estimate to the truth, from the poses that are associated by time.
-
-    It is the identity without such poses, and for "se3" if there are fewer than three.
-    """
+    """Returns the transform (4, 4) that moves an estimate to the truth; the identity with too few common poses."""
     a, b = _associated_poses(estimate, truth)
     if alignment == "none" or len(a) < (_MIN_ASSOCIATED if alignment == "se3" else 1):
         return np.eye(4)
@@ -82,10 +84,7 @@ def true_from_world(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
 
 def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: AlignmentName) -> PathErrors:
-    """Returns the errors of the aligned estimate at the frames that have a true pose.
-
-    The errors are empty if fewer than three frames have a true pose.
-    """
+    """Returns the errors of the aligned estimate at the frames that have a true pose; empty for fewer than three."""
     a, b = _associated_poses(estimate, truth)
     if len(a) < _MIN_ASSOCIATED:
         return pose_errors(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)))
@@ -93,10 +92,7 @@ def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
 
 
 def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
-    """Returns warnings if the truth seems to have another clock, unit, scale or body than the estimate.
-
-    There are no warnings if the estimate has fewer than three frames, as after an early interrupt.
-    """
+    """Returns warnings if the truth seems to have another clock, unit, scale or body; none below three frames."""
     if len(estimate) < _MIN_ASSOCIATED:
         return []
     if not len(truth):
@@ -128,9 +124,9 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
 def _axis_turn_deg(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
     """Returns the angle by which the axes of the true bodies are turned from those of the camera, and its sigma [deg].
 
-    The angle is that between the rotation that fits the positions and the one that fits the attitudes. The standard
-    deviation is that of the jackknife that leaves out one of `_BLOCKS` parts of the path at a time (Kuensch 1989), so
-    errors that are correlated along the path count; over a nearly still path it is as large as the angle.
+    It is that between the rotation that fits the positions and the one that fits the attitudes. The standard deviation
+    is that of a jackknife that leaves out one of `_BLOCKS` parts of the path at a time (Kuensch 1989), so errors
+    correlated along the path count; over a nearly still path it is as large as the angle.
     """
     block = np.arange(len(truth)) * _BLOCKS // len(truth)
     kept = [block != k for k in range(-1, _BLOCKS)]  # first all rows
@@ -158,11 +154,68 @@ def _axis_turn(estimate: Trajectory, truth: Trajectory) -> Array:
 
 
 def _associated_poses(estimate: Trajectory, truth: Trajectory) -> tuple[Trajectory, Trajectory]:
-    """Returns the associated poses of both trajectories, row by row (`associate`)."""
     rows = associate(estimate.times_s, truth.times_s)
     return _selected(estimate, rows.estimate), _selected(truth, rows.truth)
 
 
 def _selected(path: Trajectory, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Trajectory:
-    """Returns the poses of a trajectory in the given rows or where a mask is true."""
     return Trajectory(path.times_s[rows], path.world_from_camera[rows])
+
+
+class TrueMap(NamedTuple):
+    """True heights in the frame of the true trajectory."""
+
+    grid: MapGrid  #: cells of the heights
+    height_m: Array  #: (rows, cols) heights at the centres of the cells; NaN where unknown
+
+
+def true_heights(elevation: ElevationMap, true: TrueMap, true_from_world: Array) -> NDArray[np.float32] | None:
+    """Returns the true height at the centres of the cells of a map (rows, cols) [m], NaN where unknown.
+
+    Heights are along the axis of height of the map; None if those of map and truth are not within 45 degrees. Iteration
+    from the height of the map: the point (x, y, h) of a cell, moved by `true_from_world` (4, 4), is compared with the
+    true height there, and h reduced by the difference. In a level frame one step is exact; with a tilt t it converges
+    where the slope is below 1 / tan t.
+    """
+    true_from_map = true_from_world @ geometry.inverse(elevation.map_from_world)
+    cosine = float(true_from_map[2, 2])
+    if cosine < _LEAST_COSINE:
+        return None
+    x, y = elevation.grid.centres()
+    height = np.empty(elevation.height_m.shape, np.float32)
+    known = elevation.height_m[np.isfinite(elevation.height_m)]
+    middle = float(np.median(known)) if len(known) else 0.0
+    for row in range(0, len(y), _ROWS_PER_CALL):
+        part = slice(row, row + _ROWS_PER_CALL)
+        level = np.where(np.isfinite(elevation.height_m[part]), elevation.height_m[part], middle).astype(np.float64)
+        points = np.stack([*np.meshgrid(x, y[part]), level], axis=-1).reshape(-1, 3)
+        for _ in range(_MOST_STEPS):
+            moved = geometry.transform(true_from_map, points)
+            step = (moved[:, 2] - _height_at(true, moved[:, 0], moved[:, 1])) / cosine
+            points[:, 2] -= step
+            if not np.nanmax(np.abs(step), initial=0.0) > _CONVERGED_M:
+                break
+        height[part] = points[:, 2].reshape(level.shape)
+    return height
+
+
+def _height_at(true: TrueMap, x: Array, y: Array) -> Array:
+    """Returns true heights (n,) at positions, interpolated bilinearly; NaN outside and beside unknown cells."""
+    grid = true.grid
+    rows, cols = (grid.north_m - y) / grid.cell_m - 0.5, (x - grid.west_m) / grid.cell_m - 0.5
+    return map_coordinates(true.height_m, [rows, cols], order=1, mode="constant", cval=np.nan)
+
+
+def recorded_map_metrics(elevation: ElevationMap, heights: NDArray[np.float32]) -> dict[str, float | None]:
+    """Returns `map.*` of metrics.json for a map and its true heights (rows, cols) (`true_heights`).
+
+    Errors are those of all cells that have both. Metrics that need more than heights, completeness among them, are
+    None.
+    """
+    cells = np.isfinite(heights)
+    return map_metrics(elevation, truth_without_flight(heights, cells, np.zeros_like(cells))) | dict.fromkeys(_UNKNOWN)
+
+
+def truth_without_flight(height_m: NDArray[np.float32], seen: NDArray[np.bool_], asked: NDArray[np.bool_]) -> Truth:
+    none = Trajectory(np.zeros(0), np.zeros((0, 4, 4)))
+    return Truth(none, np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0, np.int64), height_m, seen, asked)

@@ -21,12 +21,10 @@ def _statistic(values: ArrayLike, function: Callable[[Any], Any]) -> float | Non
 
 
 def rms(values: ArrayLike) -> float | None:
-    """Returns the root mean square of all values; None if there are none or if it is not finite."""
     return _statistic(values, lambda array: np.sqrt(np.mean(array**2)))
 
 
 def mean(values: ArrayLike) -> float | None:
-    """Returns the mean of all values; None if there are none or if it is not finite."""
     return _statistic(values, np.mean)
 
 

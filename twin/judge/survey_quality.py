@@ -19,10 +19,9 @@ def _over_pairs(result: SurveyResult, name: str, percent: float = 50) -> float |
 def stereo_quality(result: SurveyResult) -> dict[str, Any]:
     """Returns `vision` of metrics.json, over all stereo observations, including those that gave no keyframe.
 
-    points_median and points_p10 are the median and the 10th percentile of the number of matched points.
-    contrast_median and saturated_median are the medians of the contrast and of the saturated fraction of the pixel
-    values; both are None without images. blind_looks is the number of frames that have a stereo observation but
-    did not become keyframes, because they had too few matched points.
+    points_median and points_p10 are percentiles of the number of matched points; contrast_median and saturated_median
+    medians of contrast and saturated fraction, None without images. blind_looks is the number of frames with a stereo
+    observation that had too few matched points for a keyframe.
     """
     observed = {pair.row for pair in result.stereo_observations}
     return {
@@ -37,21 +36,18 @@ def stereo_quality(result: SurveyResult) -> dict[str, Any]:
 def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     """Returns `self_check.*` of metrics.json; a value that was not measured is None.
 
-    frames_lost and links_failed are fractions; nodes_bridged is a number of nodes (see `EstimationQuality`),
-    keyframes_unlinked the number of keyframes that are not in the map (`SurveyResult.unlinked`).
-    link_residual is the median over the links of the residuals of their points, divided by the expected residuals;
-    link_chi2 is the mean chi-square of the links per degree of freedom. row_offset_px, row_spread_ratio and repetition
-    are medians over the stereo pairs: of the row difference of the matched points (right minus left) [px], of the
-    standard deviation of this difference divided by the expected one, and of the largest autocorrelation of the left
-    image away from its main peak. pitch_deg, yaw_deg, roll_deg and row_shift (a fraction of the focal length) are the
-    estimated errors of the rectification, with the signs of `calibration_error.right_*`; row_pattern is the systematic
-    row difference that they do not explain, and disparity_offset the common error of all disparities that the links
-    imply (both are fractions of the focal length). sigma_max_m is the largest 3-D standard deviation (square root of
-    the trace of the covariance) of a keyframe position [m]. frame_sigma_m is the 3-D standard deviation of the position
-    of a keyframe relative to the previous keyframe, by frame-to-frame motion alone: the 90th percentile over the
-    keyframes [m]. length_scale and depth_scale are the lengths from the images across and along the optical axis,
-    divided by those of DVL, USBL and pressure; None where these do not determine them. readings_rejected and
-    readings_disputed are numbers of readings of each navigation sensor.
+    frames_lost and links_failed are fractions, nodes_bridged a number of nodes (`EstimationQuality`),
+    keyframes_unlinked that of the keyframes not in the map. link_residual is the median over the links of the residuals
+    of their points, divided by the expected ones; link_chi2 the mean chi-square of the links per degree of freedom.
+    row_offset_px, row_spread_ratio and repetition are medians over the stereo pairs: row difference of the matched
+    points (right minus left), its standard deviation / expected, and largest autocorrelation of the left image away
+    from its main peak. pitch_deg, yaw_deg, roll_deg and row_shift (fraction of the focal length) are estimated errors
+    of the rectification, with the signs of `calibration_error.right_*`; row_pattern the systematic row difference that
+    they do not explain, disparity_offset the common error of all disparities (fractions of the focal length).
+    sigma_max_m is the largest 3-D standard deviation of a keyframe position; frame_sigma_m that of a keyframe relative
+    to the previous one by frame-to-frame motion alone, 90th percentile. length_scale and depth_scale are lengths from
+    the images across and along the optical axis / those of DVL, USBL and pressure. readings_rejected and _disputed are
+    numbers by navigation sensor.
     """
     quality, epipolar = result.quality, result.quality.epipolar
     pitch, yaw, roll = (None,) * 3 if epipolar is None else np.rad2deg(epipolar.estimate[:3]).tolist()

@@ -30,7 +30,7 @@ class PathErrors(NamedTuple):
 
 
 def anchor(first_estimated: Array, first_true: Array) -> Array:
-    """Returns true_from_estimated (4, 4), the transform that maps the first estimated pose to the first true pose."""
+    """Returns true_from_estimated (4, 4), which maps the first estimated pose to the first true pose."""
     return first_true @ geometry.inverse(first_estimated)
 
 
@@ -42,10 +42,7 @@ def pose_errors(estimated: Array, true: Array) -> PathErrors:
 
 
 def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
-    """Returns the errors at the frames of both trajectories, with the estimate anchored at the first true pose.
-
-    If the trajectories differ in length, the frames at the end of the longer one are left out.
-    """
+    """Returns the errors at the frames of both trajectories, with the estimate anchored at the first true pose."""
     n = min(len(estimate), len(truth))
     true = truth.world_from_camera[:n]
     if n == 0:
@@ -54,7 +51,6 @@ def path_errors(estimate: Trajectory, truth: Trajectory) -> PathErrors:
 
 
 def _cumulative_length(positions: Array) -> Array:
-    """Returns the length (n,) of the path from the first position to each of the positions (n, 3) [m]."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.concatenate([[0.0], np.cumsum(steps)])[: len(positions)]
 
@@ -75,11 +71,7 @@ def trajectory_metrics(errors: PathErrors) -> dict[str, float | None]:
 
 
 def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
-    """Returns `tracks[]` of metrics.json: one row for each alignment at the end of a track.
-
-    A row has the errors of all keyframes up to the end of the track, before and after its alignment. The alignment of
-    the whole survey at the end has no positions before and after it, and therefore no row.
-    """
+    """Returns `tracks[]` of metrics.json: errors of all keyframes so far, before and after each track's alignment."""
     error_m = path_errors(result.final, truth.trajectory).distance_m
     rows = []
     for alignment, *positions in zip(result.alignments, result.before_ga, result.after_ga, strict=False):
@@ -100,9 +92,8 @@ def track_metrics(result: SurveyResult, truth: Truth) -> list[dict[str, Any]]:
 def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
     """Returns the RMS of the position errors (n,) [m] at the far end of a track; None if the track has no frames.
 
-    The far end consists of the frames whose planned distance from the start of the survey is at least `FAR_SHARE` of
-    the greatest one within the track. Drift is greatest there (Negahdaripour & Madjidi 2003, section III). The error of
-    a single frame would be dominated by frame-to-frame noise.
+    These are the frames whose planned distance from the start is at least `FAR_SHARE` of the greatest within the track.
+    Drift is greatest there (Negahdaripour & Madjidi 2003, section III); a single frame would show frame-to-frame noise.
     """
     frames = np.flatnonzero(truth.track[: len(error_m)] == track)
     if len(frames) == 0:
@@ -112,15 +103,11 @@ def farthest_error_m(track: int, error_m: Array, truth: Truth) -> float | None:
 
 
 def keyframe_errors_m(positions: Array, frames: NDArray[np.int64], result: SurveyResult, truth: Truth) -> Array:
-    """Returns the position errors (min(n, m),) of the first keyframes of a survey [m].
-
-    The positions are anchored at the first true pose before they are compared.
+    """Returns the position errors (min(n, m),) of the first keyframes of a survey [m], anchored at the first true pose.
 
     Args:
         positions: (n, 3) estimated positions of the first n keyframes, not yet anchored [m].
         frames: (m,) frame numbers of the first m keyframes.
-        result: output of the estimators, of which the first online pose is used.
-        truth: source of the true trajectory.
     """
     n = min(len(positions), len(frames))
     if n == 0:

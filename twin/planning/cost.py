@@ -16,24 +16,21 @@ from twin.world.mission import Mission
 
 
 class ComputingCost(NamedTuple):
-    """Estimated computing cost of a survey."""
-
     wall_s: float  #: processor time on an idle 2-core machine [s]
     memory_mb: float  #: peak memory [MB]
     disk_mb: float  #: disk space of the run folder [MB]
 
 
 class _Coefficients(NamedTuple):
-    """Coefficients of a cost (time, memory or disk) that is linear in the numbers of frames and keyframes."""
+    """Coefficients of a cost: fixed, per frame, per frame and megapixel, per keyframe, per keyframe and megapixel."""
 
-    start: float  #: fixed cost of start and report
-    frame: float = 0.0  #: cost per frame
-    frame_mpx: float = 0.0  #: additional cost per frame for each megapixel of the image
-    keyframe: float = 0.0  #: cost per keyframe
-    keyframe_mpx: float = 0.0  #: additional cost per keyframe for each megapixel of the image
+    start: float
+    frame: float = 0.0
+    frame_mpx: float = 0.0
+    keyframe: float = 0.0
+    keyframe_mpx: float = 0.0
 
     def total(self, n_frames: int, n_keyframes: int, megapixels: float) -> float:
-        """Returns the cost of a survey with images of `megapixels` each."""
         frame = self.frame + self.frame_mpx * megapixels
         return self.start + n_frames * frame + n_keyframes * (self.keyframe + self.keyframe_mpx * megapixels)
 
@@ -52,7 +49,6 @@ _FACE_MB, _MESH_TEXEL_MB = 80e-6, 4e-6  #: memory of a mesh floor [MB], per tria
 
 
 def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
-    """Returns the estimated computing cost of simulating a mission with this number of keyframes."""
     megapixels = mission.rig.width_px * mission.rig.height_px / 1e6
     size = mission.n_frames, n_keyframes, megapixels
     if mission.scenario.imaging.fidelity == "surrogate":
@@ -64,7 +60,6 @@ def computing_cost(mission: Mission, n_keyframes: int) -> ComputingCost:
 
 
 def _floor_mb(mission: Mission) -> float:
-    """Returns the memory of the height grid, its texture, the walls with theirs, and a mesh floor [MB]."""
     terrain, walls = mission.terrain, mission.terrain.walls
     floor_mb = _NODE_MB * terrain.height_m.size + _TEXEL_MB * (terrain.texture.size / 3)
     if mission.mesh_floor is not None:

@@ -21,11 +21,7 @@ _LEAST_DRAWN_M = 0.005  #: height above the floor at which the outlines of the o
 
 
 def draw(summary: PlanSummary, file: Path) -> Path:
-    """Writes a PNG file that shows the plan as seen from above, and returns the path of the file.
-
-    The left panel shows sea floor, objects, planned path, footprint of the first image and survey area. The right panel
-    shows the survey area and the overlap over the floor, and marks where the overlap is insufficient.
-    """
+    """Writes a PNG file that shows path and overlap of the plan over the floor from above, and returns its path."""
     mission = summary.mission
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(14, 6.5))
@@ -44,10 +40,7 @@ def draw(summary: PlanSummary, file: Path) -> Path:
 
 
 def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
-    """Draws the overlap of each image pair midway between its two camera positions.
-
-    Outlined markers show overlaps that are more than `OVERLAP_TOLERANCE` below the required one.
-    """
+    """Draws the overlap of each image pair midway between its two cameras; outlined where it is insufficient."""
     floor, t = summary.floor, summary.mission.terrain
     along, across = required_overlaps(summary.mission)
     axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))
@@ -70,7 +63,6 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
 
 
 def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
-    """Draws the shaded surface of sea floor and objects, the outlines of the objects, and contours of the floor."""
     mission = summary.mission
     t, top = mission.terrain, summary.floor.surface
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
@@ -88,11 +80,10 @@ def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
 
 
 def _draw_path(axes: Axes, mission: Mission) -> None:
-    """Draws the planned path, the footprint of the first image and the survey area."""
     path = mission.plan.outline()
     axes.plot(path[:, 0], path[:, 1], color=COLOURS["online"], label=f"{LABELS['reference']} path")
     axes.plot(*path[0, :2], "o", color=COLOURS["final"], label="start")
-    across_m, along_m = mission.plan.footprint_m
+    across_m, along_m = mission.plan.request.footprint_m
     first_image = (path[0, 0] - along_m / 2, path[0, 1] - across_m / 2)
     style = {"fill": False, "linewidth": 1.4}
     turned = {"angle": np.degrees(mission.plan.area.heading), "rotation_point": "center"}
@@ -101,5 +92,4 @@ def _draw_path(axes: Axes, mission: Mission) -> None:
 
 
 def _area(mission: Mission, **style) -> Patch:
-    """Returns the outline of the survey area."""
     return Polygon(mission.plan.area.outline(), closed=True, **style)

@@ -9,8 +9,7 @@ from scipy.optimize import root_scalar
 from scipy.special import ndtr, ndtri
 
 from twin.core.geometry import Array
-from twin.core.height_field import ray_grid
-from twin.core.image_overlap import RAY_COLUMNS
+from twin.core.height_field import RAY_COLUMNS, ray_grid
 from twin.surrogate import error_model_file
 from twin.surrogate.floor_relief import floor_relief
 from twin.surrogate.height_errors import CellConditions, KeyframeRuns, cell_conditions, height_sigmas
@@ -25,30 +24,17 @@ _GOLDEN_RATIO = 0.6180339887498949  # multiples of it, modulo 1, are spread even
 
 
 class ExpectedError(NamedTuple):
-    """Expected height error of the map.
-
-    Args:
-        sigma_m: (n,) standard deviation of the height error at floor points spread evenly over the images [m].
-        completeness: share, 0 to 1, of the floor in view for which the depth filter provides a height. Losses near the
-            border of the images are neglected.
-        bound_px: largest Cramér-Rao bound of image matching at the depths of these points [px of the matched images].
-        fitted_bound_px: largest bound of the surveys to which the error model was fitted [px].
-    """
-
-    sigma_m: Array
+    sigma_m: Array  #: (n,) standard deviation of the height error at floor points spread evenly over the images
+    #: share of the floor in view for which the depth filter provides a height, without losses near image borders
     completeness: float
-    bound_px: float
-    fitted_bound_px: float
+    bound_px: float  #: largest Cramér-Rao bound of image matching at the depths of these points
+    fitted_bound_px: float  #: largest bound of the surveys to which the error model was fitted
 
     def percentile_m(self, percent: float, holes: float = 0.0) -> float | None:
-        """Returns a percentile of the absolute height error [m]; None if it is infinite or no floor is in view.
+        """Returns a percentile of the absolute height error; None if it is infinite or no floor is in view.
 
-        The error is a mixture of zero-mean normal distributions with the standard deviations `sigma_m`; in holes of the
-        map it is infinite.
-
-        Args:
-            percent: 0 to 100.
-            holes: share of the area without a height, 0 to 1.
+        The error is a mixture of zero-mean normal distributions with the standard deviations `sigma_m`; it is infinite
+        in holes of the map, a share of the area.
         """
         share = percent / 100
         if share >= 1 - holes or len(self.sigma_m) == 0:
@@ -62,7 +48,6 @@ class ExpectedError(NamedTuple):
 
     @property
     def rmse_m(self) -> float | None:
-        """Returns the expected RMSE of the heights [m]; None if no floor is in view."""
         return float(np.sqrt(np.mean(self.sigma_m**2))) if len(self.sigma_m) else None
 
 

@@ -9,11 +9,11 @@ from typing import Any
 from twin.controllers.forecast import Forecast, forecast
 from twin.core.geometry import Array
 from twin.imaging.light.spectra import provenance_of
-from twin.judge.require import judge_requirements
 from twin.judge.summary_statistics import finite_tree
+from twin.judge.verdict import judge_requirements
 from twin.planning.cost import ComputingCost, computing_cost
 from twin.planning.expected_error import ExpectedError, expected_error
-from twin.report.wording import length, percent, with_unit
+from twin.report.number_formats import length, percent, with_unit
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
 from twin.world.planning import SHORT_PERCENT
@@ -49,25 +49,22 @@ class PlanSummary:
     mission: Mission
     plane: Forecast  #: footprint, overlaps, disparity and depth error refer to the reference plane
     floor: FloorForecast  #: properties of the planned images over the floor with its objects
-    error: ExpectedError  #: expected height error of the map
-    cost: ComputingCost  #: computing time, memory and disk space of the simulation
+    error: ExpectedError
+    cost: ComputingCost
     require: dict[str, dict[str, Any]]  #: value, limit and verdict of each required metric that can be predicted
     #: sentences on requirements expected to be missed, on insufficient overlap, and on limits of validity
     warnings: tuple[str, ...]
 
     @property
     def meets_requirements(self) -> bool:
-        """Returns whether all requirements that can be predicted are expected to be met."""
         return all(r["passed"] for r in self.require.values())
 
     @property
     def hold_s(self) -> float:
-        """Returns the time of station keeping [s]."""
         return self.mission.scenario.control.hold_s * len(self.mission.tracks)
 
 
 def summarise(mission: Mission) -> PlanSummary:
-    """Returns the summary of a mission, computed without a simulation."""
     plane = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
     floor = forecast_over_floor(mission)
     error = expected_error(mission, floor)
@@ -103,7 +100,6 @@ def _predicted_metrics(floor: FloorForecast, error: ExpectedError) -> dict[str, 
 
 
 def _missed(require: dict[str, dict[str, Any]]) -> Iterator[str]:
-    """Yields a sentence for each requirement that the plan is expected to miss."""
     for name, r in require.items():
         if not r["passed"]:
             expected, limit = with_unit(name, r["value"]), with_unit(name, r["limit"])
@@ -111,12 +107,9 @@ def _missed(require: dict[str, dict[str, Any]]) -> Iterator[str]:
 
 
 def required_overlaps(mission: Mission) -> tuple[float, float]:
-    """Returns the required overlaps as fractions of the image sides along and across the swath.
-
-    The overlap along is converted: the scenario gives it as a fraction of the image width (see `frames_per_keyframe`).
-    """
+    """Returns the required overlaps as fractions of the image sides along and across (`frames_per_keyframe`)."""
     plan, required = mission.plan, mission.scenario.plan
-    along = 1 - (1 - required.overlap_along) * plan.footprint_m[0] / plan.side_along_m
+    along = 1 - (1 - required.overlap_along) * plan.request.footprint_m[0] / plan.side_along_m
     return max(0.0, along), required.overlap_across
 
 
@@ -133,10 +126,7 @@ def _short_overlap(mission: Mission, floor: FloorForecast) -> Iterator[str]:
 
 
 def _limits_of_validity(mission: Mission, error: ExpectedError) -> Iterator[str]:
-    """Yields a sentence for each limit of validity of the plan that applies to a mission.
-
-    These are that the expected error is extrapolated, that it leaves out effects, and that the plan leaves out objects.
-    """
+    """Yields a sentence for each limit of validity of the plan that applies to a mission."""
     scenario = mission.scenario
     if error.bound_px > _EXTRAPOLATED * error.fitted_bound_px:
         yield (
@@ -184,14 +174,13 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
 
 
 def _cost_text(cost: ComputingCost) -> str:
-    """Returns the computing cost as text."""
     minutes = cost.wall_s / 60
     time = f"{cost.wall_s:.0f} s" if minutes < 2 else f"{minutes:.0f} min" if minutes < 120 else f"{minutes / 60:.1f} h"
     return f"about {time} on 2 cores, {cost.memory_mb / 1000:.1f} GB of memory, {cost.disk_mb:.0f} MB of disk"
 
 
 def floor_rows(summary: PlanSummary) -> list[tuple[str, ...]]:
-    """Returns a header and the image properties over the floor: label, minimum, 5th percentile, median, maximum."""
+    """Returns the image properties over the floor as table rows, the header first."""
     table: list[tuple[str, ...]] = [("", "minimum", "5 %", "median", "maximum")]
     for key, values in floor_spreads(summary).items():
         label, write, _ = _PROPERTIES[key]
@@ -205,10 +194,7 @@ def floor_spreads(summary: PlanSummary) -> dict[str, Spread]:
 
 
 def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
-    """Returns the summary as a JSON object: lengths in metres, fractions from 0 to 1, missing values null.
-
-    `picture` is the path of the drawing of the plan.
-    """
+    """Returns the summary as a JSON object, with the path of the drawing of the plan."""
     mission, plane = summary.mission, summary.plane._asdict()
     return finite_tree(
         {

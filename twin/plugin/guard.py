@@ -25,10 +25,7 @@ class PluginFailed(SurveyAborted):
 class GuardedPlugin:
     """Plug-in whose calls and results are checked. An object of the plug-in's class is created at the first call.
 
-    Args:
-        key, group, name: the class, as `loading.load` finds it; it raises TwinError if it cannot.
-        methods: methods that the plug-in must have.
-        arguments: arguments with which the class is called.
+    `key`, `group` and `name` give the class (`loading.load`, which raises TwinError), `methods` what it must have.
     """
 
     def __init__(self, key: str, group: str, name: str, methods: Sequence[str], *arguments: Any):
@@ -38,11 +35,7 @@ class GuardedPlugin:
         self._plugin: Any = None
 
     def call(self, method: str, *arguments: Any) -> Any:
-        """Returns the result of a method, which gets copies of the arguments.
-
-        Raises:
-            PluginFailed: the class or the method raised an exception, or a method is missing.
-        """
+        """Returns the result of a method, which gets copies; raises PluginFailed if it fails or is missing."""
         if self._plugin is None:
             plugin = self._attempt("its class", self._create, self._arguments)
             if missing := [name for name in self._methods if not callable(getattr(plugin, name, None))]:
@@ -51,11 +44,7 @@ class GuardedPlugin:
         return self._attempt(method, getattr(self._plugin, method), arguments)
 
     def numbers(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
-        """Returns the result of a method as an array of floats.
-
-        Raises:
-            PluginFailed: the value is not an array of this shape, or a number is not finite.
-        """
+        """Returns the result of a method as floats; raises PluginFailed unless it has this shape and is finite."""
         try:
             array = np.array(value, dtype=np.float64)
         except Exception:  # conversion runs code of the value: a tensor with a gradient raises RuntimeError
@@ -70,9 +59,8 @@ class GuardedPlugin:
     def poses(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
         """Returns the result of a method, checked to be rigid poses; `shape` is (4, 4) or (n, 4, 4).
 
-        Raises:
-            PluginFailed: these are not numbers of this shape, a rotation is not orthonormal with determinant 1, a last
-                row is not (0, 0, 0, 1), or a coordinate is beyond `_MOST_POSITION_M`.
+        Raises PluginFailed if these are not numbers of this shape, a rotation is not orthonormal with determinant 1, a
+        last row is not (0, 0, 0, 1), or a coordinate is beyond `_MOST_POSITION_M`.
         """
         array = self.numbers(method, value, shape)
         rotation = array[..., :3, :3]
@@ -95,11 +83,9 @@ class GuardedPlugin:
         return array
 
     def refuse(self, method: str, returned: str, expected: str) -> NoReturn:
-        """Raises PluginFailed for a value that a method returned."""
         raise PluginFailed(f"{self.label}: {method} returned {returned} (expected: {expected})")
 
     def _attempt(self, what: str, function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
-        """Returns the result of a function of the plug-in; an exception in it becomes PluginFailed."""
         try:
             return function(*copy.deepcopy(arguments))
         except (Exception, SystemExit) as error:  # a plug-in may raise any exception
@@ -107,17 +93,12 @@ class GuardedPlugin:
 
 
 def check_loadable(key: str, group: str, name: str | None) -> None:
-    """Raises TwinError if a plug-in is named and cannot be loaded."""
     if name is not None:
         loading.load(key, group, name)
 
 
 def terrain_heights(name: str, x_m: Array, y_m: Array, seed: int) -> Array:
-    """Returns the heights (rows, cols) [m] of a floor from a terrain plug-in (`TerrainGenerator.heights`).
-
-    Raises:
-        TwinError: the plug-in cannot be loaded, raised an exception, or returned an unusable value.
-    """
+    """Returns heights (rows, cols) [m] of a floor from a terrain plug-in; raises TwinError if it fails."""
     key, shape = "terrain.plugin", (len(y_m), len(x_m))
     plugin = GuardedPlugin(key, loading.TERRAINS, name, ["heights"])
     try:

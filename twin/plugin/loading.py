@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable
-from importlib.metadata import entry_points
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
 from operator import attrgetter
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
-from twin.errors import TwinError, described
+from twin.errors import TwinError, described, did_you_mean
 
 #: Groups of entry points under which other packages register plug-ins.
 CONTROLLERS, ESTIMATORS, TERRAINS, READERS = "twin.controllers", "twin.estimators", "twin.terrains", "twin.readers"
@@ -17,46 +17,25 @@ CONTROLLERS, ESTIMATORS, TERRAINS, READERS = "twin.controllers", "twin.estimator
 T = TypeVar("T")
 
 
-class Registered(NamedTuple):
-    """A plug-in that another package registers."""
+def registered(group: str, make: Callable[[Any, str], T]) -> list[T]:
+    """Returns `make(plugin, "module:Class")` of the plug-ins of a group; raises TwinError, naming one that fails."""
 
-    name: str  # name of the entry point
-    target: str  # module and class as the entry point gives them, for example "mypackage.control:LQR"
-    create: Callable[..., Any]  # the class; calling it returns the plug-in
+    def made(entry: EntryPoint) -> T:
+        return make(entry.load()(), entry.value)
 
-
-def registered(group: str) -> list[Registered]:
-    """Imports and returns the plug-ins that the installed packages register in a group of entry points.
-
-    Raises:
-        TwinError: a plug-in cannot be imported; the message names the group, the entry point and the cause.
-    """
-    return [
-        Registered(entry.name, entry.value, attempt(f"{group} {entry.name}", entry.value, entry.load))
-        for entry in entry_points(group=group)
-    ]
+    entries = entry_points(group=group)
+    return [attempt(f"{group} {entry.name}", entry.value, partial(made, entry)) for entry in entries]
 
 
 def load(key: str, group: str, name: str) -> Callable[..., Any]:
-    """Returns the class that a name refers to; loading imports its module, which runs code of its package.
-
-    Args:
-        key: key of the scenario that gives the name, for error messages.
-        group: group of entry points in which a name without a colon is looked up.
-        name: "module:Class", where the module can be imported, or the name of an entry point.
-
-    Raises:
-        TwinError: there is no such entry point, the module cannot be imported, or it has no such class.
-    """
+    """Returns the class "module:Class" or of an entry point; runs its package; raises TwinError, which names `key`."""
     module, colon, attribute = name.partition(":")
     if colon:
         return attempt(key, name, lambda: _attribute(importlib.import_module(module), attribute))
     entries = {entry.name: entry for entry in entry_points(group=group)}
     if name not in entries:
-        close = difflib.get_close_matches(name, entries, n=1)
-        hint = f" (did you mean {close[0]}?)" if close else ""
-        allowed = ", ".join(["module:Class", *sorted(entries)])
-        raise TwinError(key, f"{name}: no installed package registers this name in {group}{hint}", allowed)
+        problem = f"{name}: no installed package registers this name in {group}{did_you_mean(name, entries)}"
+        raise TwinError(key, problem, ", ".join(["module:Class", *sorted(entries)]))
     return attempt(key, name, entries[name].load)
 
 
@@ -69,7 +48,6 @@ def attempt(key: str, name: str, function: Callable[[], T]) -> T:
 
 
 def _attribute(module: Any, dotted: str) -> Callable[..., Any]:
-    """Returns the class with a dotted name in a module. Raises AttributeError or TypeError if the module has none."""
     found = attrgetter(dotted)(module)
     if not callable(found):
         raise TypeError(f"{dotted} is not a class")

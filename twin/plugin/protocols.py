@@ -33,10 +33,7 @@ class ControllerSetup(NamedTuple):
 
 
 class Controller(Protocol):
-    """Controller of the vehicle: key `control.plugin`, entry points `twin.controllers`.
-
-    The class is called once per survey with a `ControllerSetup`.
-    """
+    """Controller (key `control.plugin`, entry points `twin.controllers`), created with a `ControllerSetup`."""
 
     def command(self, estimate: Estimate, reference: Reference) -> Array:
         """Returns the command that applies until the next frame.
@@ -79,10 +76,8 @@ class Estimator(Protocol):
     def update(self, frame: Frame) -> Array | None:
         """Returns the online pose (4, 4) at a frame, or None if it could not be measured.
 
-        The vehicle slows down if many frames have no pose, and stops if half a second has none (`MissionActions`).
-
-        Args:
-            frame: time, left image, right image (None between keyframes), and readings of the navigation sensors.
+        The right image is None between keyframes. The vehicle slows down if many frames have no pose, and stops if half
+        a second has none (`MissionActions`).
         """
         ...
 
@@ -100,10 +95,7 @@ class Estimator(Protocol):
 
 
 class TerrainGenerator(Protocol):
-    """Generator of the heights of a sea floor: key `terrain.plugin`, entry points `twin.terrains`.
-
-    The class is called without arguments.
-    """
+    """Generator of floor heights: key `terrain.plugin`, entry points `twin.terrains`; created without arguments."""
 
     def heights(self, x_m: Array, y_m: Array, seed: int) -> Array:
         """Returns the heights (rows, cols) of the floor above the reference plane z = 0 [m].

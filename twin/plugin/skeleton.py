@@ -7,31 +7,24 @@ import keyword
 import re
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
 from twin.errors import TwinError
 
 Kind = Literal["controller", "estimator", "terrain", "reader"]
 
 
-class _Flown(NamedTuple):
-    """Settings of the survey that the test of a skeleton flies with the plug-in."""
-
-    section: str  # section of the scenario with the key `plugin`
-    fidelity: str  # value of imaging.fidelity
-    error_m: float  # largest RMSE of the trajectory and of the cross-track error that the test accepts [m]
-
-
-_FLOWN: dict[str, _Flown] = {
-    "controller": _Flown("control", "surrogate", 0.05),
-    "estimator": _Flown("estimate", "rendered", 0.15),
-    "terrain": _Flown("terrain", "surrogate", 0.05),
+#: Survey that the test of a skeleton flies with the plug-in: section of the key `plugin`, imaging.fidelity, and largest
+#: RMSE of the trajectory and of the cross-track error that the test accepts [m].
+_FLOWN: dict[str, dict[str, str]] = {
+    "controller": {"SECTION": "control", "FIDELITY": "surrogate", "ERROR_M": "0.05"},
+    "estimator": {"SECTION": "estimate", "FIDELITY": "rendered", "ERROR_M": "0.15"},
+    "terrain": {"SECTION": "terrain", "FIDELITY": "surrogate", "ERROR_M": "0.05"},
 }
 KINDS: tuple[Kind, ...] = ("controller", "estimator", "terrain", "reader")
 
 
 def plugin_kind(text: str) -> Kind:
-    """Returns the kind of plug-in that a text names; raises TwinError if it names none."""
     for kind in KINDS:
         if text == kind:
             return kind
@@ -39,11 +32,7 @@ def plugin_kind(text: str) -> Kind:
 
 
 def package_name(folder: Path) -> str:
-    """Returns the name of the package in a folder: its name in lower case, with "_" for ".", "-" and white space.
-
-    Raises:
-        TwinError: the name is not valid for a Python package, or a module of this name can already be imported.
-    """
+    """Returns the lower-case package name of a folder, "_" for ".", "-", space; raises TwinError if wrong or taken."""
     name = re.sub(r"[\s.-]+", "_", folder.absolute().name).lower()
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,60}", name) or keyword.iskeyword(name):
         allowed = "letters, digits and underscores, starting with a letter"
@@ -54,18 +43,10 @@ def package_name(folder: Path) -> str:
 
 
 def write(kind: Kind, folder: Path) -> list[Path]:
-    """Writes a package with a working plug-in and its test into a folder, and returns its files.
-
-    Args:
-        folder: new or empty folder; its name becomes the name of the package and of the entry point.
-
-    Raises:
-        TwinError: see `package_name`.
-        OSError: a file cannot be written.
-    """
+    """Writes a package with a working plug-in and its test into a new or empty folder, and returns its files."""
     package = package_name(folder)
     flown = _FLOWN.get(kind)
-    use = f"    twin run quickstart --set {flown.section}.plugin={package}" if flown else "    twin replay DATASET"
+    use = f"    twin run quickstart --set {flown['SECTION']}.plugin={package}" if flown else "    twin replay DATASET"
     if kind == "estimator":
         use += f"\n    twin replay DATASET --estimator {package}"
     values = {
@@ -73,10 +54,8 @@ def write(kind: Kind, folder: Path) -> list[Path]:
         "KIND": kind,
         "PACKAGE": package,
         "CLASS": kind.capitalize(),
-        "SECTION": flown.section if flown else "",
-        "FIDELITY": flown.fidelity if flown else "",
-        "ERROR_M": f"{flown.error_m:g}" if flown else "",
         "USE": use,
+        **(flown or {}),
     }
     templates = {
         "pyproject.toml": "pyproject.toml",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,20 +26,12 @@ _NOMINAL_HZ = 1.0  # frame rate of a data set without two frames at different ti
 class RecordedFrames:
     """Rectified frames of a data set, one at a time. A frame that cannot be used is skipped and counted.
 
-    Args:
-        dataset: the data set.
-        calibration: calibration of the cameras.
-        bayer: pattern of raw images; None: grey or colour images.
+    Times are relative to the first frame, at `start_s` in the clock of the data set. Frames out of the order of time
+    are skipped (`increasing`). `skipped` counts frames and right images that could not be used, by reason, while they
+    are read.
 
-    Attributes:
-        rectification: conversion of the recorded images to a rectified pair.
-        start_s: time of the first frame in the clock of the data set [s]; the times of the yielded frames are relative
-            to it. Frames out of the order of time are skipped (`increasing`).
-        skipped: number of frames or right images that could not be used, by reason, counted while the frames are read.
-
-    Raises:
-        TwinError: no left image can be read, the calibration does not fit the images or cannot be rectified, or a Bayer
-            pattern is given for images that have colours.
+    Raises TwinError if no left image can be read, the calibration does not fit the images or cannot be rectified, or a
+    Bayer pattern is given for images that have colours.
     """
 
     def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):
@@ -72,13 +65,10 @@ class RecordedFrames:
                 index += 1
 
     def _frame(self, images: StereoImages, index: int) -> Frame | None:
-        """Returns the rectified frame of recorded images with an index; None if its left image cannot be used."""
         left = self._read(images.left, "left")
         if left is None:
             return None
-        right = self._read(images.right, "right")
-        right = None if right is None else self.rectification.right(right)
-        return Frame(index, images.time_s - self.start_s, self.rectification.left(left), right)
+        return Frame(index, images.time_s - self.start_s, left, self._read(images.right, "right"))
 
     def spread(self, n: int) -> Iterator[Frame]:
         """Yields at most n frames with both images, in the order of time and spread evenly over the data set.
@@ -97,22 +87,18 @@ class RecordedFrames:
         """Returns the number of frames skipped so far; a frame without a usable right image is not skipped."""
         return sum(n for reason, n in self.skipped.items() if reason == _OUT_OF_ORDER or reason.startswith("left"))
 
-    def _read(self, image: ImageSource | None, side: str) -> Image | None:
-        """Returns an image as RGB; if it cannot be used, adds the reason to `skipped` and returns None."""
+    def _read(self, image: ImageSource | None, side: Literal["left", "right"]) -> Image | None:
+        """Returns the rectified image (RGB); if it cannot be used, adds the reason to `skipped` and returns None."""
         try:
             if image is None:
                 raise UnreadableImage("missing")
-            return read_rgb(image, self.size_px, self._format)
+            return self.rectification.rectified(read_rgb(image, self.size_px, self._format), side)
         except UnreadableImage as error:
             self.skipped[f"{side} image: {error}"] += 1
             return None
 
     def first_pair(self) -> Frame:
-        """Returns the first frame with both images.
-
-        Raises:
-            TwinError: no frame has both images.
-        """
+        """Returns the first frame with both images; raises TwinError if there is none."""
         for frame in self:
             if frame.right is not None:
                 return frame
@@ -121,10 +107,7 @@ class RecordedFrames:
 
 
 def increasing(times_s: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of a largest set of frames whose times (n,) increase in the order of the data set.
-
-    The set is a longest increasing subsequence (Schensted 1961), so a single wrong time excludes a single frame.
-    """
+    """Returns a mask (n,) of a longest increasing subsequence (Schensted 1961): one wrong time excludes one frame."""
     ends: list[float] = []  # for each length, the smallest last time of a sequence
     rows: list[int] = []  # and its row
     before = np.full(len(times_s), -1)
@@ -142,11 +125,7 @@ def increasing(times_s: Array) -> NDArray[np.bool_]:
 
 
 def _usual_size(dataset: Dataset) -> tuple[int, int]:
-    """Returns the most frequent (width, height) of the first `_N_SIZES` readable left images [px].
-
-    Raises:
-        TwinError: no left image is readable.
-    """
+    """Returns the most frequent (width, height) of the first `_N_SIZES` readable left images [px]."""
     sizes, problem = Counter[tuple[int, int]](), ""
     for frame in dataset.images:
         try:
@@ -162,7 +141,6 @@ def _usual_size(dataset: Dataset) -> tuple[int, int]:
 
 
 def _frame_rate_hz(dataset: Dataset) -> float:
-    """Returns the frame rate [Hz] from the median of the positive intervals between frames; 1 Hz if there are none."""
     intervals = np.diff([frame.time_s for frame in dataset.images])
     intervals = intervals[intervals > 0]
     return 1 / float(np.median(intervals)) if len(intervals) else _NOMINAL_HZ

@@ -23,8 +23,7 @@ from twin.datasets.ros2.bag_reader import BagTopics
 from twin.datasets.truth_files import read_true_map, read_truth
 from twin.errors import TwinError
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
-from twin.judge.recorded import AlignmentName, associate
-from twin.judge.true_map import TrueMap
+from twin.judge.recorded import AlignmentName, TrueMap, associate
 from twin.recordings.frames import RecordedFrames
 from twin.recordings.recorded_aiding import Aiding
 from twin.report.run_writer import OPTIONAL_OUTPUTS
@@ -84,7 +83,6 @@ class OpenedDataset(NamedTuple):
 
     @property
     def used_readings(self) -> list[str]:
-        """Returns the names of the sensors whose readings are used."""
         return [] if self.aiding is None else self.aiding.used
 
     @property
@@ -100,14 +98,12 @@ class OpenedDataset(NamedTuple):
 def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     """Returns a data set with its calibration, truth and readings, after checks of these and of its first stereo pair.
 
-    Raises:
-        TwinError: the folder has no known layout, there is no calibration or no usable pair, fewer than 30 points of
-            the first pair are matched, the cameras are swapped, the calibration or the truth does not fit the images, a
-            file is damaged, or topics are named for a data set that is not a bag.
+    Raises TwinError if the folder has no known layout, there is no calibration or no usable pair, fewer than 30 points
+    of the first pair are matched, the cameras are swapped, the calibration or the truth does not fit the images, a file
+    is damaged, or topics are named for a data set that is not a bag.
     """
     in_bag = options.truth is not None and is_bag(folder) and not is_file(options.truth)
-    left, right = options.topics or (None, None)
-    dataset, reader = read_dataset(folder, BagTopics(left, right, str(options.truth) if in_bag else None))
+    dataset, reader = read_dataset(folder, BagTopics(options.topics, str(options.truth) if in_bag else None))
     if options.topics is not None and not is_bag(folder):
         raise TwinError("--topics", f"{folder} is not a ROS 2 bag", "no topics for other data sets")
     calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
@@ -132,18 +128,13 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
 
 
 def _sound(value: T | TwinError) -> T:
-    """Returns what was read from a data set; raises the error if it is damaged."""
     if isinstance(value, TwinError):
         raise value
     return value
 
 
 def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:
-    """Returns the true heights: those of the option, or those of the data set if the true poses are its own, too.
-
-    Raises:
-        TwinError: the file is not a height grid, or there are no true poses, in whose frame the heights are.
-    """
+    """Returns the true heights: those of the option, or those of the data set if the true poses are its own, too."""
     if options.true_map is None:
         own = dataset.true_map if options.truth is None and truth is not None else None
         return None if own is None else read_true_map(own)
@@ -153,13 +144,10 @@ def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions
 
 
 def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Trajectory | None:
-    """Returns the true poses of the rectified left camera, in the order of time, at times relative to the first frame.
+    """Returns the true poses of the rectified left camera, at times relative to the first frame; None without a truth.
 
-    Returns None without a truth.
-
-    Raises:
-        TwinError: the truth is damaged or has no poses, a true position is impossible, or there are several frames and
-            none of them has a true pose at its time (`associate`).
+    Raises TwinError if the truth is damaged or has no poses, a true position is impossible, or there are several frames
+    and none of them has a true pose at its time (`associate`).
     """
     truth, source = _sound(dataset.truth if file is None else read_truth(file, dataset)), str(file or dataset.folder)
     if truth is None:
@@ -176,11 +164,7 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
 
 
 def _ordered(truth: Trajectory, source: str) -> Trajectory:
-    """Returns the true poses in the order of time; of several poses at the same time, only the first one is kept.
-
-    Raises:
-        TwinError: there are no poses, or a coordinate of a position is larger than 1e8 m or not a number.
-    """
+    """Returns the true poses in the order of time; of several poses at the same time, only the first one is kept."""
     if not len(truth):
         raise TwinError(source, "the truth has no poses", "true poses at the times of the frames")
     largest_m = float(np.abs(truth.positions).max())

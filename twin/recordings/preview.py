@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from twin.estimate.first_pair import LightInspection, inspect_light
 from twin.recordings.replay import OpenedDataset
-from twin.report.wording import length, percent, plain
+from twin.report.number_formats import length, percent, plain
 
 _N_LINES = 9  # number of epipolar lines
 _N_PAIRS = 24  # largest number of pairs from which the light of the cameras is estimated
@@ -26,20 +26,12 @@ def light_of(opened: OpenedDataset) -> LightInspection:
 
 
 def draw(opened: OpenedDataset, light: LightInspection, file: Path) -> Path:
-    """Writes the figure as PNG and returns `file`.
+    """Writes the figure as PNG and returns `file`, whose name is not changed.
 
     First row: the rectified pair with some epipolar lines, which are image rows, and the matched points, coloured by
     disparity. Second row: before and after the light of the cameras was made uniform in the left image. Third row:
     dense disparity of the images as recorded, and as the map uses it. Fourth row: a histogram of the row differences of
     the matched points, and the mean grey levels of both cameras along the rows of the images.
-
-    Args:
-        opened: the data set.
-        light: light of its cameras (`light_of`).
-        file: file to write; its name is not changed.
-
-    Raises:
-        OSError: the file cannot be written.
     """
     pair = opened.pair
     height_in = 1.6 * _WIDTH_IN * pair.rig.height_px / pair.rig.width_px + 1.6
@@ -83,7 +75,6 @@ def rows(opened: OpenedDataset, light: LightInspection) -> list[tuple[str, ...]]
 
 
 def _corner_light(mean: NDArray[np.float32]) -> float:
-    """Returns the mean of an image (H, W) in its corners, each a tenth of it wide and high, over that in its middle."""
     height, width = mean.shape
     down, across = -(-height // 10), -(-width // 10)
     corners = [part for rows in (mean[:down], mean[-down:]) for part in (rows[:, :across], rows[:, -across:])]
@@ -92,12 +83,10 @@ def _corner_light(mean: NDArray[np.float32]) -> float:
 
 
 def _known_share(disparity_px: NDArray[np.float32]) -> float:
-    """Returns the fraction of the pixels that have a disparity, that is, are not NaN."""
     return float(np.isfinite(disparity_px).mean())
 
 
 def _draw_matches(axes: Sequence[Axes], opened: OpenedDataset) -> None:
-    """Draws the rectified pair with epipolar lines and the matched points, coloured by disparity."""
     pair, (left, right) = opened.pair, axes
     disparity_px, pixels = pair.points.measured[:, 2] * pair.rig.focal_px, pair.points.pixels
     _draw_image(left, pair.left, f"{opened.name}: left image, {len(disparity_px)} matched points", _N_LINES)
@@ -108,7 +97,6 @@ def _draw_matches(axes: Sequence[Axes], opened: OpenedDataset) -> None:
 
 
 def _draw_even_image(axes: Axes, light: LightInspection) -> None:
-    """Draws the left image in even light; only a title if there are too few pairs to know the light."""
     if light.n_pairs < _FEWEST_PAIRS:
         axes.set_title(f"after: light unknown from fewer than {_FEWEST_PAIRS} pairs")
         axes.set_axis_off()
@@ -118,7 +106,6 @@ def _draw_even_image(axes: Axes, light: LightInspection) -> None:
 
 
 def _draw_disparities(axes: Sequence[Axes], recorded_px: NDArray[np.float32], light: LightInspection) -> None:
-    """Draws the disparities (H, W) of the images as recorded and as the map uses them, with the share of known ones."""
     low, high = np.nanpercentile(recorded_px, [1, 99])
     mapped = "without the light" if light.subtracted else "the same: texture dominates"
     for one, disparity_px, title in (
@@ -131,7 +118,6 @@ def _draw_disparities(axes: Sequence[Axes], recorded_px: NDArray[np.float32], li
 
 
 def _draw_row_differences(axes: Axes, difference_px: NDArray[np.floating]) -> None:
-    """Draws a histogram of the row differences (n,) of the matched points."""
     axes.hist(difference_px, bins=50, range=(-1, 1), color="#4477aa")
     axes.axvline(0, color="k", linewidth=0.8)
     axes.set(xlabel="row of the right point minus row of the left point [px]", ylabel="matched points")
@@ -149,7 +135,6 @@ def _draw_light(axes: Axes, light: LightInspection) -> None:
 
 
 def _draw_image(axes: Axes, image: np.ndarray, title: str, n_lines: int = 0) -> None:
-    """Draws an image with a number of epipolar lines and a title, without axes."""
     axes.imshow(image)
     for row in np.linspace(0, image.shape[0], n_lines + 2)[1:-1]:
         axes.axhline(row, color="w", linewidth=0.5, alpha=0.6)

@@ -41,30 +41,21 @@ class Start(NamedTuple):
 
 
 class _FirstReadings(NamedTuple):
-    """Readings of the first frames, referred to the first frame by the visual motion since then."""
-
     rotations: list[Array]  #: world_from_camera (3, 3) of the first frame by each attitude
     verticals: list[Array]  #: direction (3,) of the vertical in camera axes at the first frame by each reading
     heights: list[tuple[float, Array]]  #: recorded heights, with the motion (3,) since the first frame in its axes
 
 
 class Aiding:
-    """Readings that a replay uses.
+    """Readings that a replay uses; `notes` are sentences on those not used, and on assumptions about their times.
 
     Heights need the direction of gravity, so they are used only with an attitude or a vertical. Velocities are
     interpolated to frames, so with fewer velocities than frames the errors of consecutive frames are correlated; their
     standard deviation is increased by the root of the number of frames per reading.
 
-    Args:
-        readings: recorded readings.
-        left_from_rectified: (4, 4) pose of the rectified left camera in the recorded one.
-        start_s: time of the first frame in the clock of the data set [s].
-        frame_rate_hz: nominal rate of the frames.
-
-    Attributes:
-        body_from_camera: (4, 4) pose of the rectified left camera in the body.
-        noise: noise of the readings, for the estimators; that of sensors that are not used is the default.
-        notes: sentences on readings that are not used, and on assumptions about their times.
+    `left_from_rectified` and `body_from_camera` are poses (4, 4) of the rectified left camera, in the recorded one and
+    in the body; `start_s` is the time of the first frame in the clock of the data set. `noise` is the noise of the
+    readings, the default for sensors that are not used.
     """
 
     def __init__(self, readings: RecordedReadings, left_from_rectified: Array, start_s: float, frame_rate_hz: float):
@@ -90,10 +81,9 @@ class Aiding:
         return list(self._series)
 
     def at(self, time_s: float) -> Readings:
-        """Returns the readings of the frame at a time [s] since the first frame.
+        """Returns the readings of a frame at a time [s] since the first one; None where a sensor has none near it.
 
-        Height and attitude are the readings nearest in time, the others are interpolated; None where a sensor is not
-        used or has no reading near this time.
+        Height and attitude are the readings nearest in time, the others are interpolated.
         """
         series, limit_s = self._series.get, self._limit_s
         height, attitude = (_nearest(series(name), time_s, limit_s) for name in ("pressure", "attitude"))
@@ -115,23 +105,18 @@ class Aiding:
     ) -> Start | None:
         """Returns the start that fits the first readings of gravity and height; None without attitude and vertical.
 
-        The motion over the first frames is estimated from the images alone. With it, each reading of the attitude gives
-        a rotation of the camera at the first frame, and the start has the mean of these rotations. Without an attitude,
-        each vertical gives its direction at the first frame; the start has their mean, and the heading over the plane
-        of the floor. Each recorded height gives an offset between the recorded heights and those of the world; `at`
-        adds the mean offset from now on.
+        The motion over the first frames is estimated from the images alone. With it, each attitude gives a rotation of
+        the camera at the first frame, and the start has their mean. Without an attitude, each vertical gives its
+        direction at the first frame; the start has their mean, and the heading over the plane of the floor. Each
+        recorded height gives an offset between the recorded heights and those of the world; `at` adds the mean offset
+        from now on.
 
         If none of the first frames has a height, heights are not used from now on. If none of them has an attitude or a
         vertical and `known` is None, none of these and no heights are used from now on, and the result is None. In both
         cases, a sentence on this is added to `notes`.
 
-        Args:
-            frames: the frames, from the first one on.
-            rig: calibration of the frames.
-            settings: settings of the estimators.
-            over_plane: (4, 4) pose of the left camera above the floor plane of the first stereo pair; a start from
-                readings has its height above this plane.
-            known: (4, 4) exact pose at the first frame, which becomes the start; None: it is found from the readings.
+        `over_plane` (4, 4) is the pose of the left camera above the floor plane of the first stereo pair, from which
+        the start has its height; `known` (4, 4) is an exact start.
         """
         gravity = next((name for name in ("attitude", "vertical") if name in self._series), None)
         if gravity is None:
@@ -157,15 +142,11 @@ class Aiding:
         return Start(pose, cov, _prior_cov(rotation, bool(found.heights), gravity == "attitude"))
 
     def _leave_out(self, name: str, note: str) -> None:
-        """Ends the use of the readings of a sensor, if there are any, and adds a note."""
         if self._series.pop(name, None) is not None:
             self.notes += (note,)
 
     def _first_rotation(self, found: _FirstReadings, over_plane: Array) -> Array | None:
-        """Returns the rotation (3, 3) of the first frame from its readings; None without any.
-
-        The heading of verticals is that of the rotation (3, 3) over the plane of the floor.
-        """
+        """Returns the rotation (3, 3) of the first frame; one by verticals has the heading of `over_plane`."""
         if found.rotations:
             return geometry.nearest_rigid(geometry.pose(np.mean(found.rotations, axis=0), np.zeros(3)))[:3, :3]
         if not found.verticals:
@@ -177,10 +158,6 @@ class Aiding:
         return geometry.so3_exp(axis * np.arctan2(sine, up[2])) @ over_plane
 
     def _start_cov(self, rotation: Array, n_attitudes: int) -> Array:
-        """Returns the covariance (3, 3) of the first rotation in camera axes [rad^2], from `n_attitudes` or verticals.
-
-        The heading is exact if it defines the world.
-        """
         if "attitude" not in self._series:
             return rotation.T @ np.diag([self.noise.up_rad**2, self.noise.up_rad**2, _EXACT_RAD2]) @ rotation
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
@@ -188,7 +165,6 @@ class Aiding:
         return np.diag(np.diag(camera_from_body @ variances @ camera_from_body.T)) / n_attitudes
 
     def _first_readings(self, motions: Iterable[tuple[Array, Readings]]) -> _FirstReadings:
-        """Returns what the readings of the first frames say on the first frame, by the motion since then."""
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
         found = _FirstReadings([], [], [])
         for moved, readings in motions:
@@ -204,10 +180,7 @@ class Aiding:
     def _first_motions(
         self, frames: Iterable[Frame], rig: StereoRig, settings: EstimatorSettings
     ) -> list[tuple[Array, Readings]]:
-        """Returns poses (4, 4) in the axes of the camera at the first frame, and the readings at these poses.
-
-        They are those of the first frame and of the frames, among the first `_START_FRAMES`, whose motion was measured.
-        """
+        """Returns the poses (4, 4) in the first camera, and readings, of first frames with measured motion."""
         found = []
         with Navigator(rig, replace(settings, use_ga=False, use_f2m=False), np.eye(4)) as navigator:
             for frame in islice(frames, _START_FRAMES):
@@ -219,10 +192,8 @@ class Aiding:
     def residuals(self, path: Trajectory) -> dict[str, float]:
         """Returns the RMS of (path - reading) / sigma at the frames of a path: "pressure", "attitude", "vertical".
 
-        About 1 is expected. A sensor without readings is left out; velocities are not compared.
-
-        Args:
-            path: poses of the rectified left camera in the world of the replay.
+        About 1 is expected. A sensor without readings is left out; velocities are not compared. The path has poses of
+        the rectified left camera in the world of the replay.
         """
         camera_from_body = geometry.inverse(self.body_from_camera)[:3, :3]
         parts = {name: list[Array]() for name in ("pressure", "attitude", "vertical")}
@@ -240,7 +211,6 @@ class Aiding:
 
 
 def _noise(series: Mapping[str, SensorSeries], frame_rate_hz: float) -> SensorNoise:
-    """Returns the noise of the readings; sensors that are not used have the default noise."""
     noise, sigmas = SensorNoise(), {name: one.sigmas for name, one in series.items()}
     if "pressure" in series:
         noise = replace(noise, pressure_m=float(sigmas["pressure"][0]))
@@ -265,7 +235,6 @@ def _prior_cov(rotation: Array, has_height: bool, has_heading: bool) -> Array:
 
 
 def _interval_s(series: SensorSeries) -> float:
-    """Returns the median interval between the readings [s]; 0 for a single reading."""
     return float(np.median(np.diff(series.times_s))) if len(series.times_s) > 1 else 0.0
 
 

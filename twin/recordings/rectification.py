@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,16 +32,14 @@ class Rectification(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Returns a phrase that states whether the images were recorded rectified or rectified by the replay."""
         return "rectified as recorded" if self.maps == (None, None) else "rectified by `twin replay`"
 
-    def left(self, image: Image) -> Image:
-        """Returns the rectified image for a recorded image of the left camera."""
-        return _resampled(image, self.maps[0])
-
-    def right(self, image: Image) -> Image:
-        """Returns the rectified image for a recorded image of the right camera."""
-        return _resampled(image, self.maps[1])
+    def rectified(self, image: Image, side: Literal["left", "right"]) -> Image:
+        """Returns a recorded image of a camera, resampled by cubic interpolation; black outside of it."""
+        maps = self.maps[0 if side == "left" else 1]
+        if maps is None:
+            return image
+        return np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_CUBIC), np.uint8)
 
 
 def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Rectification:
@@ -49,12 +47,8 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Recti
 
     For a pair that was recorded rectified (`is_rectified`), the camera matrix is that of its left camera. Otherwise,
     the rotations and the common camera matrix are those of `cv2.stereoRectify` (Bouguet's method, alpha = 0: all pixels
-    of a rectified image lie in the recorded image) or, for fisheye lenses, of `cv2.fisheye.stereoRectify` with
-    balance = 0.
-
-    Raises:
-        TwinError: the images have to be rectified, and the cameras have different lens models or views that do not
-            overlap.
+    of a rectified image lie in the recorded image) or, for fisheye lenses, of `cv2.fisheye.stereoRectify` with balance
+    = 0. Raises TwinError if the cameras have different lens models or views that do not overlap.
     """
     left, right = calibration.left, calibration.right
     assert left.size_px is not None
@@ -85,11 +79,10 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Recti
 
 
 def is_rectified(calibration: StereoCalibration) -> bool:
-    """Returns whether the recorded images are a rectified pair.
+    """Returns whether the recorded images are a rectified pair, but for a shift of the right image along its rows.
 
     Such a pair has no distortion, parallel axes, a baseline along the image rows, and equal focal lengths and rows of
-    the principal points. The columns of the principal points may differ, as in the Middlebury data sets; then
-    `rectification` shifts the right image.
+    the principal points. Their columns may differ, as in the Middlebury data sets.
     """
     left, right = calibration.left, calibration.right
     offset = calibration.right_from_left[:3, 3]
@@ -100,7 +93,6 @@ def is_rectified(calibration: StereoCalibration) -> bool:
 
 
 def _rig(matrix: Array, baseline_m: float, size_px: tuple[int, int], frame_rate_hz: float) -> StereoRig:
-    """Returns the calibration of a rectified pair, given the camera matrix (3, 3) of both cameras."""
     return StereoRig(
         width_px=size_px[0],
         height_px=size_px[1],
@@ -113,25 +105,14 @@ def _rig(matrix: Array, baseline_m: float, size_px: tuple[int, int], frame_rate_
 
 
 def _four(camera: RecordedCamera) -> Array:
-    """Returns the four distortion coefficients of a fisheye camera; zeros if it has none."""
     return camera.distortion if len(camera.distortion) == 4 else np.zeros(4)
 
 
 def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
-    """Returns the columns (H, W) and the rows (H, W) [px] in the recorded image of the pixels of the rectified image.
-
-    The turn is the rotation rectified_from_recorded (3, 3) between the axes of the camera.
-    """
+    """Returns columns and rows (H, W) [px] in the recorded image; `turn` is rectified_from_recorded (3, 3)."""
     size = rig.width_px, rig.height_px
     if camera.kind == "fisheye":
         maps = cv2.fisheye.initUndistortRectifyMap(camera.matrix, _four(camera), turn, rig.matrix, size, cv2.CV_32FC1)
     else:
         maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, rig.matrix, size, cv2.CV_32FC1)
     return np.asarray(maps[0], np.float32), np.asarray(maps[1], np.float32)
-
-
-def _resampled(image: Image, maps: _Maps | None) -> Image:
-    """Returns the image resampled by cubic interpolation at the columns and rows in `maps`, black outside the image."""
-    if maps is None:
-        return image
-    return np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_CUBIC), np.uint8)

@@ -24,11 +24,10 @@ from twin.estimate import Navigator
 from twin.estimate.self_check import check_survey
 from twin.estimate.stereo_vision import StereoVision
 from twin.judge.metrics import EvaluationInput
-from twin.judge.recorded import ALIGNMENTS, AlignmentName, RecordedTruth, associate, true_from_world
-from twin.judge.true_map import true_heights
+from twin.judge.recorded import ALIGNMENTS, AlignmentName, RecordedTruth, associate, true_from_world, true_heights
 from twin.plugin.guard import check_loadable
 from twin.plugin.loading import ESTIMATORS
-from twin.plugin.navigator import NOTE, PluginNavigator
+from twin.plugin.navigator import NOTE, Estimators, navigator_of
 from twin.plugin.protocols import EstimatorSetup
 from twin.recordings.opened_dataset import OpenedDataset, ReplayOptions, open_dataset
 from twin.recordings.recorded_aiding import Start
@@ -61,26 +60,16 @@ class ReplayResult(NamedTuple):
 def replay(
     folder: Path, out: Path, options: ReplayOptions | None = None, progress: Progress = lambda stage, share: None
 ) -> ReplayResult:
-    """Runs the estimators on a recorded data set and writes a run folder.
+    """Runs the estimators on a recorded data set and writes a run folder (`twin.replay`).
 
-    An interrupt (Ctrl-C) ends the current stage; the stages after it are completed.
-
-    Args:
-        folder: folder of the data set, or a ROS 2 bag.
-        out: run folder to write, new or empty.
-        options: options of the replay.
-        progress: called with the stage ("replay", "map" or "report") and its completed fraction.
-
-    Raises:
-        TwinError: the data set, one of its files or the estimator cannot be used (nothing was written), or the run
-            folder is not empty, is written by another process, or cannot be written.
+    An interrupt (Ctrl-C) ends the current stage; the stages after it are completed. `progress` is called with the stage
+    ("replay", "map" or "report") and its completed fraction.
     """
     with sole_writer(out), one_blas_thread():
         return _replay(folder, out, options or ReplayOptions(), progress)
 
 
 def _replay(folder: Path, out: Path, options: ReplayOptions, progress: Progress) -> ReplayResult:
-    """Replays a data set as `replay` does, into a folder that this process has locked."""
     check_loadable(ESTIMATOR_OPTION, ESTIMATORS, options.estimator)
     opened = open_dataset(folder, options)
     settings = replace(options.settings or EstimatorSettings(), window_tracks=_ALL_TRACKS, wide_search=True)
@@ -119,19 +108,14 @@ def _setup(opened: OpenedDataset, options: ReplayOptions, settings: EstimatorSet
 
 def _navigator(
     setup: EstimatorSetup, start: Start, estimator: str | None, settings: EstimatorSettings, vision: StereoVision
-) -> Navigator:
-    """Returns the estimators of `twin.estimate`, or those of a plug-in if `estimator` names one."""
-    rig, world_from_camera, noise = setup.rig, setup.start, setup.noise
-    if estimator is not None:
-        return PluginNavigator(estimator, setup, settings, vision, vision.stopwatch, ESTIMATOR_OPTION)
-    navigator = Navigator(rig, settings, world_from_camera, noise, vision, stopwatch=vision.stopwatch)
-    if start.cov is not None and start.prior_cov is not None:
+) -> Estimators:
+    navigator = navigator_of(estimator, setup, settings, vision, ESTIMATOR_OPTION)
+    if isinstance(navigator, Navigator) and start.cov is not None and start.prior_cov is not None:
         navigator.set_start_cov(start.cov, start.prior_cov)
     return navigator
 
 
-def _estimate(opened: OpenedDataset, navigator: Navigator, progress: Progress) -> None:
-    """Passes all frames, with their readings, to the estimators, and aligns the network after each segment."""
+def _estimate(opened: OpenedDataset, navigator: Estimators, progress: Progress) -> None:
     track, aligned, frames = 1, 0, opened.frames
     for k, frame in enumerate(frames):
         if opened.aiding is not None:
@@ -159,7 +143,6 @@ class _Replayed:
             return Maps(elevation, n_tiles=self.guard.attempt("tiles", lambda: _write_tiles(estimation, result)) or 0)
 
     def findings(self, result: SurveyResult, elevation: ElevationMap | None) -> list[Finding]:
-        """Returns a finding if many frames could not be used, and the failed checks of the estimates."""
         frames = self.opened.frames
         found, most = list[Finding](), _MOST_UNUSED * len(frames)
         if frames.unused > most:
@@ -170,7 +153,6 @@ class _Replayed:
         return found
 
     def evaluation(self, result: SurveyResult, maps: Maps) -> EvaluationInput:
-        """Returns the input of the evaluation."""
         frames, times_s = self.opened.frames, result.online.times_s
         source = _source(self.opened) | {"skipped": dict(frames.skipped), "frames_in_dataset": len(frames)}
         return EvaluationInput(
@@ -185,7 +167,6 @@ class _Replayed:
         )
 
     def _truth(self, result: SurveyResult, elevation: ElevationMap | None) -> RecordedTruth:
-        """Returns the true poses, and the true heights at the cells of the map, moved to it by the alignment."""
         path, true_map, alignment = self.opened.truth, self.opened.true_map, self.options.alignment
         if path is None or true_map is None or elevation is None:
             return RecordedTruth(path, alignment)
@@ -193,7 +174,6 @@ class _Replayed:
         return RecordedTruth(path, alignment, true_heights(elevation, true_map, moved))
 
     def _notes(self, result: SurveyResult) -> list[str]:
-        """Returns the notes of the reader and the readings, and on a plug-in and readings that do not fit."""
         aiding, estimator = self.opened.aiding, self.options.estimator
         notes = [*self.opened.dataset.notes, *result.quality.repeat_notes]
         if estimator is not None:
@@ -220,10 +200,7 @@ class _Replayed:
 
 
 def _write_tiles(estimation: Estimation, result: SurveyResult) -> int:
-    """Writes the tiles of a map whose cells were enlarged, in the folder `tiles`, and returns their number.
-
-    An error of a file ends the writing; the guard records it. The tiles that are finished by then remain.
-    """
+    """Writes the tiles of a map of enlarged cells until an error, which the guard records; returns their number."""
     folder = estimation.folder.tiled_map()
     try:
         for tile, elevation in estimation.navigator.build_tiles(result):
@@ -237,7 +214,6 @@ def _write_tiles(estimation: Estimation, result: SurveyResult) -> int:
 
 
 def _source(opened: OpenedDataset) -> dict[str, Any]:
-    """Returns texts on the replay for metrics.json and scenario.resolved.toml, by key."""
     return {
         "dataset": opened.name,
         "reader": opened.reader,
@@ -248,17 +224,14 @@ def _source(opened: OpenedDataset) -> dict[str, Any]:
 
 
 def alignment_name(name: str) -> AlignmentName:
-    """Returns the alignment of a name; raises TwinError if there is none."""
     return _one_of(ALIGNMENTS, name, "--align", "an alignment")
 
 
 def bayer_pattern(name: str | None) -> Bayer | None:
-    """Returns the Bayer pattern of a name, None if `name` is None; raises TwinError if there is none."""
     return None if name is None else _one_of(BAYER, name, "--bayer", "a Bayer pattern")
 
 
 def _one_of(allowed: Sequence[T], name: str, option: str, what: str) -> T:
-    """Returns the allowed value that equals `name`."""
     for value in allowed:
         if value == name:
             return value
@@ -266,11 +239,7 @@ def _one_of(allowed: Sequence[T], name: str, option: str, what: str) -> T:
 
 
 def image_topics(text: str | None) -> tuple[str, str] | None:
-    """Returns the topics of the left and the right images from the text `LEFT,RIGHT`; None if `text` is None.
-
-    Raises:
-        TwinError: the text is not two different topics.
-    """
+    """Returns the topics (left, right) in `LEFT,RIGHT`, None for None; raises TwinError unless they are two topics."""
     if text is None:
         return None
     topics = [part.strip() for part in text.split(",")]

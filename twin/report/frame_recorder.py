@@ -36,9 +36,9 @@ class FrameRecorder:
     """Writes frames to the folder `frames` of a run while the survey is flown. Use as a context manager.
 
     `frames.csv` has index, time, exposure and sensor readings (without beacons and IMU) of every frame, and whether it
-    has a stereo pair. `imu.csv` has the readings of the IMU in body axes, if there is one. `truth.npz` has the true
-    poses and velocities in double precision. With `record` = "all", `left` and `right` have the images as PNG files,
-    with "keyframes" they are those that the estimators store in `keyframes`; with "none", nothing is written.
+    has a stereo pair; `imu.csv` the readings of the IMU in body axes; `truth.npz` true poses and velocities in double
+    precision. With `record` = "all", `left` and `right` have the images as PNG files; with "keyframes" they are those
+    in `keyframes`; with "none", nothing is written.
 
     Raises:
         OSError: the folder cannot be written, or on exit one of the last images could not be written.
@@ -63,7 +63,6 @@ class FrameRecorder:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Waits until all images are written, and writes truth.npz."""
         self._writer.shutdown()
         if self._lines is not None:
             self._lines.close()
@@ -78,9 +77,8 @@ class FrameRecorder:
     def add(self, frame: Frame, world_from_camera: Array, twist_body: Array) -> None:
         """Adds a frame; raises OSError if an earlier image could not be written, for example on a full disk.
 
-        Args:
-            world_from_camera: (4, 4) true pose of the left camera.
-            twist_body: (6,) true [angular, linear] velocity of the body in its own axes [rad/s, m/s].
+        The true pose (4, 4) is that of the left camera, `twist_body` (6,) the true [angular, linear] velocity in body
+        axes [rad/s, m/s].
         """
         if self._lines is None:
             return
@@ -97,7 +95,6 @@ class FrameRecorder:
             self._waiting.append(self._writer.submit(self._write, frame.index, frame.left, frame.right))
 
     def _add_imu(self, readings: ImuReadings) -> None:
-        """Writes readings of the IMU to imu.csv, which the first call creates."""
         if self._imu_lines is None:
             self._imu_lines = (self._folder / "imu.csv").open("w", newline="", encoding="utf-8")
             csv.writer(self._imu_lines).writerow(IMU_COLUMNS)
@@ -105,7 +102,6 @@ class FrameRecorder:
         csv.writer(self._imu_lines).writerows([repr(value) for value in row] for row in table.tolist())
 
     def _write(self, index: int, left: Image, right: Image | None) -> None:
-        """Writes the images of a frame."""
         for side, image in (("left", left), ("right", right)):
             if image is not None:
                 data = cv2.imencode(".png", image[..., ::-1], _PNG)[1]

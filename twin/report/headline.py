@@ -6,14 +6,19 @@ from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 from twin.judge.map_error import INFINITE_WITH_HOLES
-from twin.judge.require import more_is_better
-from twin.judge.warnings import nees_bounds
+from twin.judge.verdict import more_is_better, nees_bounds
 from twin.report.html import render_text
-from twin.report.wording import DASH, REPLAY_ALIGNMENTS, length, percent, with_unit
+from twin.report.number_formats import DASH, length, percent, with_unit
 from twin.scenario.water_sources import WATER_SOURCES
 
 #: Level of a badge: green, amber or red. The name is also the badge's CSS class in page.css.
 Level = Literal["good", "warn", "bad"]
+#: How the estimates of a replay were moved to the recorded truth, by the name of the alignment.
+REPLAY_ALIGNMENTS = {
+    "se3": "aligned with the truth by the best rigid motion (SE(3))",
+    "first": "anchored at the first true pose",
+    "none": "without alignment",
+}
 _STATUSES = {"aborted": "The survey was aborted", "degraded": "The survey is degraded"}
 
 
@@ -25,10 +30,7 @@ class Badge(NamedTuple):
 
 
 def badge(metrics: Mapping[str, Any] | None) -> Badge:
-    """Returns the verdict on a survey from its metrics.json; None stands for an unfinished survey.
-
-    Red: unfinished, not complete, or a requirement is missed; otherwise amber with warnings, and green without.
-    """
+    """Returns red if unfinished (None), incomplete or missing a requirement, amber with warnings, otherwise green."""
     if not metrics:
         return Badge("unfinished", "bad")
     missed = ["requirement missed"] if _missed(metrics) else []
@@ -44,7 +46,6 @@ def first_lines(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _status(metrics: Mapping[str, Any]) -> list[str]:
-    """Returns a list with one sentence on the status of the survey and its reason; [] if complete without a reason."""
     status, reason = metrics["status"], metrics["reason"]
     if status == "complete":
         return [f"{reason[:1].upper()}{reason[1:]}."] if reason else []
@@ -52,7 +53,6 @@ def _status(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _missed(metrics: Mapping[str, Any]) -> list[str]:
-    """Returns a sentence for each requirement that was missed."""
     return [
         f"Requirement missed: {name} is {_value(name, row['value'], metrics)}, "
         f"{'at least' if more_is_better(name) else 'at most'} {with_unit(name, row['limit'])} is required."
@@ -82,11 +82,8 @@ class KeyFigure(NamedTuple):
 def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> str:
     """Returns the summary of a survey or replay: status, conditions, final position error and map quality.
 
-    The limitations of these results are not included; `first_lines` returns them.
-
-    Args:
-        metrics: contents of metrics.json; None for an unfinished survey.
-        scenario: contents of the scenario file.
+    `metrics` are the contents of metrics.json (None: unfinished), `scenario` those of the scenario file. `first_lines`
+    returns the limitations of these results.
     """
     if metrics is None and "replay" in scenario:
         return "This replay is unfinished: it has no metrics.json."
@@ -105,10 +102,7 @@ def results(metrics: Mapping[str, Any]) -> str:
 
 
 def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
-    """Returns the key figures of a survey; an empty list if `metrics` is empty.
-
-    A replay has only the figures that have a value: recorded images have no plan, and often no truth.
-    """
+    """Returns the key figures of a survey; of a replay only those that have a value."""
     if not metrics:
         return []
     text = render_text("key_figures.txt.j2", {**metrics, "nees_bounds": nees_bounds(metrics["consistency"])})

@@ -9,26 +9,28 @@ from typing import Any
 
 import jinja2
 
-from twin.report import wording
+from twin.report.number_formats import (
+    angle,
+    area_le90,
+    length,
+    milliradians,
+    milliseconds,
+    percent,
+    plain,
+    ratio,
+    with_unit,
+)
 
 _SHARED_TEMPLATES = "twin.report"
 #: Number formats by the names that they have in templates.
 _FILTERS = {
-    "length": wording.length, "percent": wording.percent, "plain": wording.plain, "ms": wording.milliseconds,
-    "angle": wording.angle, "milliradians": wording.milliradians, "ratio": wording.ratio,
-    "area_le90": wording.area_le90,
+    "length": length, "percent": percent, "plain": plain, "ms": milliseconds, "angle": angle,
+    "milliradians": milliradians, "ratio": ratio, "area_le90": area_le90,
 }  # fmt: skip
 
 
 def render_page(package: str, template: str, context: Mapping[str, Any]) -> str:
-    """Returns a template rendered as self-contained HTML.
-
-    Args:
-        package: package that contains the template and the files that it includes; files that are not in this package
-            are taken from `twin.report`.
-        template: file name of the template.
-        context: variables of the template.
-    """
+    """Returns a template as self-contained HTML; files that are not in `package` are taken from `twin.report`."""
     return _for_narrow_screens(_rendered(package, template, context, autoescape=True))
 
 
@@ -38,7 +40,6 @@ def render_text(template: str, context: Mapping[str, Any]) -> str:
 
 
 def _rendered(package: str, template: str, context: Mapping[str, Any], **options: Any) -> str:
-    """Returns a template rendered with the number formats of `wording` as filters."""
     environment = jinja2.Environment(
         **options,
         trim_blocks=True,
@@ -46,7 +47,7 @@ def _rendered(package: str, template: str, context: Mapping[str, Any], **options
         loader=jinja2.FunctionLoader(lambda name: _source(package, name) or _source(_SHARED_TEMPLATES, name)),
     )
     environment.filters |= {name: _of_defined(number) for name, number in _FILTERS.items()}
-    environment.filters["with_unit"] = wording.with_unit
+    environment.filters["with_unit"] = with_unit
     return environment.get_template(template).render(**context)
 
 
@@ -74,6 +75,5 @@ def _with_column_names(table: re.Match[str]) -> str:
 
 
 def _source(package: str, name: str) -> str | None:
-    """Returns the text of a file in a package; None if there is no such file."""
     file = files(package).joinpath(name)
     return file.read_text(encoding="utf-8") if file.is_file() else None

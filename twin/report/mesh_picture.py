@@ -39,8 +39,8 @@ def surface_picture(mesh_file: Path, map_from_world: Array | None = None) -> Ima
 
     Args:
         mesh_file: the mesh in the world (`twin.exchange.mesh.map_mesh`).
-        map_from_world: (4, 4) pose of the world in the frame of the map, whose axes are east, north and up of the
-            picture; None: the identity.
+        map_from_world: (4, 4) pose of the world in the map, whose axes are east, north and up of the picture; None: the
+            identity.
     """
     if not mesh_file.is_file():
         return None
@@ -92,10 +92,9 @@ def shaded_colours(colours: Image, normals: Array) -> Image:
 def camera_pose(vertices: Array) -> Array:
     """Returns the pose (4, 4) of an OpenGL camera (viewing along -z) that has all vertices except outliers in view.
 
-    The viewing direction is fixed (`DEPRESSION_DEG`, `EAST_DEG`), and outliers are clipped (`FRAMED_PERCENT`). Let the
-    camera be at distance d from the centre of the vertices, and q a vertex relative to this centre in camera axes. The
-    vertex is in view if |q_x| <= t (d - q_z), where t is the tangent of half the horizontal field of view, and if q_y
-    satisfies the same condition for the vertical field of view. The distance is the smallest such d times `MARGIN`.
+    At the distance d from the centre of the vertices, a vertex at q relative to this centre, in camera axes, is in view
+    if |q_x| <= t (d - q_z), with t the tangent of half the horizontal field of view, and accordingly for q_y. The
+    distance is the smallest such d times `MARGIN`.
     """
     low, high = np.percentile(vertices, FRAMED_PERCENT, axis=0)
     framed = np.clip(vertices, low, high)
@@ -110,12 +109,10 @@ def camera_pose(vertices: Array) -> Array:
 
 
 def _axis_rotation(axis: int, angle_deg: float) -> Array:
-    """Returns the rotation matrix (3, 3) about a coordinate axis (0 to 2)."""
     return np.asarray(cv2.Rodrigues(np.deg2rad(angle_deg) * np.eye(3)[axis])[0])
 
 
 def _main(mesh_file: str, picture_file: str, map_from_world: str) -> None:
-    """Renders a GLB file to an image file; `map_from_world` is a (4, 4) matrix as JSON (`surface_picture`)."""
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")  # must be set before pyrender is imported
     import trimesh
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.records import Array, Estimate, Frame, Image, StereoRig
 from twin.report import recording_surfaces
 from twin.report.headline import badge, first_lines, headline, key_figures
 from twin.report.images import jpeg_bytes, read_rgb
-from twin.report.recording_data import N_SNAPSHOTS, FrameTimes, snapshots, stage_durations, stride, subsampled_rows
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.style import ESTIMATES, LABELS, rgb
@@ -24,6 +25,8 @@ from twin.scenario import file as scenario_file
 
 #: Largest number of keyframes whose images are logged; longest side of these images and of the orthomosaic [px].
 N_IMAGED, IMAGE_SIDE_PX, MOSAIC_PX = 500, 320, 1600
+#: Largest number of snapshots of growing entities (paths, network, map), and of samples of a time series.
+N_SNAPSHOTS, N_SAMPLES = 24, 5000
 
 #: Command of the Rerun viewer; --bind makes it accept connections from this machine only.
 VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
@@ -31,15 +34,15 @@ VIEWER = (sys.executable, "-m", "rerun", "--bind", "127.0.0.1")
 TRUTH_ALPHA, TRUTH_BELOW_M = 110, 0.03
 
 
+class FrameTimes(NamedTuple):
+    """Frame numbers (n,) and their times (n,) [s]."""
+
+    frames: NDArray[np.int64]
+    times_s: Array
+
+
 def write_recording(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
-    """Writes run.rrd into a run folder and returns its path.
-
-    Args:
-        metrics: contents of metrics.json, given while that file does not exist yet.
-
-    Raises:
-        TwinError: `folder` is not a run folder, or one of its files is damaged.
-    """
+    """Writes run.rrd into a run folder and returns its path; arguments and errors are those of `load_run`."""
     run = load_run(folder, metrics)
     file = run.folder / "run.rrd"
     rig = replayed_rig(run.scenario)
@@ -157,7 +160,7 @@ def log_map(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
 
 
 def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None:
-    """Logs the rig and its images along the true path, or along the online estimate if there is no true path."""
+    """Logs the rig and its images along the true path, or along the online estimate if there is none."""
     name = "truth" if "truth" in run.trajectories else "online"
     if name not in run.trajectories or not len(run.trajectories[name]):
         return
@@ -175,7 +178,6 @@ def log_cameras(recording: rr.RecordingStream, run: Run, rig: StereoRig) -> None
 
 
 def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: FrameTimes) -> None:
-    """Logs the images of the left or right camera (`side`) at the given frames; missing images are skipped."""
     images = [read_rgb(run.image_file(int(f), side)) for f in times.frames]
     exists = np.array([image is not None for image in images], dtype=bool)
     if exists.any():
@@ -186,7 +188,7 @@ def _send_images(recording: rr.RecordingStream, run: Run, side: str, times: Fram
 
 
 def log_rig(recording: rr.RecordingStream, rig: StereoRig) -> None:
-    """Logs the two cameras in the axes of the left one; the calibration is scaled to the size of the logged images."""
+    """Logs the two cameras in the axes of the left one; the calibration is scaled to the logged images."""
     scale = min(1.0, IMAGE_SIDE_PX / max(rig.width_px, rig.height_px))
     camera = rr.Pinhole(
         image_from_camera=np.diag([scale, scale, 1.0]) @ rig.matrix,
@@ -211,7 +213,6 @@ def log_curves(recording: rr.RecordingStream, run: Run) -> None:
 
 
 def _log_errors(recording: rr.RecordingStream, run: Run, name: str) -> None:
-    """Logs position, height and heading error of one estimate."""
     errors, truth = run.errors(name), run.trajectories["truth"]
     rows = subsampled_rows(len(errors.travelled_m))
     times = FrameTimes(rows, truth.times_s[rows])
@@ -264,12 +265,10 @@ def colour(role: str) -> tuple[int, int, int]:
 
 
 def line(positions: Array, role: str) -> rr.LineStrips3D:
-    """Returns positions (n, 3) as one polyline in the colour of `role`."""
     return rr.LineStrips3D([positions.astype(np.float32)], colors=[colour(role)], radii=rr.Radius.ui_points(1.5))
 
 
 def segments(pairs: Array, role: str) -> rr.LineStrips3D:
-    """Returns pairs of points (n, 2, 3) as separate line segments in the colour of `role`."""
     return rr.LineStrips3D(pairs.astype(np.float32), colors=[colour(role)], radii=rr.Radius.ui_points(0.6))
 
 
@@ -283,16 +282,53 @@ def surface_mesh(surface: recording_surfaces.Surface, alpha: int = 255) -> rr.Me
 
 
 def jpeg(image: Image, longest_px: int) -> rr.EncodedImage:
-    """Returns an RGB image as a Rerun JPEG image, downscaled to a longer side of `longest_px` if it is larger."""
     return rr.EncodedImage(contents=jpeg_bytes(image, longest_px), media_type="image/jpeg")
 
 
 def time_columns(times: FrameTimes) -> list[rr.TimeColumn]:
-    """Returns the frame numbers and times as the two timelines of the recording."""
     return [rr.TimeColumn("frame", sequence=times.frames), rr.TimeColumn("sim_time", duration=times.times_s)]
 
 
 def _set_time(recording: rr.RecordingStream, frame: int, time_s: float) -> None:
-    """Sets the current time of both timelines."""
     recording.set_time("frame", sequence=int(frame))
     recording.set_time("sim_time", duration=float(time_s))
+
+
+def snapshots(run: Run) -> Iterator[tuple[int, tuple[int, float]]]:
+    """Yields the last keyframe of each snapshot: (keyframe number, (frame number, time [s]))."""
+    path, frames = run.trajectories.get("online"), run.keyframes.frames
+    if path is None or not len(frames):
+        return
+    for k in np.unique(np.linspace(0, len(frames) - 1, min(N_SNAPSHOTS, len(frames))).astype(int)):
+        yield int(k), (int(frames[k]), float(path.times_s[frames[k]]))
+
+
+def stage_durations(run: Run) -> dict[str, tuple[FrameTimes, Array]]:
+    """Returns, by stage, the frames of at most `N_SAMPLES` calls and their durations [ms]; "ga" is the alignment."""
+    path = run.trajectories.get("online")
+    if path is None:
+        return {}
+    keyframes = run.keyframes.frames
+    frames_by_count = {len(keyframes): keyframes, len(path): np.arange(len(path))}
+    timing_ms = run.keyframes.timing_ms
+    durations = {s: (frames_by_count[len(v)], v) for s, v in timing_ms.items() if len(v) in frames_by_count}
+    durations |= _alignment_durations(run)
+    thin = {s: (f[:: stride(len(f))], v[:: stride(len(f))]) for s, (f, v) in durations.items()}
+    return {stage: (FrameTimes(frames, path.times_s[frames]), values) for stage, (frames, values) in thin.items()}
+
+
+def _alignment_durations(run: Run) -> dict[str, tuple[NDArray[np.int64], Array]]:
+    """Returns {"ga": (frames, durations [ms])} of the global alignments, each at the last keyframe of its track."""
+    keys, tracks = run.keyframes, (run.metrics or {}).get("tracks") or []
+    timed = [(keys.frames[keys.tracks <= row["track"]], row["ga_ms"]) for row in tracks if row["ga_ms"] is not None]
+    rows = [(frames[-1], ms) for frames, ms in timed if len(frames)]
+    return {"ga": (np.array([f for f, _ in rows]), np.array([ms for _, ms in rows], dtype=float))} if rows else {}
+
+
+def stride(n: int, limit: int = N_SAMPLES) -> int:
+    """Returns the smallest stride with which at most `limit` of n items are kept."""
+    return max(1, -(-n // limit))
+
+
+def subsampled_rows(n: int) -> NDArray[np.int64]:
+    return np.arange(0, n, stride(n))

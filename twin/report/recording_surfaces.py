@@ -30,7 +30,6 @@ class Surface(NamedTuple):
 
 
 def floor_surface(raster: Raster) -> Surface:
-    """Returns the true floor as a surface in grey; higher points are lighter."""
     low, high = np.nanpercentile(raster.values, [1, 99]) if np.isfinite(raster.values).any() else (0.0, 1.0)
     shade = np.clip((raster.values - low) / max(high - low, 1e-6), 0, 1)
     grey = np.nan_to_num(110 + 90 * shade).astype(np.uint8)
@@ -47,7 +46,6 @@ def map_surface(dem: Raster, mosaic: Raster | None) -> Surface:
 
 
 def in_world(surface: Surface, map_from_world: Array) -> Surface:
-    """Returns a surface of the map frame in the axes of the world."""
     points = geometry.transform(geometry.inverse(map_from_world), surface.points)
     return surface._replace(points=points, normals=surface.normals @ map_from_world[:3, :3])
 
@@ -55,7 +53,7 @@ def in_world(surface: Surface, map_from_world: Array) -> Surface:
 def _covers_same_area(cells: MapGrid, pixels: MapGrid) -> bool:
     """Returns whether two grids have the same north-west corner and the same size but for a cell and a pixel.
 
-    A reduced orthomosaic (`geotiff.read_mosaic`) lacks rows and columns that do not fill a reduced pixel.
+    A reduced orthomosaic lacks rows and columns that do not fill a reduced pixel.
     """
     corner = np.array([pixels.west_m - cells.west_m, pixels.north_m - cells.north_m])
     size = np.array([pixels.cols, pixels.rows]) * pixels.cell_m - np.array([cells.cols, cells.rows]) * cells.cell_m
@@ -87,12 +85,7 @@ def _surface(raster: Raster, colours: Image) -> Surface:
 
 
 def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the number (n,) of the first camera group that views each point; `NOT_OBSERVED` if no group does.
-
-    Args:
-        points: (n, 3) in the world [m].
-        groups: poses world_from_camera (n_k, 4, 4) of the left camera in each group.
-    """
+    """Returns the first group of poses (n_k, 4, 4) that views each world point (n, 3); `NOT_OBSERVED` if none does."""
     group = np.full(len(points), NOT_OBSERVED)
     remaining = np.flatnonzero(np.isfinite(points).all(axis=1))
     for number, poses in enumerate(groups):
@@ -104,17 +97,13 @@ def first_observed(points: Array, groups: Sequence[Array], rig: StereoRig) -> ND
 
 
 def _in_image(points: Array, world_from_camera: Array, rig: StereoRig) -> NDArray[np.bool_]:
-    """Returns whether each of the points (n, 3) projects into the image of a camera with square pixels, centred."""
     x, y, z = geometry.transform(geometry.inverse(world_from_camera), points).T
     tangent_x, tangent_y = rig.width_px / 2 / rig.focal_px, rig.height_px / 2 / rig.focal_px
     return (z > 0) & (np.abs(x) <= tangent_x * z) & (np.abs(y) <= tangent_y * z)
 
 
 def submesh(surface: Surface, group: NDArray[np.int64], number: int) -> Surface:
-    """Returns the triangles that are completely observed once a camera group has been added, and their vertices.
-
-    `group` (n,) are the groups of the vertices (`first_observed`); the largest one of such a triangle is `number`.
-    """
+    """Returns the triangles that camera group `number` completes, and their vertices."""
     triangles = surface.triangles[group[surface.triangles].max(axis=1, initial=-1) == number]
     used, renumbered = np.unique(triangles, return_inverse=True)
     parts = surface.points[used], surface.normals[used], surface.colours[used]

@@ -17,8 +17,6 @@ _RIG_KEYS = ("image_width_px", "image_height_px", "focal_px", "baseline_m", "fra
 
 
 class RunDescription(NamedTuple):
-    """Description of a run without a scenario, such as a replay."""
-
     name: str  # name of the run
     seed: int | None  # seed of its random numbers; None if it has none
     text: str  # contents of scenario.resolved.toml
@@ -31,7 +29,7 @@ def describe_replay(
     settings: EstimatorSettings,
     estimator: str | None = None,
 ) -> RunDescription:
-    """Returns the description of a replayed run: texts and numbers on its `source`, rectified rig, and estimators."""
+    """Returns the description of a replayed run: `source` (texts and numbers), rectified rig, and estimators."""
     tree = {
         "name": name,
         "replay": dict(source),
@@ -51,14 +49,7 @@ def describe_replay(
 
 
 def replayed_rig(scenario: Mapping[str, Any]) -> StereoRig | None:
-    """Returns the rectified rig of a replayed run; None for a run of a scenario.
-
-    Args:
-        scenario: contents of scenario.resolved.toml.
-
-    Raises:
-        TwinError: a value is missing or not a number.
-    """
+    """Returns the rig in scenario.resolved.toml; None for a run of a scenario; raises TwinError for a wrong value."""
     if "replay" not in scenario:
         return None
     try:

@@ -29,11 +29,7 @@ _INDEX = {
 
 
 def checked_metrics(metrics: Any) -> dict[str, Any]:
-    """Returns the contents of metrics.json, validated, with None for each missing number and [] for each missing list.
-
-    Raises:
-        ValueError: a value has another type than `twin` writes, or a necessary one is missing; names the key.
-    """
+    """Returns valid metrics, None and [] for missing numbers and lists; raises ValueError, which names the key."""
     template = empty_metrics()
     texts = dict.fromkeys(("name", "status"), "")
     optional = dict.fromkeys(("version", "scenario_hash", "reason", "warning", "schema"), _OptionalText)
@@ -45,7 +41,6 @@ def checked_metrics(metrics: Any) -> dict[str, Any]:
 
 
 def checked_index(index: Any) -> dict[str, Any]:
-    """Returns the contents of keyframes/index.json, validated; raises ValueError like `checked_metrics`."""
     index = conform(index, _INDEX)
     for key in ("frames", "tracks"):
         if not all(isinstance(number, int) and number >= 0 for number in index.get(key, [])):
@@ -58,12 +53,10 @@ def checked_index(index: Any) -> dict[str, Any]:
 
 
 def checked_environment(environment: Any) -> dict[str, Any]:
-    """Returns the contents of env.json; raises ValueError if they are not a JSON object."""
     return conform(environment, {})
 
 
 def checked_scenario(scenario: Any) -> dict[str, Any]:
-    """Returns the contents of the scenario file, validated; raises ValueError like `checked_metrics`."""
     template = Scenario().model_dump(mode="json", exclude_none=True)  # a key without a default may have any value
     return conform(scenario, template | {"lamps": [], "beacons": []})
 
@@ -75,18 +68,17 @@ class _OptionalText:
 def conform(given: Any, template: Any, key: str = "", complete: bool = False) -> Any:
     """Checks that a value has the structure of a template, and returns it.
 
-    A template has one of these forms:
-        a table: the value is a table, and the value of each of its keys has the structure given for that key or, if
-            there is none, for the key "*"; without the key "*", other keys are accepted unchecked.
-        a list: the value is a list whose items have the structure of the template's only item, if it has one.
+    A template is one of:
+        a table: a value for each of its keys, or for any other key under "*"; without "*", others are unchecked.
+        a list: the template of all items is its only item, if it has one.
         a string, a Boolean or a finite number: the value is of this type.
-        `_OptionalText`: the value is a string or None.
-        None: the value is a finite number or None; NaN: a number, NaN or None.
+        `_OptionalText`: a string or None.
+        None: a finite number or None; NaN: a number, NaN or None.
 
     Args:
         key: dotted key of the value, for the message.
-        complete: whether to add missing keys to tables (not to those in lists), with None for numbers, Booleans and
-            optional strings, and [] for lists; another missing string is an error.
+        complete: whether to add missing keys to tables (not to those in lists): None for numbers, Booleans and optional
+            strings, [] for lists; another missing string is an error.
 
     Raises:
         ValueError: the value does not have this structure, or an item of a list lacks a key; the message names the key.
@@ -109,7 +101,7 @@ def conform(given: Any, template: Any, key: str = "", complete: bool = False) ->
 
 
 def _item(given: Any, template: Any, key: str) -> Any:
-    """Returns an item of a list after checking it like `conform`; a table must have all keys of its template."""
+    """Returns an item of a list, checked like `conform`; a table must have all keys of its template."""
     if isinstance(template, dict) and isinstance(given, dict):
         for name in template.keys() - given.keys():
             _require(False, f"{key}.{name}", None, "a value: it is missing")
@@ -124,7 +116,6 @@ def _nothing(template: Any) -> Any:
 
 
 def _join(key: str, name: str) -> str:
-    """Returns the dotted key of an item of a table."""
     return f"{key}.{name}" if key else name
 
 
@@ -146,7 +137,6 @@ def _scalar_rule(template: Any, given: Any) -> tuple[str, bool]:
 
 
 def _require(fits: bool, key: str, given: Any, allowed: str) -> None:
-    """Raises ValueError, naming the key and the allowed values, if a value does not fit its template."""
     if not fits:
         shown = "a table" if isinstance(given, Mapping) else repr(given)[:80]
         raise ValueError(f"{key or 'contents'}: {shown} (allowed: {allowed})")

@@ -31,8 +31,6 @@ RASTERS = ("dem", "dem_sigma", "dem_truth", "dem_error")
 
 
 class Network(NamedTuple):
-    """The keyframe network."""
-
     positions: Array  # (n, 3) of the nodes in the world [m]
     edges: NDArray[np.int64]  # (m, 2) indices into `positions` of the two nodes of each link
 
@@ -65,7 +63,6 @@ class Run:
 
     @property
     def finished(self) -> bool:
-        """Returns whether the survey has finished, i.e. has metrics."""
         return self.metrics is not None
 
     @property
@@ -75,33 +72,19 @@ class Run:
         return next((allowed for allowed in ALIGNMENTS if allowed == name), None)
 
     def errors(self, name: str) -> PathErrors:
-        """Returns the errors of the estimate "f2f", "online" or "final" at the frames that have a true pose.
-
-        The estimate of a replay is aligned with the truth by the method that its metrics state; any other estimate is
-        anchored at the first true pose.
-        """
+        """Returns the errors of "f2f", "online" or "final", aligned as the metrics say, or at the first true pose."""
         estimate, truth, alignment = self.trajectories[name], self.trajectories["truth"], self.alignment
         return path_errors(estimate, truth) if alignment is None else recorded_errors(estimate, truth, alignment)
 
     def image_file(self, frame: int, side: str) -> Path:
-        """Returns the path of an image of a keyframe; `side` is "left" or "right"."""
         return self.folder / "keyframes" / f"{frame:06d}_{side}.png"
 
     def frames_with_image(self) -> list[int]:
-        """Returns the frame numbers of the keyframes whose left image exists."""
         return [int(f) for f in self.keyframes.frames if self.image_file(int(f), "left").is_file()]
 
 
 def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
-    """Reads a run folder.
-
-    Args:
-        folder: the run folder.
-        metrics: contents of metrics.json, given while that file does not exist yet; None: read from the file.
-
-    Raises:
-        TwinError: `folder` is not a run folder, or one of its files is damaged.
-    """
+    """Reads a run folder; `metrics` stand for a metrics.json that does not exist yet; raises TwinError if not valid."""
     folder = Path(folder)
     if problem := path_problem(folder):
         raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder of a run")
@@ -121,7 +104,6 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
 
 
 def _network(text: str) -> Network:
-    """Returns the network in the text of a g2o pose graph; raises KeyError or ValueError if it is damaged."""
     lines = [line.split() for line in text.splitlines()]
     nodes = [line for line in lines if line and line[0] == "VERTEX_SE3:QUAT"]
     pairs = [line[1:3] for line in lines if line and line[0] == "EDGE_SE3:QUAT"]
@@ -131,7 +113,6 @@ def _network(text: str) -> Network:
 
 
 def _read_keyframes(file: Path) -> Keyframes:
-    """Reads keyframes/index.json; if it is missing, there are no keyframes, and `map_from_world` is the identity."""
     index = _read_json(file, checked_index) or {}
     frames, tracks = (np.array(index.get(key, []), dtype=np.int64) for key in ("frames", "tracks"))
     timing_ms = {stage: np.array(values, dtype=float) for stage, values in index.get("timing_ms", {}).items()}
@@ -142,16 +123,14 @@ def _read_keyframes(file: Path) -> Keyframes:
 
 
 def _read_json(file: Path, checked: Callable[[Any], dict[str, Any]]) -> dict[str, Any] | None:
-    """Returns the contents of a JSON file, passed through `checked`; None if the file does not exist."""
     return _read(file, lambda f: checked(read_json(f))) if file.is_file() else None
 
 
 def _read_existing(files: dict[str, Path], reader: Any) -> dict[str, Any]:
-    """Returns `reader(file)` for each file that exists and is not empty, by the key of the file."""
+    """Returns `reader(file)` for each file that exists and is not empty."""
     return {key: _read(file, reader) for key, file in files.items() if file.is_file() and file.stat().st_size > 0}
 
 
 def _read(file: Path, reader: Any) -> Any:
-    """Returns `reader(file)`; raises TwinError if the file cannot be read."""
     with reading(file, "", "an undamaged file, written by `twin run`"):
         return reader(file)

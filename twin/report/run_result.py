@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from twin.core.optional_packages import optional
 from twin.core.records import Trajectory
 from twin.errors import TwinError
-from twin.judge.require import numbers_of
+from twin.judge.verdict import numbers_of
 
 if TYPE_CHECKING:
     import pandas
@@ -30,13 +30,7 @@ _KEY_FIGURES = (
 
 @dataclass(frozen=True)
 class RunResult:
-    """Outcome of a survey.
-
-    Args:
-        status: "complete", "degraded" or "aborted".
-        metrics: contents of metrics.json.
-        folder: the run folder.
-    """
+    """Outcome of a survey: status ("complete", "degraded" or "aborted"), contents of metrics.json, run folder."""
 
     status: str
     metrics: dict[str, Any]
@@ -44,11 +38,7 @@ class RunResult:
 
     @classmethod
     def of_folder(cls, folder: str | Path) -> RunResult:
-        """Returns the outcome of the survey in a run folder.
-
-        Raises:
-            TwinError: it is not a run folder, a file is damaged, or the survey has not finished.
-        """
+        """Returns the outcome in a run folder; raises TwinError if it is damaged, unfinished or no run folder."""
         from twin.report.run_folder import load_run  # imported here: it needs rasterio
 
         run = load_run(folder)
@@ -60,7 +50,6 @@ class RunResult:
 
     @cached_property
     def contents(self) -> Run:
-        """Returns all contents of the run folder."""
         from twin.report.run_folder import load_run
 
         return load_run(self.folder)
@@ -83,11 +72,7 @@ class RunResult:
         return final.positions - truth.positions[np.minimum(rows, len(truth) - 1)]
 
     def to_dataframe(self) -> pandas.DataFrame:
-        """Returns a row for each frame: time, true, online and final positions [m], and the final position error [m].
-
-        Raises:
-            TwinError: the package pandas is not installed.
-        """
+        """Returns time, true, online, final positions, final error [m] by frame; raises TwinError without pandas."""
         pandas = optional("pandas", "notebook", "to_dataframe")
         table = pandas.DataFrame({"time_s": self.trajectories["final"].times_s})
         for name in ("truth", "online", "final"):
@@ -97,7 +82,6 @@ class RunResult:
         return table
 
     def _repr_html_(self) -> str:
-        """Returns name, status, key figures, warnings and the link to the report, for notebooks."""
         values = [(name, numbers_of(self.metrics).get(metric)) for name, metric in _KEY_FIGURES]
         texts = [(name, "unknown" if value is None else f"{1000 * value:.2f} mm") for name, value in values]
         rows = "".join(f"<tr><td>{name}</td><td>{text}</td></tr>" for name, text in texts)

@@ -47,7 +47,6 @@ class PlannedTruth(NamedTuple):
     start: Array  # its rotation holds for the whole reference path, unless the truth has a planned heading per frame
 
     def reference(self) -> Trajectory:
-        """Returns the planned path as poses world_from_camera."""
         truth = self.truth
         planned = np.tile(self.start, (len(truth.reference), 1, 1))
         planned[:, :3, 3] = truth.reference
@@ -75,13 +74,8 @@ class SurveyRecord:
 class RunFolder:
     """Writer of a run folder and its log (log.jsonl, one JSON object per line). Use as a context manager.
 
-    Args:
-        folder: path of the run folder, which is created if it does not exist.
-        scenario: the resolved scenario of the run, or the description of a run without a scenario.
-        outputs: members of `OPTIONAL_OUTPUTS` to write at the end; None: no results but the metrics.
-
-    Raises:
-        TwinError: the folder cannot be written.
+    `scenario` is the resolved one, or the description of a run without one; `outputs` are the `OPTIONAL_OUTPUTS` to
+    write at the end, None: metrics only. Raises TwinError if the folder cannot be written.
     """
 
     def __init__(
@@ -118,12 +112,10 @@ class RunFolder:
     def finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
         """Writes all results, metrics.json last, and returns the metrics as written.
 
-        If a result cannot be written, for example because the disk is full, the status becomes "aborted". An interrupt
-        while the maps, the report or the recording are written ends this stage only (`guard`): its files are deleted,
-        except a finished orthomosaic, and the status becomes "aborted" with a reason that names the stage.
-
-        Raises:
-            TwinError: metrics.json cannot be written.
+        If a result cannot be written (full disk), the status becomes "aborted". An interrupt while maps, report or
+        recording are written ends this stage only (`guard`): its files are deleted, except a finished orthomosaic, and
+        the status becomes "aborted" with a reason that names the stage. Raises TwinError if metrics.json cannot be
+        written.
         """
         try:
             return self._finish(record, guard)
@@ -132,7 +124,6 @@ class RunFolder:
             raise TwinError("--out", problem, "a writable folder with space") from None
 
     def _finish(self, record: SurveyRecord, guard: StageGuard) -> dict[str, Any]:
-        """Writes the files of `finish`; raises OSError if metrics.json cannot be written."""
         metrics = record.metrics
         self._reserve.unlink(missing_ok=True)
         temporary = ".metrics.json.part"
@@ -157,7 +148,6 @@ class RunFolder:
 
     @property
     def writes_maps(self) -> bool:
-        """Returns whether `finish` writes trajectories and maps."""
         return self._outputs is not None
 
     def orthomosaic_file(
@@ -169,7 +159,6 @@ class RunFolder:
         return OrthomosaicFile(self.path / "mosaic.tif", grid, georeference) if self.writes_maps else nullcontext()
 
     def tiled_map(self) -> TiledMapFolder:
-        """Returns the writer of a map in tiles, in the folder `tiles`."""
         from twin.exchange.tiled_map import TiledMapFolder
 
         return TiledMapFolder(self.path / "tiles")
@@ -185,11 +174,9 @@ class RunFolder:
                         file.unlink()
 
     def _write(self, name: str, text: str) -> None:
-        """Writes a text file of this folder."""
         (self.path / name).write_text(text, encoding="utf-8")
 
     def _write_trajectories(self, record: SurveyRecord) -> None:
-        """Writes trajectories, network and the index of the keyframes."""
         result = record.result
         paths = {"f2f": result.f2f, "online": result.online, "final": result.final}
         if record.simulated is not None:
@@ -212,7 +199,7 @@ class RunFolder:
         self._write("keyframes/index.json", json.dumps(index))
 
     def _write_maps(self, record: SurveyRecord) -> None:
-        """Writes the rasters of the truth, the map and its error, the mesh, and mosaic.tif if it does not exist yet."""
+        """Writes the rasters of truth, map and error, the mesh, and mosaic.tif if it does not exist yet."""
         from twin.exchange import geotiff, mesh
 
         elevation, origin = record.elevation, record.georeference
@@ -237,7 +224,6 @@ class RunFolder:
             mesh.write_glb(self.path / "mesh.glb", elevation)
 
     def _write_optional_output(self, name: str, metrics: dict[str, Any]) -> None:
-        """Writes the report or the recording, whose libraries are imported only when needed."""
         if name == "report":
             from twin.report import survey_page
 

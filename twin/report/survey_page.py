@@ -12,16 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.user_files import read_text
-from twin.judge.processing_budget import stage_times
-from twin.report import wording
-from twin.report.figures import draw_all
-from twin.report.headline import badge, closed_form_comparison, first_lines, headline, key_figures
+from twin.report.headline import REPLAY_ALIGNMENTS, badge, closed_form_comparison, first_lines, headline, key_figures
 from twin.report.html import render_page
 from twin.report.images import jpeg_bytes, read_rgb
 from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
-from twin.report.stage_table import stage_rows
+from twin.report.stage_tables import PROCESSING_STAGES, stage_rows, stage_times
 from twin.report.style import COLOURS, ESTIMATES, LABELS
+from twin.report.survey_figures import draw_all
 
 #: Longest side of an image in the report [px].
 IMAGE_PX = 1400
@@ -30,22 +28,13 @@ N_SAMPLES = 4
 
 
 def write_report(folder: Path, metrics: dict[str, Any] | None = None) -> Path:
-    """Writes report.html into a run folder and returns its path.
-
-    Args:
-        folder: the run folder.
-        metrics: contents of metrics.json, given while that file does not exist yet; None: read from the file.
-
-    Raises:
-        TwinError: `folder` is not a run folder, or one of its files is damaged.
-    """
+    """Writes report.html into a run folder and returns its path; arguments and errors are those of `load_run`."""
     file = Path(folder) / "report.html"
     file.write_text(render(load_run(folder, metrics)), encoding="utf-8")
     return file
 
 
 def render(run: Run) -> str:
-    """Returns the report of a run as HTML."""
     return render_page("twin.report", "survey_page.html.j2", context(run))
 
 
@@ -64,12 +53,12 @@ def context(run: Run) -> dict[str, Any]:
         "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],
         "closed_form_comparison": closed_form_comparison(metrics["links"]) if has_links else "",
         "stage_times": stage_times(metrics, run.scenario, run.keyframes.n_frames_per_keyframe) if metrics else [],
-        "processing_stages": wording.PROCESSING_STAGES,
+        "processing_stages": PROCESSING_STAGES,
         "figures": draw_all(run),
         "mosaic": mosaic_image(run),
         "surface": jpeg_uri(surface_picture(run.folder / "mesh.glb", run.keyframes.map_from_world)),
         "samples": sample_images(run),
-        "alignment": wording.REPLAY_ALIGNMENTS[run.alignment or "first"],
+        "alignment": REPLAY_ALIGNMENTS[run.alignment or "first"],
         "scenario": read_text(run.folder / SCENARIO_FILE),
         "environment": {key: _text(value) for key, value in run.environment.items()},
         "colours": COLOURS,
@@ -85,10 +74,7 @@ def mosaic_image(run: Run) -> str | None:
 
 
 def sample_images(run: Run) -> list[tuple[int, str, str]]:
-    """Returns the frame number and the images of at most `N_SAMPLES` keyframes spread over the survey.
-
-    The left and right images are JPEG data URIs, "" if they do not exist.
-    """
+    """Returns frame number, left and right image (JPEG data URI, or "") of at most `N_SAMPLES` spread keyframes."""
     frames = run.frames_with_image()
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(N_SAMPLES, len(frames))).round().astype(int))
     samples = []
@@ -99,12 +85,10 @@ def sample_images(run: Run) -> list[tuple[int, str, str]]:
 
 
 def jpeg_uri(image: NDArray[np.uint8] | None) -> str:
-    """Returns an RGB image as a JPEG data URI, reduced so that no side is longer than `IMAGE_PX`; "" for None."""
     if image is None:
         return ""
     return "data:image/jpeg;base64," + base64.b64encode(jpeg_bytes(image, IMAGE_PX)).decode()
 
 
 def _text(value: Any) -> str:
-    """Returns a value of env.json as text."""
     return json.dumps(value) if isinstance(value, Mapping | list) else str(value)

@@ -11,11 +11,8 @@ from twin.errors import TwinError
 from twin.reproduce import light, paper, paper_budget, tank, turbidity
 from twin.reproduce.exhibit import Exhibit, write_all
 
-#: Function that runs an experiment: takes its folder, and whether to run the quick version; returns the results.
-Experiment = Callable[[Path, bool], Exhibit]
-
-#: The experiments, in the order of the index page.
-EXPERIMENTS: dict[str, Experiment] = {
+#: The experiments, in the order of the index page: functions of a folder and whether to run the quick version.
+EXPERIMENTS: dict[str, Callable[[Path, bool], Exhibit]] = {
     "paper": paper.run,
     "tank1": partial(tank.run, "tank1"),
     "tank2": partial(tank.run, "tank2"),
@@ -28,18 +25,10 @@ EXPERIMENTS: dict[str, Experiment] = {
 def run_all(
     folder: Path, quick: bool, names: Sequence[str] = tuple(EXPERIMENTS), report: Callable[[str], None] = lambda _: None
 ) -> None:
-    """Runs experiments, each in a subfolder of its name, and writes results.json and index.html.
+    """Runs experiments, each in a subfolder of its name; writes results.json and index.html anew after each of them.
 
-    results.json and the page are written again after each experiment, so that an interrupt does not lose finished ones.
-
-    Args:
-        folder: folder to write, created if missing.
-        quick: whether to run smaller, quick versions of the experiments.
-        names: the experiments to run.
-        report: called after each experiment with a line of text: its name and computing time.
-
-    Raises:
-        TwinError: a name is not that of an experiment.
+    `report` gets a line with name and computing time after each. Raises TwinError if a name is not that of an
+    experiment.
     """
     for name in names:
         if name not in EXPERIMENTS:

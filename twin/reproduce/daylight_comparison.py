@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +21,8 @@ from twin.imaging.light.optics import Optics
 from twin.imaging.light.sun_sky import sky_radiance
 from twin.imaging.light.water import Medium, medium
 from twin.imaging.reference.pixel_light import (
-    BatchMean,
     Effort,
-    PixelLight,
     PixelRay,
-    PlaneLight,
     ReferenceScene,
     Sunlight,
     pixel_light,
@@ -40,9 +36,9 @@ from twin.reproduce.light_cell import (
     ROUND,
     Compared,
     LightCell,
-    green_of,
     looking_down,
     text_of,
+    within,
 )  # fmt: skip
 from twin.scenario.model import SEA_WATER_INDEX, SunConfig, WaterConfig
 
@@ -57,20 +53,13 @@ LIGHT_ERROR, PLANE_ERROR = 0.05, 0.03  # largest relative standard errors accept
 RIG = StereoRig(64, 48, 100.0, 0.1)  # the model's pixel next to the principal point is compared with the ray through it
 
 
-class DaylightSelection(NamedTuple):
-    """The cells to compute."""
-
-    waters: tuple[str, ...] = WATERS  #: Jerlov types
-    elevations_deg: tuple[float, ...] = ELEVATIONS_DEG  #: of the sun, in air
-    depths_m: tuple[float, ...] = DEPTHS_M  #: of the camera below the surface
-    ranges_m: tuple[float, ...] = RANGES_M  #: of the floor, straight below
+#: Cells to compute: Jerlov types, elevations of the sun in air [deg], depths of the camera and ranges of the floor [m].
+Selection = tuple[Sequence[str], Sequence[float], Sequence[float], Sequence[float]]
+ALL_DAYLIGHT: Selection = (WATERS, ELEVATIONS_DEG, DEPTHS_M, RANGES_M)
+QUICK_DAYLIGHT: Selection = (("IB", "III"), ELEVATIONS_DEG, (5.0,), (2.0,))
 
 
-ALL_DAYLIGHT = DaylightSelection()
-QUICK_DAYLIGHT = DaylightSelection(("IB", "III"), ELEVATIONS_DEG, (5.0,), (2.0,))
-
-
-def daylight_cells(selection: DaylightSelection = ALL_DAYLIGHT, walks: int = MOST_WALKS) -> Iterable[LightCell]:
+def daylight_cells(selection: Selection = ALL_DAYLIGHT, walks: int = MOST_WALKS) -> Iterable[LightCell]:
     """Yields the cells of a selection; `walks` is the largest number of Monte Carlo walks for each value."""
     for water, elevation_deg, depth_m, range_m in product(*selection):
         conditions = {"water": water, "elevation_deg": elevation_deg, "depth_m": depth_m, "range_m": range_m}
@@ -89,33 +78,25 @@ def _compared(water_type: str, elevation_deg: float, depth_m: float, range_m: fl
     daylight = daylight_at(sun, water, range_m)
     veil = DaylightVeil(daylight, np.array([0.0, range_m])).radiance(np.array([0.0, 0.0, -1.0]), depth_m)
     scene, found = reference_scene(daylight, water, depth_m + range_m), dict[str, Compared]()
+    effort = Effort(min(walks, ROUND))
     s, c = np.sin(np.deg2rad(SLOPE_DEG)), np.cos(np.deg2rad(SLOPE_DEG))  # the sun is in the east
     planes = {"level": ((0.0, 0.0, 1.0), range_m), "to_sun": ((s, 0.0, c), LIFT_M), "from_sun": ((-s, 0.0, c), LIFT_M)}
     for name, (normal, height_m) in planes.items():
-        truth = _plane_truth(scene, np.array([0.0, 0.0, height_m]), np.array(normal), walks)
-        model = plane_lx(daylight, np.array(normal), depth_m + range_m - height_m)
-        found[name] = Compared(model, truth, "_lx")
+        place = np.array([0.0, 0.0, height_m]), np.array(normal)
+        truth = refined(
+            lambda one, place=place: plane_light(scene, *place, one),
+            lambda light: within(PLANE_ERROR, light.total), effort, walks,
+        )  # fmt: skip
+        found[name] = Compared(plane_lx(daylight, place[1], depth_m + range_m - height_m), truth.total, "_lx")
     above_floor, ray = replace(scene, albedo=ALBEDO / 255), PixelRay(looking_down(range_m), RIG, (RIG.cx_px, RIG.cy_px))
-    effort = Effort(min(walks, ROUND))
-    truth = refined(lambda one: pixel_light(above_floor, ray, one), _is_accurate, effort, walks)
+    truth = refined(
+        lambda one: pixel_light(above_floor, ray, one),
+        lambda light: within(LIGHT_ERROR, light.total, light.veil), effort, walks,
+    )  # fmt: skip
     return found | {
         "veil": Compared(float(veil[1, GREEN]), truth.veil, "_cd_m2"),
         "lu": Compared(_model_lu(daylight, water, range_m), truth.total, "_cd_m2"),
     }
-
-
-def _plane_truth(scene: ReferenceScene, point_m: Array, normal: Array, walks: int) -> BatchMean:
-    """Returns the illuminance [lx] of a plane at a point by the Monte Carlo reference, with its standard error."""
-
-    def enough(light: PlaneLight) -> bool:
-        return light.total.standard_error <= PLANE_ERROR * light.total.value
-
-    effort = Effort(min(walks, ROUND))
-    return refined(lambda one: plane_light(scene, point_m, normal, one), enough, effort, walks).total
-
-
-def _is_accurate(light: PixelLight) -> bool:
-    return all(mean.standard_error <= LIGHT_ERROR * mean.value for mean in (light.total, light.veil))
 
 
 def _model_lu(daylight: Daylight, water: Medium, range_m: float) -> float:
@@ -139,14 +120,11 @@ def reference_scene(daylight: Daylight, water: Medium, surface_m: float) -> Refe
     source = daylight.source
     sky = source.sky_share * sky_radiance(np.linspace(0.0, 1.0, SKY_STEPS + 1))
     sun = Sunlight(source.to_sun, source.beam_lx, surface_m, SUN_RADIUS_RAD, sky)
-    return ReferenceScene(green_of(water), np.zeros((0, 7)), (), 0.0, sun=sun)
+    return ReferenceScene(water.bands[GREEN], np.zeros((0, 7)), (), 0.0, sun=sun)
 
 
 def daylight_table(found: Sequence[LightCell]) -> list[tuple[str, ...]]:
-    """Returns the table of the results: a header, then one row per cell; standard errors follow "+-".
-
-    Lu/Ed is the upwelling radiance divided by the level illuminance [1/sr].
-    """
+    """Returns rows, header first; Lu/Ed is upwelling radiance / level illuminance [1/sr]; "+-" a standard error."""
     header = (
         "water, sun", "depth, range", "Ed, model / truth", f"{SLOPE_DEG:g} deg to the sun", "away from it",
         "Lu/Ed, truth", "model / truth", "albedo 0.5, truth", "model / truth",

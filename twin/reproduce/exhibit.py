@@ -26,8 +26,6 @@ Row = tuple[str, ...]
 
 
 class Table(NamedTuple):
-    """A table of the results of an experiment."""
-
     key: str  #: name of the table within its experiment
     title: str
     rows: tuple[Row, ...]  #: rows of text, the header first
@@ -41,26 +39,21 @@ class Figure(NamedTuple):
 
 
 class Exhibit(NamedTuple):
-    """Results of one experiment."""
-
-    name: str  #: name of the experiment, as in `twin reproduce NAME`
+    name: str  #: as in `twin reproduce NAME`
     title: str
     text: str  #: description of the experiment, in a few sentences
     tables: tuple[Table, ...]
     figures: tuple[Figure, ...] = ()
 
     def table(self, key: str) -> Table:
-        """Returns the table with a given key, which must exist."""
         return next(table for table in self.tables if table.key == key)
 
     def as_dict(self) -> dict[str, Any]:
-        """Returns the results as the contents of a JSON file."""
         tables, figures = ([item._asdict() for item in items] for items in (self.tables, self.figures))
         return self._asdict() | {"tables": tables, "figures": figures}
 
 
 def make_table(key: str, title: str, rows: Sequence[Sequence[str]]) -> Table:
-    """Returns a table of rows of text, the header first."""
     return Table(key, title, tuple(tuple(row) for row in rows))
 
 
@@ -79,22 +72,19 @@ def extent_of(grid: MapGrid) -> tuple[float, float, float, float]:
 
 
 def write_json(file: Path, contents: Any) -> None:
-    """Writes contents to a JSON file, whose folder is created if missing."""
+    """Writes a JSON file, in a folder that is created if missing."""
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
 
 
 def write_exhibit(exhibit: Exhibit, folder: Path) -> Exhibit:
-    """Writes NAME.json to the folder of the experiment's figures, which is created if missing; returns the exhibit."""
+    """Writes NAME.json to a folder, which is created if missing; returns the exhibit."""
     write_json(folder / f"{exhibit.name}.json", {"schema": SCHEMA} | exhibit.as_dict())
     return exhibit
 
 
 def write_all(exhibits: Sequence[Exhibit], folder: Path, quick: bool) -> None:
-    """Writes results.json and index.html to a folder, which is created if missing.
-
-    The page shows the figures from one subfolder per experiment, next to the page.
-    """
+    """Writes results.json and index.html, which shows the figures in the subfolders of the experiments, to a folder."""
     contents = {"schema": f"{SCHEMA}s", "quick": quick, "exhibits": [exhibit.as_dict() for exhibit in exhibits]}
     write_json(folder / RESULTS_FILE, contents)
     page = render_page("twin.reproduce", "index_page.html.j2", {"exhibits": exhibits, "quick": quick})
@@ -102,11 +92,7 @@ def write_all(exhibits: Sequence[Exhibit], folder: Path, quick: bool) -> None:
 
 
 def read_all(file: Path) -> tuple[list[Exhibit], bool]:
-    """Returns the exhibits in a results.json, and whether they are those of the quick versions.
-
-    Raises:
-        TwinError: the file cannot be read or is not a results.json.
-    """
+    """Returns the exhibits in a results.json, and whether of quick versions; raises TwinError if it is not readable."""
     contents = read_json(file, "", "results.json of `twin reproduce all`")
     if not isinstance(contents, dict) or not isinstance(contents.get("exhibits"), list):
         raise TwinError(str(file), "has no list of exhibits", "results.json of `twin reproduce all`")
@@ -114,7 +100,6 @@ def read_all(file: Path) -> tuple[list[Exhibit], bool]:
 
 
 def _exhibit_of(contents: Any, file: Path) -> Exhibit:
-    """Returns the exhibit in the contents of a JSON file; raises TwinError if they are not those of an exhibit."""
     try:
         tables = tuple(make_table(t["key"], t["title"], t["rows"]) for t in contents["tables"])
         figures = tuple(Figure(f["file"], f["caption"]) for f in contents["figures"])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from twin.terrains import Terrain
 from twin.terrains.noise import fractal_field
 
-Array = NDArray[np.float64]
+Array = NDArray[np.floating]
 
 SAND_M, SAND_SPACING_M = (2.4, 2.0), 0.005  # size of the sand, spacing of its heights
 TANK_M, TANK_SPACING_M = (2.7, 2.7), 0.003
@@ -30,32 +30,25 @@ SPOT_M, SPOT_RADIUS_M = (0.28, 0.12), 0.55  # centre and radius (1/e) of the bri
 SHADE_EDGE_M, SHADE_WIDTH_M = -0.33, 0.06  # x of the soft edge of the shade, and half the width of this edge
 
 
-def _nodes(size_m: tuple[float, float], step_m: float) -> tuple[Array, Array]:
+def _nodes(size_m: tuple[float, float], step_m: float) -> tuple[Array, ...]:
     """Returns x and y (rows, cols) [m] of the nodes of a grid around the origin, from south to north."""
-    east, north = (np.arange(round(size / step_m) + 1) * step_m - size / 2 for size in size_m)
-    x, y = np.meshgrid(east, north)
-    return np.asarray(x, np.float64), np.asarray(y, np.float64)
+    return tuple(np.meshgrid(*(np.arange(round(size / step_m) + 1) * step_m - size / 2 for size in size_m)))
 
 
-def _texels(size_m: tuple[float, float]) -> tuple[Array, Array]:
+def _texels(size_m: tuple[float, float]) -> tuple[Array, ...]:
     """Returns x and y (rows, cols) [m] of the centres of the texels, from south to north."""
-    east, north = (np.arange(round(size / TEXEL_M)) * TEXEL_M - size / 2 + TEXEL_M / 2 for size in size_m)
-    x, y = np.meshgrid(east, north)
-    return np.asarray(x, np.float64), np.asarray(y, np.float64)
+    return tuple(np.meshgrid(*(np.arange(round(side / TEXEL_M)) * TEXEL_M - side / 2 + TEXEL_M / 2 for side in size_m)))
 
 
 def _terrain(height_m: Array, spacing_m: float, size_m: tuple[float, float], albedo: NDArray[np.floating]) -> Terrain:
-    """Returns a terrain around the origin with the given nodes and texels (rows from south to north)."""
+    """Returns a terrain around the origin; rows of heights and albedo from south to north."""
     texture = np.clip(255 * albedo[::-1] + 0.5, 0, 255).astype(np.uint8)
     west, south = (-side / 2 for side in size_m)
     return Terrain(height_m.astype(np.float32), spacing_m, west, south, texture, TEXEL_M)
 
 
 def block_on_sand(seed: int) -> Terrain:
-    """Returns a terrain with the block at its centre, which is the origin; the mean height of the sand is about 0.
-
-    The seed is that of the sand relief, the roughness of the block and the noise of the texture.
-    """
+    """Returns a terrain with the block at its centre, the origin; the mean height of the sand is about 0."""
     rng = np.random.default_rng(seed)
     x, y = _nodes(SAND_M, SAND_SPACING_M)
     ripples = 0.012 * np.sin(2 * np.pi * (x + 0.15 * np.sin(2.1 * y) + 0.04 * np.sin(5.3 * y)) / 0.16)
@@ -68,7 +61,7 @@ def block_on_sand(seed: int) -> Terrain:
 
 
 def _on_block(x: Array, y: Array) -> NDArray[np.bool_]:
-    """Returns a mask of the points on the block, excluding its hollow cores."""
+    """Returns whether points are on the block, but not in its hollow cores."""
     heading = np.deg2rad(HEADING_DEG)
     along, across = x * np.cos(heading) + y * np.sin(heading), y * np.cos(heading) - x * np.sin(heading)
     block = (np.abs(along) < BLOCK_M[0] / 2) & (np.abs(across) < BLOCK_M[1] / 2)
@@ -80,7 +73,7 @@ def _on_block(x: Array, y: Array) -> NDArray[np.bool_]:
 class TankObject(NamedTuple):
     """An object on the floor of the tank, with its sides parallel to x and y."""
 
-    name: str  #: name in the tables
+    name: str
     shape: Literal["box", "disc", "dome", "pipe"]  #: disc: upright cylinder; dome: half an ellipsoid; pipe: lying
     centre_m: tuple[float, float]  #: (x, y) of the centre, in the middle between nodes of the height grid
     #: extent along x and y, and height; the extents are even multiples of `TANK_SPACING_M`, so that the sides lie in
@@ -114,7 +107,7 @@ OBJECTS = (
 
 
 def tank_floor(seed: int, objects: Sequence[TankObject] = OBJECTS) -> Terrain:
-    """Returns the floor of the tank with its centre at the origin and z = 0 on the level floor; seed: its texture."""
+    """Returns the floor of the tank with its centre at the origin and z = 0 on the level floor."""
     rng = np.random.default_rng(seed)
     x, y = _nodes(TANK_M, TANK_SPACING_M)
     height = np.max([item.height_at(x, y) for item in objects], axis=0, initial=0.0)
@@ -123,12 +116,7 @@ def tank_floor(seed: int, objects: Sequence[TankObject] = OBJECTS) -> Terrain:
     albedo = FLOOR * (1 + GRAIN * noise)
     for item in objects:
         albedo = np.where(item.height_at(x, y) > 0, item.albedo * (1 + item.grain * noise), albedo)
-    lit = albedo * _tank_illuminance(x, y)
-    return _terrain(height, TANK_SPACING_M, TANK_M, np.repeat(lit[..., None], 3, 2))
-
-
-def _tank_illuminance(x: Array, y: Array) -> Array:
-    """Returns the illuminance of the floor relative to its largest value; it has a spot and a soft-edged shadow."""
     spot = np.exp(-((x - SPOT_M[0]) ** 2 + (y - SPOT_M[1]) ** 2) / SPOT_RADIUS_M**2)
     lit = 0.5 + 0.5 * np.tanh((x - SHADE_EDGE_M) / SHADE_WIDTH_M)
-    return (0.55 + 0.45 * spot) * (SHADE + (1 - SHADE) * lit)
+    illuminance = (0.55 + 0.45 * spot) * (SHADE + (1 - SHADE) * lit)  # relative to its largest value
+    return _terrain(height, TANK_SPACING_M, TANK_M, np.repeat((albedo * illuminance)[..., None], 3, 2))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,9 +32,9 @@ from twin.reproduce.light_cell import (
     ROUND,
     Compared,
     LightCell,
-    green_of,
     looking_down,
     text_of,
+    within,
 )  # fmt: skip
 from twin.scenario.file import load_scenario
 from twin.scenario.model import Scenario
@@ -62,34 +61,23 @@ NEAR_PX, FAR_PX = 2.0, 40.0
 LIGHT_ERROR, SHARP_ERROR, BLUR_ERROR = 0.019, 0.01, 0.1
 
 
-class LampSelection(NamedTuple):
-    """The cells to compute."""
-
-    waters: tuple[str, ...] = WATERS  #: Jerlov types
-    lamp_arrangements: tuple[str, ...] = tuple(LAMP_ARRANGEMENTS)
-    heights_m: tuple[float, ...] = HEIGHTS_M  #: heights of the camera above the floor
-    pixels: tuple[tuple[float, float], ...] = PIXELS
+#: Cells to compute: Jerlov types, lamp arrangements, heights of the camera above the floor [m], pixels.
+Selection = tuple[Sequence[str], Sequence[str], Sequence[float], Sequence[tuple[float, float]]]
+ALL_LAMPS: Selection = (WATERS, tuple(LAMP_ARRANGEMENTS), HEIGHTS_M, PIXELS)
+QUICK_LAMPS: Selection = (("IB", "III"), ("leds",), (2.0,), PIXELS[:2])
 
 
-ALL_LAMPS = LampSelection()
-QUICK_LAMPS = LampSelection(("IB", "III"), ("leds",), (2.0,), PIXELS[:2])
-
-
-def lamp_cells(
-    selection: LampSelection = ALL_LAMPS, walks: int = MOST_WALKS, phase: str = "sea"
-) -> Iterable[LightCell]:
+def lamp_cells(selection: Selection = ALL_LAMPS, walks: int = MOST_WALKS, phase: str = "sea") -> Iterable[LightCell]:
     """Yields the cells of a selection: conditions, with the light of a pixel by the model and by the reference.
 
-    Args:
-        selection: the cells to compute.
-        walks: largest number of pairs of random walks in a cell; fewer if the reference is accurate enough.
-        phase: phase function of model and reference, a value of `water.phase_function`.
+    A cell has at most `walks` pairs of random walks; `phase` is a value of `water.phase_function`.
     """
-    for water, lamps in product(selection.waters, selection.lamp_arrangements):
+    waters, arrangements, heights_m, pixels = selection
+    for water, lamps in product(waters, arrangements):
         settings = f"water.jerlov={water}", f"water.phase_function={phase}", "sun.illuminance_lx=0"
         scenario = load_scenario("reef", [*settings, *LAMP_ARRANGEMENTS[lamps]])
         width_px, height_px = scenario.rig.image_width_px, scenario.rig.image_height_px
-        for height_m, (across, down) in product(selection.heights_m, selection.pixels):
+        for height_m, (across, down) in product(heights_m, pixels):
             pixel = round(across * (width_px - 1)), round(down * (height_px - 1))
             conditions = {"water": water, "height_m": height_m, "lamps": lamps}
             conditions |= {"column_px": pixel[0], "row_px": pixel[1]}
@@ -120,23 +108,19 @@ def _compared(scenario: Scenario, height_m: float, pixel: tuple[int, int], walks
 
 
 def _is_accurate(light: PixelLight) -> bool:
-    """Returns whether the standard errors are within `LIGHT_ERROR`, `SHARP_ERROR` and `BLUR_ERROR`."""
-    means = [(light.total, LIGHT_ERROR), (light.veil, LIGHT_ERROR), *((s, BLUR_ERROR) for s in _blur_shares(light))]
-    within = all(mean.standard_error <= limit * mean.value for mean, limit in means)
-    return within and light.sharp_share.standard_error <= SHARP_ERROR
+    of_light = within(LIGHT_ERROR, light.total, light.veil) and within(BLUR_ERROR, *_blur_shares(light))
+    return of_light and light.sharp_share.standard_error <= SHARP_ERROR
 
 
 def _blur_shares(light: PixelLight) -> tuple[BatchMean, BatchMean]:
-    """Returns the shares of the blurred light that is displaced by less than `NEAR_PX`, and by at least `FAR_PX`."""
     return light.blurred_share(0.0, NEAR_PX), light.blurred_share(FAR_PX)
 
 
 def reference_light(scenario: Scenario, height_m: float, pixel: tuple[int, int], effort: Effort) -> PixelLight:
     """Returns the Monte Carlo estimate of the green light of a pixel of the left camera, which points straight down."""
-    rig, illumination = scenario.believed_rig(), illumination_of(scenario)
-    pose = looking_down(height_m)
+    rig, illumination, pose = scenario.believed_rig(), illumination_of(scenario), looking_down(height_m)
     sources = light_sources_in_camera(rig, scenario.lamps, illumination.daylight, 0)
-    water, lamps = green_of(illumination.water), lamps_in_world(sources, pose, GREEN)
+    water, lamps = illumination.water.bands[GREEN], lamps_in_world(sources, pose, GREEN)
     scene = ReferenceScene(water, lamps, sources.beam, ALBEDO / 255)
     return pixel_light(scene, PixelRay(pose, rig, pixel), effort)
 
@@ -153,8 +137,8 @@ def model_light(scenario: Scenario, height_m: float, pixel: tuple[int, int]) -> 
     optics = Optics(rig, illumination, scenario.lamps)
     direct, forward, veil = optics.parts(albedo, depth, 0)
     at = pixel[1], pixel[0], GREEN
-    parts = {"direct": float(direct[at]), "blurred": 0.0 if forward is None else float(forward[at])}
-    parts["veil"] = float(veil[at])
+    blurred = 0.0 if forward is None else float(forward[at])
+    parts = {"direct": float(direct[at]), "blurred": blurred, "veil": float(veil[at])}
     total = sum(parts.values())
     light = parts | {"total": total, "sharp_share": parts["direct"] / total, "blur_near": np.nan, "blur_far": np.nan}
     if forward is None:
@@ -180,7 +164,7 @@ def model_light(scenario: Scenario, height_m: float, pixel: tuple[int, int]) -> 
 
 
 def lamp_table(found: Sequence[LightCell]) -> list[tuple[str, ...]]:
-    """Returns the comparison as table rows, a header and one row per cell; standard errors follow "+-"."""
+    """Returns the results as table rows, the header first; standard errors follow "+-"."""
     header = (
         "water, height", "lamps, pixel", "total, model / truth", "sharp, truth", "model", "veil, truth / model",
         f"blur < {NEAR_PX:g} px, truth", "model", f"> {FAR_PX:g} px, truth", "model",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from twin.imaging.reference.pixel_light import BatchMean
-from twin.report.figures import log_axis
+from twin.report.plotting import log_axis
 from twin.reproduce.daylight_comparison import ALL_DAYLIGHT, QUICK_DAYLIGHT, daylight_cells, daylight_table
 from twin.reproduce.exhibit import Exhibit, Figure, Table, drawn, make_table, write_json
 from twin.reproduce.lamp_comparison import ALL_LAMPS, QUICK_LAMPS, lamp_cells, lamp_table
@@ -29,7 +30,6 @@ class LightComparison(NamedTuple):
 
     @property
     def tables(self) -> tuple[Table, Table]:
-        """Returns the results as tables; standard errors follow "+-"."""
         lamps = make_table("light", "Lamps", lamp_table(self.lamps))
         return lamps, make_table("daylight", "Daylight", daylight_table(self.daylight))
 
@@ -58,7 +58,6 @@ def run(folder: Path, quick: bool = False) -> Exhibit:
 
 
 def draw(cells: Sequence[LightCell], file: Path) -> None:
-    """Draws the figure to a PNG file."""
     with drawn(file, 12.0, 7.5) as figure:
         grid = figure.subplots(2, 2)
         figure.suptitle(
@@ -66,12 +65,12 @@ def draw(cells: Sequence[LightCell], file: Path) -> None:
         )
         _ratios(grid[0, 0], cells, "total light, model / reference", lambda cell: cell.light["total"].ratio)
         _ratios(grid[0, 1], cells, "veil, reference / model", lambda cell: cell.light["veil"].inverse_ratio)
-        _shares(grid[1, 0], cells)
-        _blur(grid[1, 1], cells)
+        _against_truth(grid[1, 0], cells, {"sharp_share": "full"}, 0.0, "share of unscattered light")
+        blur = {"blur_near": "full", "blur_far": "none"}
+        _against_truth(grid[1, 1], cells, blur, 1e-3, "blur: share within 2 px (full), beyond 40 px (open)")
 
 
 def _series(cells: Sequence[LightCell]) -> list[tuple[str, tuple[float, float, float, float], list[LightCell]]]:
-    """Returns name, colour and cells of each water type."""
     waters = list(dict.fromkeys(cell.conditions["water"] for cell in cells))
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(waters)))
     return [
@@ -85,8 +84,11 @@ def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[
         for lamps, marker in MARKERS.items():
             chosen = [cell for cell in own if cell.conditions["lamps"] == lamps]
             found = [value(cell) for cell in chosen]
+            pixels = [(cell.conditions["column_px"], cell.conditions["row_px"]) for cell in chosen]
+            shifts_m = {pixel: OFFSET_M * k for k, pixel in enumerate(dict.fromkeys(pixels))}
+            heights_m = [cell.conditions["height_m"] for cell in chosen]
             axes.errorbar(
-                [_place_m(cell, chosen) for cell in chosen], [one.value for one in found],
+                [h + shifts_m[pixel] for h, pixel in zip(heights_m, pixels, strict=True)], [one.value for one in found],
                 yerr=[2 * one.standard_error for one in found], fmt=marker, color=colour, markersize=4,
                 label=water if lamps == "leds" else None,
             )  # fmt: skip
@@ -97,33 +99,15 @@ def _ratios(axes: Axes, cells: Sequence[LightCell], label: str, value: Callable[
                 bbox_to_anchor=(1.0, 0.5))  # fmt: skip
 
 
-def _place_m(cell: LightCell, cells: Sequence[LightCell]) -> float:
-    """Returns the abscissa of a cell [m]: the camera height, shifted for each pixel so that markers do not overlap."""
-    pixels = [(one.conditions["column_px"], one.conditions["row_px"]) for one in (*cells, cell)]
-    return cell.conditions["height_m"] + OFFSET_M * list(dict.fromkeys(pixels)).index(pixels[-1])
-
-
-def _shares(axes: Axes, cells: Sequence[LightCell]) -> None:
+def _against_truth(axes: Axes, cells: Sequence[LightCell], fills: Mapping[str, str], low: float, title: str) -> None:
+    """Plots shares by the model against those by the reference, from `low` to 1; axes above 0 are logarithmic."""
     for _, colour, own in _series(cells):
-        for cell in own:
-            model, truth = cell.light["sharp_share"][:2]
+        for cell, (name, fill) in product(own, fills.items()):
+            model, truth = cell.light[name][:2]
+            bar = 2 * truth.standard_error if name == "sharp_share" else None
             marker = MARKERS[cell.conditions["lamps"]]
-            axes.errorbar(truth.value, model, xerr=2 * truth.standard_error, fmt=marker, color=colour, markersize=4)
-    axes.plot([0, 1], [0, 1], color="#9aa8b0", linewidth=1)
-    axes.set(xlim=(0, 1), ylim=(0, 1), xlabel="reference", ylabel="model", title="share of unscattered light")
-
-
-def _blur(axes: Axes, cells: Sequence[LightCell]) -> None:
-    for _, colour, own in _series(cells):
-        for cell in own:
-            for name, fill in (("blur_near", "full"), ("blur_far", "none")):
-                model, truth = cell.light[name][:2]
-                marker = MARKERS[cell.conditions["lamps"]]
-                axes.plot(truth.value, model, marker, color=colour, markersize=4, fillstyle=fill)
-    axes.plot([1e-3, 1], [1e-3, 1], color="#9aa8b0", linewidth=1)
-    axes.set(
-        xlim=(1e-3, 1), ylim=(1e-3, 1), xlabel="reference", ylabel="model",
-        title="blur: share within 2 px (full), beyond 40 px (open)",
-    )  # fmt: skip
-    log_axis(axes.xaxis)
-    log_axis(axes.yaxis)
+            axes.errorbar(truth.value, model, xerr=bar, fmt=marker, color=colour, markersize=4, fillstyle=fill)
+    axes.plot([low, 1], [low, 1], color="#9aa8b0", linewidth=1)
+    axes.set(xlim=(low, 1), ylim=(low, 1), xlabel="reference", ylabel="model", title=title)
+    for axis in (axes.xaxis, axes.yaxis) if low else ():
+        log_axis(axis)

@@ -10,9 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.imaging.light.phase_function import phase_of
-from twin.imaging.light.water import Medium
-from twin.imaging.reference.pixel_light import BandWater, BatchMean
+from twin.imaging.reference.pixel_light import BatchMean
 
 GREEN, ALBEDO = 1, 128  # band that is compared, and albedo of the floor; 255 = white
 ROUND, MOST_WALKS = 8_000, 1_500_000  # walks (for a pixel: pairs) in a round; most walks for each value
@@ -28,7 +26,7 @@ class Compared(NamedTuple):
 
     @property
     def ratio(self) -> BatchMean:
-        """Returns model / truth, with the standard error of the truth."""
+        """Returns model / truth, with its standard error."""
         value = self.model / self.truth.value
         return BatchMean(value, value * self.truth.standard_error / self.truth.value)
 
@@ -46,7 +44,6 @@ class Compared(NamedTuple):
         return Compared(self.model / other.model, BatchMean(value, float(value * np.hypot(own, others))))
 
     def row(self, name: str) -> dict[str, float]:
-        """Returns the values for the files, by key."""
         values = {
             "model": (f"{name}_model{self.unit}", self.model),
             "truth": (f"{name}_truth{self.unit}", self.truth.value),
@@ -56,21 +53,17 @@ class Compared(NamedTuple):
 
 
 class LightCell(NamedTuple):
-    """One cell of a comparison."""
-
     conditions: dict[str, Any]  #: water type, heights etc. by key in the files
     light: dict[str, Compared]  #: quantities by key
-
-    @property
-    def row(self) -> dict[str, Any]:
-        """Returns the contents of the cell for the files, by key."""
-        return self.conditions | {key: x for name, one in self.light.items() for key, x in one.row(name).items()}
 
 
 def write_csv(cells: Sequence[LightCell], file: Path) -> list[dict[str, Any]]:
     """Writes cells to a CSV file, in a folder that is created if missing; returns the rows."""
     file.parent.mkdir(parents=True, exist_ok=True)
-    rows = [cell.row for cell in cells]
+    rows = [
+        cell.conditions | {key: x for name, one in cell.light.items() for key, x in one.row(name).items()}
+        for cell in cells
+    ]
     with file.open("w", newline="", encoding="utf-8") as stream:
         writer = csv.DictWriter(stream, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()
@@ -78,15 +71,14 @@ def write_csv(cells: Sequence[LightCell], file: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def within(error: float, *means: BatchMean) -> bool:
+    """Returns whether the relative standard error of every mean is at most `error`."""
+    return all(mean.standard_error <= error * mean.value for mean in means)
+
+
 def text_of(mean: BatchMean, digits: str = ".3g") -> str:
     """Returns a mean with its standard error as text; "-" if it is not known."""
     return "-" if np.isnan(mean.value) else f"{mean.value:{digits}} +- {mean.standard_error:.1g}"
-
-
-def green_of(water: Medium) -> BandWater:
-    """Returns the optical properties of the water in the green band, for the Monte Carlo reference."""
-    phase = phase_of(water.scatterers[GREEN])
-    return BandWater(float(water.absorption_per_m[GREEN]), float(water.scattering_per_m[GREEN]), phase)
 
 
 def looking_down(height_m: float) -> NDArray[np.float64]:

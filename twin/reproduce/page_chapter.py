@@ -20,8 +20,7 @@ SHOWN = (
 
 
 def chapter(exhibits: Sequence[Exhibit], quick: bool) -> str:
-    """Returns the chapter as Markdown, including its markers."""
-    by_name = {exhibit.name: exhibit for exhibit in exhibits}
+    shown = [(e, t) for name, key in SHOWN for e in exhibits if e.name == name for t in e.tables if t.key == key]
     plans = " (quick plans: `--quick`)" if quick else ""
     lines = [
         BEGIN, HEADING, "",
@@ -29,20 +28,14 @@ def chapter(exhibits: Sequence[Exhibit], quick: bool) -> str:
         "writes these tables and all others, with the figures, to one page.",
     ]  # fmt: skip
     described = set[str]()
-    for name, key in SHOWN:
-        exhibit = by_name.get(name)
-        table = None if exhibit is None else next((table for table in exhibit.tables if table.key == key), None)
-        if exhibit is None or table is None:
-            continue
-        lines += [""] if name in described else ["", f"**{exhibit.title}.** {exhibit.text}", ""]
-        described.add(name)
-        lines += [f"*{table.title}*", ""]
-        lines += _markdown(table)
+    for exhibit, table in shown:
+        lines += [""] if exhibit.name in described else ["", f"**{exhibit.title}.** {exhibit.text}", ""]
+        described.add(exhibit.name)
+        lines += [f"*{table.title}*", "", *_markdown(table)]
     return "\n".join([*lines, END])
 
 
 def _markdown(table: Table) -> list[str]:
-    """Returns the lines of a Markdown table."""
     header, *rows = [[cell.replace("|", "\\|") for cell in row] for row in table.rows]
     return [_line(header), _line(["---"] * len(header)), *map(_line, rows)]
 
@@ -52,11 +45,7 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def with_chapter(page: str, text: str, name: str = "page") -> str:
-    """Returns the contents of a page in which the markers and the text between them are replaced by the chapter.
-
-    Raises:
-        TwinError: the page, named `name`, does not contain each marker exactly once, the begin marker first.
-    """
+    """Returns a page whose marked part is the chapter; raises TwinError unless each marker is there once, in order."""
     first, last = page.find(BEGIN), page.find(END)
     if min(first, last) < 0 or last < first or page.count(BEGIN) != 1 or page.count(END) != 1:
         raise TwinError(name, "does not have the markers of the chapter once", f"the lines {BEGIN} and {END}")
@@ -64,11 +53,6 @@ def with_chapter(page: str, text: str, name: str = "page") -> str:
 
 
 def update(page: Path, exhibits: Sequence[Exhibit], quick: bool) -> None:
-    """Replaces the chapter in a Markdown file.
-
-    Raises:
-        TwinError: the file cannot be read, or does not contain each marker exactly once.
-        OSError: the file cannot be written.
-    """
+    """Replaces the chapter in a Markdown file; raises TwinError if it cannot be read or lacks the markers."""
     text = read_text(page, "", "a Markdown file")
     page.write_text(with_chapter(text, chapter(exhibits, quick), str(page)), encoding="utf-8")

@@ -14,6 +14,7 @@ import numpy as np
 
 from twin.core.records import Array
 from twin.judge.map_error import height_error
+from twin.judge.summary_statistics import percentile, rms
 from twin.judge.trajectory_errors import PathErrors, farthest_error_m, path_errors, track_metrics
 from twin.reproduce import paper_sheet
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, make_table, millimetres, percent, write_exhibit
@@ -46,43 +47,34 @@ CAPTIONS = {
 
 
 class Flights(NamedTuple):
-    """The three flights."""
-
     coarse: Flown  #: over the coarse texture
     unaligned: Flown  #: over the coarse texture, without alignment
     fine: Flown  #: at full resolution
 
     @property
     def aligned(self) -> tuple[Flown, Flown]:
-        """Returns the flights with alignment: over the coarse texture and at full resolution."""
         return self.coarse, self.fine
 
 
 class Claim(NamedTuple):
     """A result that the paper states."""
 
-    label: str  #: name of the quantity
+    label: str
     paper: str  #: the paper's values, as text
-    limit_m: float  #: the smallest of the paper's values; a result below it is better than the paper's
-    value_m: Callable[[Flown], float]  #: function that returns the value of a flight; NaN if it is unknown
+    limit: float  #: the smallest of the paper's values; a result below it is better than the paper's
+    value: Callable[[Flown], float]  #: value of a flight; NaN if it is unknown
+    text: Callable[[float], str] = millimetres
 
 
 def run(folder: Path, quick: bool = False, settings: tuple[str, ...] = ()) -> Exhibit:
-    """Flies the mission and returns the results; writes paper.json and the figures to a folder, created if missing.
-
-    The quick plan has short legs and a low frame rate. `settings` are further overrides of the scenarios ("key=value").
-    """
+    """Flies the mission; writes paper.json and figures to a folder, made if missing; `settings` are "key=value"."""
     flights = fly(*scenarios(quick, settings))
     folder.mkdir(parents=True, exist_ok=True)
     return write_exhibit(exhibit_of_flights(flights, quick, figures=draw_figures(flights, folder)), folder)
 
 
 def fly(coarse: Scenario, fine: Scenario) -> Flights:
-    """Flies the mission three times, in parallel on the available cores.
-
-    Raises:
-        TwinError: a mission cannot be prepared, or no stereo pair became a keyframe.
-    """
+    """Flies the mission three times, in parallel on the available cores; errors as of `fly_aligned`."""
     flown = fly_in_parallel({
         "full resolution": (fly_aligned, fine),
         "coarse texture": (fly_aligned, coarse),
@@ -92,13 +84,11 @@ def fly(coarse: Scenario, fine: Scenario) -> Flights:
 
 
 def scenarios(quick: bool, settings: tuple[str, ...] = ()) -> tuple[Scenario, Scenario]:
-    """Returns the scenarios of the mission: coarse texture and small images; fine texture and full-size images."""
     plan = (*(QUICK if quick else ()), *settings)
     return load_scenario("paper_coarse", plan), load_scenario("paper", [*FINE, *plan])
 
 
 def draw_figures(flights: Flights, folder: Path) -> tuple[Figure, ...]:
-    """Draws the counterparts of the paper's Figs. 4 to 7 in a folder; returns the figures with their captions."""
     aligned = {"coarse texture": flights.coarse, "full resolution": flights.fine}
     paper_sheet.draw_paths(aligned, folder / "paper_paths.png")
     paper_sheet.draw_tracks(aligned, SHOWN_TRACKS, folder / "paper_tracks.png")
@@ -108,13 +98,11 @@ def draw_figures(flights: Flights, folder: Path) -> tuple[Figure, ...]:
 
 
 def exhibit_of_flights(flights: Flights, quick: bool, figures: tuple[Figure, ...] = ()) -> Exhibit:
-    """Returns the results of the flights: text, tables and the given figures."""
     tables = (claims_table(flights, quick), tracks_table(flights), path_table(flights), map_table(flights))
     return Exhibit("paper", "The paper's mission: 25 tracks", _text(flights, quick), tables, figures)
 
 
 def _text(flights: Flights, quick: bool) -> str:
-    """Returns a description of the flights, in sentences."""
     plan, n = flights.coarse.mission.plan, len(flights.coarse.result.keyframe_rows)
     flown = (
         f"{plan.n_tracks} tracks of two legs of {plan.swath_length_m:.1f} m, {plan.swath_spacing_m:.2f} m apart, by "
@@ -129,44 +117,33 @@ def _text(flights: Flights, quick: bool) -> str:
 
 CLAIMS = (
     Claim("largest position error, tracks 1 to 5", "about 1 ft = 0.30 m", FOOT_M,
-          lambda flown: _percentile(_first_tracks(flown), 100)),
+          lambda flown: _largest_of_first_tracks(flown)),
     Claim("position error at the far end, worst track after the fifth", "2 to 4 ft = 0.61 to 1.22 m", 2 * FOOT_M,
           lambda flown: _far_end(flown, 0)),
     Claim(f"the same, without the {FEW} worst tracks", "at most 1.5 ft = 0.46 m", 1.5 * FOOT_M,
           lambda flown: _far_end(flown, FEW)),
     Claim("largest error of elevation", "about 1.5 ft = 0.46 m", 1.5 * FOOT_M,
-          lambda flown: _percentile(_height_errors(flown), 100)),
+          lambda flown: _elevation_error(flown, 100)),
     Claim("error of elevation, 85 % of the map within", "0.6 ft = 0.18 m", 0.6 * FOOT_M,
-          lambda flown: _percentile(_height_errors(flown), 85)),
+          lambda flown: _elevation_error(flown, 85)),
+    Claim("largest error of elevation, of the mean range 2.44 m", "20 %", 0.2,
+          lambda flown: _elevation_error(flown, 100) / MEAN_RANGE_M, lambda share: percent(share, 2)),
+    Claim("error of elevation, 85 % of the map, of the mean range 2.44 m", "7.5 %", 0.075,
+          lambda flown: _elevation_error(flown, 85) / MEAN_RANGE_M, lambda share: percent(share, 2)),
 )  # fmt: skip
 
 
 def claims_table(flights: Flights, quick: bool) -> Table:
-    """Returns a table of the paper's results and of those of the flights over both textures.
-
-    Its last column states whether the results are better than the paper's. It has no such column for a quick plan,
-    whose legs are sixty times shorter than the paper's, so that its errors are not comparable.
-    """
+    """Returns the paper's results, ours, and which are better, except for a quick plan (legs sixty times shorter)."""
     rows: list[Row] = [("", "paper", "coarse texture", "full resolution", "better than the paper")]
     for claim in CLAIMS:
-        rows.append(_claim_row(claim.label, claim.paper, claim.limit_m, [claim.value_m(f) for f in flights.aligned]))
-    for claim, words, limit in ((CLAIMS[3], "20 %", 0.2), (CLAIMS[4], "7.5 %", 0.075)):
-        label = f"{claim.label}, of the mean range 2.44 m".replace(" within", "")
-        shares = [claim.value_m(flown) / MEAN_RANGE_M for flown in flights.aligned]
-        rows.append(_claim_row(label, words, limit, shares, lambda share: percent(share, 2)))
+        values = [claim.value(flown) for flown in flights.aligned]
+        better = [DASH if np.isnan(value) else "yes" if value < claim.limit else "no" for value in values]
+        rows.append((claim.label, claim.paper, *map(claim.text, values), " / ".join(better)))
     return make_table("claims", "The paper's results", [row[:-1] for row in rows] if quick else rows)
 
 
-def _claim_row(
-    label: str, paper: str, limit: float, values: list[float], text: Callable[[float], str] = millimetres
-) -> Row:
-    """Returns a row of `claims_table`; a value is better than the paper's if it is below the limit."""
-    better = [DASH if np.isnan(value) else "yes" if value < limit else "no" for value in values]
-    return label, paper, *map(text, values), " / ".join(better)
-
-
 def tracks_table(flights: Flights) -> Table:
-    """Returns a table of the RMS position error of all keyframes so far, before and after alignments (Fig. 5)."""
     rows: list[Row] = [("track", "paper", "coarse, before", "coarse, after", "full resolution, before", "after")]
     found = [{row["track"]: row for row in track_metrics(f.result, f.truth)} for f in flights.aligned]
     for track in SHOWN_TRACKS:
@@ -181,7 +158,6 @@ def tracks_table(flights: Flights) -> Table:
 
 
 def path_table(flights: Flights) -> Table:
-    """Returns a table of the RMS and largest errors along the path (Fig. 6)."""
     final, f2f = ([_errors(flown, path) for flown in flights.aligned] for path in ("final", "f2f"))
     rows: list[Row] = [
         ("along the path", "paper", "coarse texture", "full resolution"),
@@ -194,26 +170,21 @@ def path_table(flights: Flights) -> Table:
 
 
 def map_table(flights: Flights) -> Table:
-    """Returns a table of the share of the asked area without a height, with and without alignment (Fig. 7).
-
-    For the flight without alignment, the table also has an error of the map and the distance from the planned path.
-    """
     unaligned, truth = flights.unaligned, flights.unaligned.truth
-    off_course_m = np.linalg.norm(truth.trajectory.positions - truth.reference, axis=1)
+    off_course_m = float(np.linalg.norm(truth.trajectory.positions - truth.reference, axis=1).max())
     without = "flown without alignment:"
     rows: list[Row] = [
         ("", "paper", "coarse texture", "full resolution"),
         ("map after alignment: area without a height", "none seen in Fig. 7 (b)",
          *(percent(holes(flown), 2) for flown in flights.aligned)),
         (f"{without} area without a height", "holes in Fig. 7 (c)", percent(holes(unaligned), 2), DASH),
-        (f"{without} 85 % of the map within", DASH, millimetres(_percentile(_height_errors(unaligned), 85)), DASH),
-        (f"{without} distance from the planned path, largest", DASH, millimetres(_percentile(off_course_m, 100)), DASH),
+        (f"{without} 85 % of the map within", DASH, millimetres(_elevation_error(unaligned, 85)), DASH),
+        (f"{without} distance from the planned path, largest", DASH, millimetres(off_course_m), DASH),
     ]  # fmt: skip
     return make_table("map", "The map with and without alignment", rows)
 
 
 def holes(flown: Flown) -> float:
-    """Returns the share of the asked area that has no height in the map."""
     return float(np.isnan(flown.elevation.height_m[flown.truth.asked]).mean())
 
 
@@ -221,10 +192,9 @@ def _errors(flown: Flown, path: str = "final") -> PathErrors:
     return path_errors(getattr(flown.result, path), flown.truth.trajectory)
 
 
-def _first_tracks(flown: Flown) -> Array:
-    """Returns the position errors of the frames of the first `FIRST_TRACKS` tracks [m]."""
+def _largest_of_first_tracks(flown: Flown) -> float:
     error_m = _errors(flown).distance_m
-    return error_m[flown.truth.track[: len(error_m)] <= FIRST_TRACKS]
+    return float(error_m[flown.truth.track[: len(error_m)] <= FIRST_TRACKS].max())
 
 
 def _far_end(flown: Flown, rank: int) -> float:
@@ -236,21 +206,18 @@ def _far_end(flown: Flown, rank: int) -> float:
     return values[rank] if rank < len(values) else np.nan
 
 
-def _height_errors(flown: Flown) -> Array:
+def _elevation_error(flown: Flown, percent: float) -> float:
     error = height_error(flown.elevation, flown.truth)
-    return np.abs(error[np.isfinite(error)])
-
-
-def _percentile(values: Array, percent: float) -> float:
-    return float(np.percentile(values, percent)) if len(values) else np.nan
+    found = percentile(np.abs(error[np.isfinite(error)]), percent)
+    return np.nan if found is None else found
 
 
 def _pair(values_m: Array) -> str:
     """Returns RMS and largest absolute value of errors (n,) [m] as text."""
-    return f"{millimetres(float(np.sqrt(np.mean(values_m**2))))} / {millimetres(_percentile(np.abs(values_m), 100))}"
+    return f"{millimetres(rms(values_m))} / {millimetres(float(np.abs(values_m).max()))}"
 
 
 def _degrees(values_rad: Array) -> str:
     """Returns RMS and largest absolute value of angles (n,) as text [deg]."""
     size = np.rad2deg(np.abs(values_rad))
-    return f"{np.sqrt(np.mean(size**2)):.3f} / {_percentile(size, 100):.3f} deg"
+    return f"{rms(size):.3f} / {size.max():.3f} deg"

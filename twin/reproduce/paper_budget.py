@@ -11,8 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from twin.judge.processing_budget import KEYFRAME_STAGES
-from twin.report.figures import log_axis
+from twin.report.plotting import log_axis
+from twin.report.stage_tables import KEYFRAME_STAGES
 from twin.report.style import COLOURS
 from twin.reproduce.exhibit import DASH, Exhibit, Figure, Row, Table, drawn, make_table, percent, write_exhibit
 from twin.reproduce.paper_flight import fly_aligned
@@ -26,8 +26,6 @@ PAPER_SIZE = ("rig.image_width_px=320", "rig.image_height_px=240")
 
 
 class Module(NamedTuple):
-    """A module of the paper's Fig. 2."""
-
     label: str  #: name of the module
     stage: str  #: key of its stage in the stopwatch; "" if it is part of the stage of another module
     unit: str  #: name of the item that one call processes, such as "frame" or "pair"
@@ -54,10 +52,7 @@ MODULES = (
 
 
 def run(folder: Path, quick: bool = False) -> Exhibit:
-    """Flies a part of the paper's mission (quick: one short track) and returns the results.
-
-    Writes budget.json and budget.png to a folder, which is created if missing.
-    """
+    """Flies a part of the paper's mission, quick: one track; writes budget.json, budget.png; returns the results."""
     flown = fly_aligned(load_scenario("paper", [*(QUICK if quick else FULL), *PAPER_SIZE]))
     n_frames, n_keyframes = len(flown.result.online), len(flown.result.keyframe_rows)
     text = (
@@ -67,17 +62,14 @@ def run(folder: Path, quick: bool = False) -> Exhibit:
     )
     table = budget_table(flown.stages, n_frames, n_keyframes)
     caption = "Time of each module per frame or keyframe; red: what the paper's 30 Hz leave for it."
-    figures = (Figure("budget.png", caption),)
-    exhibit = write_exhibit(Exhibit("budget", "Processing budget", text, (table,), figures), folder)
+    figure = Figure("budget.png", caption)
+    exhibit = write_exhibit(Exhibit("budget", "Processing budget", text, (table,), (figure,)), folder)
     draw(flown.stages, n_keyframes, folder / "budget.png")
     return exhibit
 
 
 def per_unit_ms(stages: Mapping[str, Any], stage: str, count: int) -> float | None:
-    """Returns the total time of a stage divided by `count` frames or keyframes [ms].
-
-    None if the stage never ran or `count` is 0.
-    """
+    """Returns the total time of a stage per frame or keyframe, of `count` [ms]; None if it never ran or without any."""
     row = stages.get(stage) or {}
     return 1e3 * row["total_s"] / count if row.get("count") and count else None
 
@@ -90,17 +82,11 @@ def keyframe_load_ms(stages: Mapping[str, Any], n_frames: int, n_keyframes: int)
 
 
 def budget_table(stages: Mapping[str, Any], n_frames: int, n_keyframes: int) -> Table:
-    """Returns a table with the time of each module and of all together, the paper's times and the budget at 30 Hz.
-
-    Args:
-        stages: durations of the stages, as `Stopwatch.summary` returns them.
-        n_frames, n_keyframes: numbers of frames and keyframes of the survey.
-    """
+    """Returns the time of each module and of all (`Stopwatch.summary`), the paper's times and the budget at 30 Hz."""
     rows: list[Row] = [("module", "paper (2003)", "ours, mean of a call", "per frame or keyframe", "budget", "share")]
     counts = {"frame": n_frames, "keyframe": n_keyframes}
     for module in MODULES:
-        row = stages.get(module.stage) or {}
-        mean = row.get("mean_ms")
+        mean = (stages.get(module.stage) or {}).get("mean_ms")
         each = per_unit_ms(stages, module.stage, counts[module.per]) if module.per in counts else None
         rows.append((
             module.label, module.paper, DASH if mean is None else f"{_ms(mean)} per {module.unit}",
@@ -122,7 +108,6 @@ def _ms(value: float | None) -> str:
 
 
 def draw(stages: Mapping[str, Any], n_keyframes: int, file: Path) -> None:
-    """Draws the time of each keyframe stage, and of F2F, with its budget, to a PNG file."""
     names = ("f2f", *KEYFRAME_STAGES)
     f2f = (stages.get("f2f") or {}).get("mean_ms") or 0.0
     values = [f2f, *(per_unit_ms(stages, name, n_keyframes) or 0.0 for name in KEYFRAME_STAGES)]

@@ -18,9 +18,10 @@ from twin.core.interrupts import StageGuard
 from twin.core.records import ElevationMap, Estimate, Frame, MapGrid, SurveyResult, Truth
 from twin.core.timing import Stopwatch
 from twin.errors import SurveyAborted, TwinError
-from twin.estimate.pipeline import Navigator, finish_in_stage
+from twin.estimate.pipeline import Navigator
 from twin.scenario.model import Scenario
-from twin.session.assembly import image_vision, make_navigator, open_world
+from twin.session.assembly import Estimators, image_vision, make_navigator, open_world
+from twin.session.conclusion import finish_in_stage
 from twin.survey import fly
 from twin.world.mission import Mission, prepare
 from twin.world.world import World
@@ -28,8 +29,6 @@ from twin.world.world import World
 
 @dataclass(frozen=True)
 class Flown:
-    """A mission that was flown."""
-
     mission: Mission
     result: SurveyResult
     elevation: ElevationMap  #: map along the final trajectory; after a flight without alignment, the F2F trajectory
@@ -39,7 +38,7 @@ class Flown:
 
 
 class F2fNavigator(Navigator):
-    """Navigator whose online and final poses are the integrated frame-to-frame motion, without any correction."""
+    """Navigator whose online and final poses are the integrated frame-to-frame motion."""
 
     def update(self, frame: Frame, track: int = 1) -> Estimate:
         estimate = super().update(frame, track)
@@ -54,28 +53,16 @@ class F2fNavigator(Navigator):
 
 
 def fly_in_parallel(flights: Mapping[str, tuple[Callable[[Scenario, str], Flown], Scenario]]) -> dict[str, Flown]:
-    """Flies missions in processes of their own, at most one per core, and returns them by name.
-
-    Prints lines of progress on stderr during long flights.
-
-    Args:
-        flights: function that flies the mission and its scenario, by name; the longest first.
-
-    Raises:
-        TwinError: a mission cannot be prepared, or no stereo pair became a keyframe.
-    """
+    """Flies missions, the longest first, in processes, at most one per core; raises errors as `fly_aligned` does."""
     with ProcessPoolExecutor(min(len(flights), os.cpu_count() or 1), mp_context=get_context("spawn")) as pool:
         flown = {name: pool.submit(function, scenario, name) for name, (function, scenario) in flights.items()}
         return {name: future.result() for name, future in flown.items()}
 
 
 def fly_aligned(scenario: Scenario, name: str = "") -> Flown:
-    """Flies a mission with all corrections; the network is aligned after each track.
+    """Flies a mission; the network is aligned after each track. With a name, long flights print lines of progress.
 
-    The name is that in the lines of progress on stderr; "": no such lines.
-
-    Raises:
-        TwinError: the mission cannot be prepared, or no stereo pair became a keyframe.
+    Raises TwinError if the mission cannot be prepared, or no stereo pair became a keyframe.
     """
     return _fly(prepare(scenario), make_navigator, name)
 
@@ -83,8 +70,8 @@ def fly_aligned(scenario: Scenario, name: str = "") -> Flown:
 def fly_without_alignment(scenario: Scenario, name: str = "") -> Flown:
     """Flies a mission on the integrated F2F motion, without F2M and GA, and maps along the F2F trajectory.
 
-    This is the case of Negahdaripour & Madjidi (2003, Fig. 7c): the vehicle follows a path with drift, so its images
-    do not cover the whole area, and the map has holes. Arguments and errors as for `fly_aligned`.
+    This is the case of Negahdaripour & Madjidi (2003, Fig. 7c): the path drifts, so the images do not cover the whole
+    area, and the map has holes. Arguments and errors as for `fly_aligned`.
     """
     estimate = scenario.estimate.model_copy(update={"use_f2m": False, "use_ga": False, "max_links": 1})
     return _fly(prepare(scenario.model_copy(update={"estimate": estimate})), _f2f_navigator, name)
@@ -92,7 +79,6 @@ def fly_without_alignment(scenario: Scenario, name: str = "") -> Flown:
 
 @contextmanager
 def _f2f_navigator(mission: Mission, _: World, folder: Path, stopwatch: Stopwatch) -> Generator[Navigator]:
-    """Opens an `F2fNavigator`; arguments as for `make_navigator`."""
     settings, noise = mission.scenario.estimator_settings(), mission.scenario.believed_noise()
     with (
         image_vision(mission, folder, stopwatch) as vision,
@@ -101,11 +87,8 @@ def _f2f_navigator(mission: Mission, _: World, folder: Path, stopwatch: Stopwatc
         yield navigator
 
 
-Make = Callable[[Mission, World, Path, Stopwatch], AbstractContextManager[Navigator]]
-
-
-def _fly(mission: Mission, make: Make, name: str = "") -> Flown:
-    """Flies a mission with the navigator that `make` opens, and builds the elevation map; name: see `fly_aligned`."""
+def _fly(mission: Mission, make: Callable[..., AbstractContextManager[Estimators]], name: str = "") -> Flown:
+    """Flies a mission with the navigator that `make` opens, with the arguments of `make_navigator`."""
     stopwatch, guard = Stopwatch(), StageGuard()
     with (
         tempfile.TemporaryDirectory(prefix="twin-") as folder,
@@ -135,15 +118,12 @@ def _progress_lines(name: str, n_frames: int) -> Callable[[Estimate, Frame], Non
 
 
 def finished_map(
-    navigator: Navigator, grid: MapGrid, guard: StageGuard, stopwatch: Stopwatch | None = None
+    navigator: Estimators, grid: MapGrid, guard: StageGuard, stopwatch: Stopwatch | None = None
 ) -> tuple[SurveyResult, ElevationMap]:
     """Returns the result of the estimators and the elevation map along the final trajectory.
 
-    If the final alignment fails, the result is without it, and `guard.cause` states why.
-
-    Raises:
-        TwinError: the survey has no keyframe, so that there is no map.
-        KeyboardInterrupt: the alignment was interrupted; an interrupt ends the whole experiment.
+    If the final alignment fails, the result is without it, and `guard.cause` states why. Raises TwinError without a
+    keyframe, and KeyboardInterrupt, which ends the experiment, if the alignment was interrupted.
     """
     result = finish_in_stage(navigator, guard)
     if guard.skipped:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twin.judge.map_error import height_error
 from twin.judge.trajectory_errors import keyframe_errors_m, path_errors
-from twin.report.figures import hillshade, log_axis
+from twin.report.plotting import hillshade, log_axis
 from twin.report.style import COLOURS
 from twin.reproduce.exhibit import drawn, extent_of
 from twin.reproduce.paper_flight import Flown
@@ -25,11 +25,10 @@ def draw_paths(flights: Mapping[str, Flown], file: Path) -> None:
     with drawn(file, 12.0, 6.4) as figure:
         panels = figure.subplots(1, len(flights), squeeze=False)[0]
         for axes, (name, flown) in zip(panels, flights.items(), strict=True):
-            paths = (("truth", flown.truth.trajectory), ("f2f", flown.result.f2f), ("final", flown.result.final))
-            for role, path in paths:
-                wide = {"linewidth": 4.0, "alpha": 0.35} if role == "truth" else {"linewidth": 0.9}
-                label = {"truth": "true", "f2f": "F2F alone", "final": "after alignment"}[role]
-                axes.plot(*path.positions[:, :2].T, color=COLOURS[role], label=label, **wide)
+            truth, f2f, final = flown.truth.trajectory, flown.result.f2f, flown.result.final
+            axes.plot(*truth.positions[:, :2].T, color=COLOURS["truth"], label="true", linewidth=4.0, alpha=0.35)
+            axes.plot(*f2f.positions[:, :2].T, color=COLOURS["f2f"], label="F2F alone", linewidth=0.9)
+            axes.plot(*final.positions[:, :2].T, color=COLOURS["final"], label="after alignment", linewidth=0.9)
             axes.set(title=name, xlabel="x [m]", ylabel="y [m]")
             axes.axis("equal")
             axes.legend(fontsize=8)

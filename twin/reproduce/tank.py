@@ -13,6 +13,7 @@ from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
 from twin.judge.map_error import height_error
+from twin.judge.summary_statistics import percentile
 from twin.judge.trajectory_errors import path_errors
 from twin.report.style import COLOURS
 from twin.reproduce.exhibit import (
@@ -46,10 +47,7 @@ _CAPTION = (
 
 
 def run(name: str, folder: Path, quick: bool = False) -> Exhibit:
-    """Surveys the tank ("tank1" or "tank2") and returns the results; writes NAME.json and NAME.png to a folder.
-
-    The quick version takes smaller images, of 320 x 240 pixels.
-    """
+    """Surveys "tank1" or "tank2" (quick: at 320 x 240 pixels); writes NAME.json, NAME.png; returns the results."""
     with tempfile.TemporaryDirectory(prefix="twin-") as images:
         survey = survey_tank(name, Path(images), QUICK if quick else ())
     grid, height_m, final = survey.mission.grid, survey.elevation.height_m, survey.result.final.world_from_camera
@@ -83,7 +81,6 @@ def _text(survey: TankSurvey) -> str:
 
 
 def _paper_table(survey: TankSurvey) -> Table:
-    """Returns a table of the figures that the paper states for its tank tests and of those of this survey."""
     rig, height_m = survey.mission.rig, float(survey.path.planned_m[0, 2])
     x, y = survey.path.planned_m[:, :2].T
     seen_m2 = survey.truth.seen.sum() * survey.mission.grid.cell_m**2
@@ -106,16 +103,15 @@ def _paper_table(survey: TankSurvey) -> Table:
 
 
 def _closure_table(survey: TankSurvey) -> Table:
-    rows = [("first frame repeated as", "before alignment", "online, with the mosaic", "after alignment", "limit")]
-    rows += [
-        (f"frame {c.frame}", millimetres(c.before_m), millimetres(c.online_m), millimetres(c.after_m), "5 mm")
-        for c in closures(survey.result, survey.path.repeats)
+    rows: list[Row] = [
+        ("first frame repeated as", "before alignment", "online, with the mosaic", "after alignment", "limit")
     ]
+    for k, errors_m in zip(survey.path.repeats, closures(survey.result, survey.path.repeats), strict=True):
+        rows.append((f"frame {k + 1}", *map(millimetres, errors_m), "5 mm"))
     return make_table("closure", "Closure error (the paper: ground truth of its test, no figure given)", rows)
 
 
 def sizes_table(sizes: Sequence[SizeRow]) -> Table:
-    """Returns the table of the sizes of the objects: true and measured sizes, largest absolute error [mm]."""
     rows: list[Row] = [
         ("object", "along x, true / measured", "along y, true / measured", "height, true / measured", "largest error")
     ]
@@ -124,20 +120,17 @@ def sizes_table(sizes: Sequence[SizeRow]) -> Table:
             f"{1e3 * true:.1f} / {DASH if np.isnan(found) else f'{1e3 * found:.1f}'}"
             for true, found in zip(row.true, row.measured, strict=True)
         ]
-        errors = np.abs(row.errors_m)
-        known = errors[np.isfinite(errors)]
-        rows.append((row.name, *pairs, f"{1e3 * known.max():.1f}" if known.size else DASH))
+        largest_m = percentile([error for error in np.abs(row.errors_m) if np.isfinite(error)], 100)
+        rows.append((row.name, *pairs, DASH if largest_m is None else f"{1e3 * largest_m:.1f}"))
     return make_table("sizes", "Sizes of the objects in the map, at half of their height [mm]", rows)
 
 
 def _map_table(survey: TankSurvey) -> Table:
     error, unanchored = height_errors(survey), np.abs(height_error(survey.elevation, survey.truth))
-    known = np.isfinite(error)
-    size = np.abs(error[known])
-    flagged = flagged_share(error, survey.elevation.sigma_m)
+    size, flagged = np.abs(error[np.isfinite(error)]), flagged_share(error, survey.elevation.sigma_m)
     rows = [
         ("", "paper", "ours"),
-        ("cells with a height, of those seen by both cameras", DASH, percent(known.sum() / survey.truth.seen.sum(), 1)),
+        ("cells with a height, of those seen by both cameras", DASH, percent(len(size) / survey.truth.seen.sum(), 1)),
         ("absolute height error: median", DASH, millimetres(float(np.median(size)))),
         ("absolute height error: 90th percentile", DASH, millimetres(float(np.percentile(size, 90)))),
         ("the same, not anchored at the first true pose: median", DASH, millimetres(float(np.nanmedian(unanchored)))),
@@ -149,11 +142,9 @@ def _map_table(survey: TankSurvey) -> Table:
 
 
 def flagged_share(error_m: Array, sigma_m: Array) -> float | None:
-    """Returns the share of the bad cells that are among the 20 % of cells with the largest sigma; None if none is bad.
+    """Returns the share of the bad cells (`BAD_M`) that are among the 20 % with the largest sigma; None if none is bad.
 
-    Args:
-        error_m: (rows, cols) height error [m]; NaN where unknown. A cell is bad if its absolute error exceeds `BAD_M`.
-        sigma_m: (rows, cols) predicted standard deviation [m].
+    Height error and sigma are (rows, cols) [m], NaN where unknown.
     """
     known = np.isfinite(error_m) & np.isfinite(sigma_m)
     bad = np.abs(error_m[known]) > BAD_M
@@ -167,7 +158,6 @@ LEAST_M, LARGEST_M = 2e-4, 0.1  # limits of the logarithmic scale of sigma and e
 
 
 def draw(title: str, survey: TankSurvey, file: Path) -> None:
-    """Draws the figure to a PNG file."""
     with drawn(file, 13.0, 7.4) as figure:
         figure.suptitle(title, fontsize=12)
         panels = figure.subplots(2, 3)

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.height_field import cast_ray, map_height_field
+from twin.core import geometry
+from twin.core.height_field import cast_pixels, map_height_field
 from twin.core.records import MapGrid, StereoRig
-from twin.kernels import kernel
 from twin.reproduce.experiment_floors import TankObject
 
 Array = NDArray[np.floating]
@@ -36,24 +36,18 @@ class Size(NamedTuple):
 
 
 class SizeRow(NamedTuple):
-    """Measured and true size of one object."""
-
     name: str
     measured: Size
     true: Size
 
     @property
     def errors_m(self) -> Size:
-        """Returns measured minus true size [m]."""
         return Size(*np.subtract(self.measured, self.true).tolist())
 
 
 class Window(NamedTuple):
-    """Part of a map around an object."""
-
-    #: x_m, y_m: (cols,), (rows,) coordinates of the cell centres relative to the centre of the object.
-    x_m: Array
-    y_m: Array
+    x_m: Array  #: (cols,) x of the cell centres, relative to the centre of the object
+    y_m: Array  #: (rows,) y likewise
     height_m: Array  #: (rows, cols) height above the floor around the object; NaN where unknown
 
 
@@ -83,7 +77,7 @@ def true_size(item: TankObject) -> Size:
 
 
 def _window(item: TankObject, height_m: Array, grid: MapGrid, hidden: NDArray[np.bool_] | None) -> Window:
-    """Returns the part of a map around an object; heights are above their median in the outer half of the margin."""
+    """Returns the window of an object; heights are above their median in the outer half of the margin."""
     x, y = (axis - c for axis, c in zip(grid.centres(), item.centre_m, strict=True))
     inside = [np.abs(axis) <= side / 2 + MARGIN_M for axis, side in zip((x, y), item.size_m, strict=False)]
     part = height_m[np.ix_(inside[1], inside[0])].astype(np.float64)
@@ -95,7 +89,7 @@ def _window(item: TankObject, height_m: Array, grid: MapGrid, hidden: NDArray[np
 
 
 def _plateau(window: Window) -> float:
-    """Returns the median height of the cells on top of an object with a flat top [m]; NaN without heights."""
+    """Returns the median height of a flat top [m]; NaN without heights."""
     known = window.height_m[np.isfinite(window.height_m)]
     if known.size == 0:
         return np.nan
@@ -131,10 +125,8 @@ _TOPS: dict[str, Callable[[Window], float]] = {"box": _plateau, "disc": _plateau
 def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
     """Returns the distance between the outermost places on both sides of 0 where a profile rises to a level [m].
 
-    The profile has heights (n,) at places (n,) relative to the centre of the object [m]; NaN heights are ignored. The
-    places are interpolated linearly between the last point at or below the level and the first one above it, from
-    outside to inside, so that holes and mismatches on top of an object do not count. NaN if the profile does not rise
-    above the level on both sides, or is above it at an end.
+    The profile has heights (n,) at places (n,) [m]; NaN heights are ignored. Holes and mismatches on top of an object
+    do not count, because the level is sought from outside to inside. NaN if `_rise` is, on one of the sides.
     """
     known = np.isfinite(height_m)
     if not np.isfinite(level_m) or not known.any():
@@ -145,9 +137,9 @@ def _extent(at_m: Array, height_m: Array, level_m: float) -> float:
 
 
 def _rise(at: Array, above: Array) -> float:
-    """Returns the place farthest from 0 at which a profile on one side of 0 rises above the level, towards 0 [m].
+    """Returns the place farthest from 0 at which heights (n,) above the level, on one side of 0, become positive [m].
 
-    The heights (n,) are above the level. NaN if the profile does not rise, or is above the level at its end.
+    It is interpolated linearly; NaN if the profile does not rise, or is above the level at its end.
     """
     order = np.argsort(-np.abs(at))
     at, above = at[order], above[order]
@@ -160,18 +152,16 @@ def _rise(at: Array, above: Array) -> float:
 
 
 def _median(values: Iterable[float]) -> float:
-    """Returns the median of the finite values; NaN if there are none."""
-    found = np.array([value for value in values if np.isfinite(value)])
-    return float(np.median(found)) if found.size else np.nan
+    found = [value for value in values if np.isfinite(value)]
+    return float(np.median(found)) if found else np.nan
 
 
 def hidden_cells(height_m: NDArray[np.floating], grid: MapGrid, poses: Array, rig: StereoRig) -> NDArray[np.bool_]:
     """Returns a mask (rows, cols) of the cells without a height whose floor an object hides in every stereo pair.
 
-    The floor of a cell is visible in a pair if it lies in both images and no object is between it and one of the
-    cameras. The level floor has the median height of the map; the objects are the heights of the map. A cell on top of
-    an object is not hidden, so that a cell in the mask is floor beside an object. Cells whose floor lies in no pair of
-    images are not in the mask. The poses (n, 4, 4) are the estimated world_from_camera of the left images.
+    The floor of a cell, at the median height of the map, is visible in a pair if it lies in both images and nothing in
+    the map is between it and one of the cameras. Cells whose floor lies in no pair of images are not in the mask. The
+    poses (n, 4, 4) are the estimated world_from_camera of the left images.
     """
     unknown = np.isnan(height_m)
     if unknown.all():
@@ -179,34 +169,19 @@ def hidden_cells(height_m: NDArray[np.floating], grid: MapGrid, poses: Array, ri
     floor_m = float(np.nanmedian(height_m))
     field = map_height_field(np.where(unknown, floor_m, height_m), grid)
     x, y = (axis[unknown] for axis in np.meshgrid(*grid.centres()))
-    camera = (rig.fx_px, rig.fy_px, rig.cx_px, rig.cy_px, rig.width_px - 1.0, rig.height_px - 1.0, rig.baseline_m)
+    floor, last_px = np.column_stack([x, y, np.full(len(x), floor_m)]), [rig.width_px - 1, rig.height_px - 1]
+    in_images, visible = np.zeros((2, len(floor)), np.bool_)
+    for left in poses:
+        cameras = (left, left @ geometry.pose(np.eye(3), np.array([rig.baseline_m, 0.0, 0.0])))
+        points = [geometry.transform(geometry.inverse(camera), floor) for camera in cameras]
+        pixels = [rig.project(seen) for seen in points]
+        inside = np.all([(place >= 0) & (place <= last_px) for place in pixels], axis=(0, 2))  # NaN is outside
+        clear = [
+            cast_pixels(field, camera[None], rig, place[inside])[0] >= (1 - HIDDEN_BEFORE) * seen[inside, 2]
+            for camera, seen, place in zip(cameras, points, pixels, strict=True)
+        ]
+        in_images |= inside
+        visible[inside] |= np.logical_and(*clear)
     hidden = np.zeros(height_m.shape, np.bool_)
-    hidden[unknown] = _hidden(field, np.ascontiguousarray(poses, np.float64), camera, x, y, floor_m)
-    return hidden
-
-
-@kernel
-def _hidden(field, poses, camera, xs, ys, z):
-    """Compiled kernel of `hidden_cells`, for the floor points (xs, ys, z)."""
-    fx, fy, cx, cy, last_u, last_v, baseline = camera
-    hidden = np.zeros(len(xs), np.bool_)
-    for k in range(len(xs)):
-        x, y = xs[k], ys[k]
-        for pose in poses:
-            dx, dy, dz = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
-            depth = pose[0, 2] * dx + pose[1, 2] * dy + pose[2, 2] * dz
-            if depth <= 0:
-                continue
-            u = fx * (pose[0, 0] * dx + pose[1, 0] * dy + pose[2, 0] * dz) / depth + cx
-            v = fy * (pose[0, 1] * dx + pose[1, 1] * dy + pose[2, 1] * dz) / depth + cy
-            if not (u <= last_u and 0 <= v <= last_v and u - fx * baseline / depth >= 0):
-                continue
-            hidden[k] = False
-            for shift in (0.0, baseline):
-                ox, oy, oz = (pose[0, 3] + shift * pose[0, 0], pose[1, 3] + shift * pose[1, 0],
-                              pose[2, 3] + shift * pose[2, 0])  # fmt: skip
-                if cast_ray(field, ox, oy, oz, x - ox, y - oy, z - oz) < 1 - HIDDEN_BEFORE:
-                    hidden[k] = True
-            if not hidden[k]:
-                break
+    hidden[unknown] = in_images & ~visible
     return hidden

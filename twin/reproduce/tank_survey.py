@@ -40,8 +40,6 @@ JITTER_M, JITTER_RAD = 0.001, float(np.deg2rad(0.1))  # standard deviation of ea
 
 
 class RigPath(NamedTuple):
-    """Path of the rig."""
-
     planned_m: Array  #: (n, 3) positions of the left camera as read on the track
     world_from_camera: Array  #: (n, 4, 4) true poses of the left camera
     repeats: tuple[int, ...] = ()  #: numbers (from 0) of the frames that repeat frame 0
@@ -54,23 +52,12 @@ class RigPath(NamedTuple):
 
 @dataclass(frozen=True)
 class TankSurvey:
-    """A tank experiment: estimates and truth."""
-
-    mission: Mission  #: rig, floor and map grid
+    mission: Mission
     path: RigPath
     result: SurveyResult
     elevation: ElevationMap  #: map along the final trajectory
     truth: Truth
     ended: str = ""  #: why the final alignment is missing; "" if it was done
-
-
-class Closure(NamedTuple):
-    """Closure errors: distances between the estimated positions of the first frame and of a frame that repeats it."""
-
-    frame: int  #: number of the frame that repeats the first, from 1
-    before_m: float  #: of the integrated frame-to-frame motion
-    online_m: float  #: of the online estimate, which registration with the mosaic corrects
-    after_m: float  #: after the global alignment
 
 
 def lawnmower_path(n_pairs: int, seed: int) -> RigPath:
@@ -115,24 +102,15 @@ def _rig_path(xy: Array, seed: int) -> RigPath:
     return RigPath(planned, poses)
 
 
-def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: int = N_PAIRS) -> TankSurvey:
-    """Returns the survey of a tank experiment.
+def survey_tank(name: str, folder: Path, settings: Sequence[str] = ()) -> TankSurvey:
+    """Returns the survey of a tank experiment: "tank1", parallel legs, or "tank2", two loops that touch at the start.
 
-    The estimators start at the planned pose of the first frame; the true pose differs from it by the bend and the
-    jitter of the track.
-
-    Args:
-        name: "tank1", parallel legs, or "tank2", two loops that touch at the start.
-        folder: folder for the keyframe images.
-        settings: overrides of the scenario `tank`, each "key=value".
-        n_pairs: number of stereo pairs of tank1.
-
-    Raises:
-        TwinError: a setting is invalid, or no stereo pair became a keyframe, so that there is no map.
+    The estimators start at the planned pose of the first frame; the true one has the bend and jitter of the track.
+    Keyframe images go to `folder`; `settings` are overrides "key=value" of the scenario `tank`. Raises TwinError if a
+    setting is invalid, or no stereo pair became a keyframe.
     """
-    path = two_loops_path(SEED) if name == "tank2" else lawnmower_path(n_pairs, SEED)
-    mission = tank_mission(settings)
-    stopwatch, guard = Stopwatch(), StageGuard()
+    path = two_loops_path(SEED) if name == "tank2" else lawnmower_path(N_PAIRS, SEED)
+    mission, stopwatch, guard = tank_mission(settings), Stopwatch(), StageGuard()
     rig, estimator, n = mission.rig, mission.scenario.estimator_settings(), len(path.planned_m)
     still = np.zeros_like(path.planned_m)
     reference = Reference(path.planned_m, still, np.zeros(n), still)
@@ -156,11 +134,10 @@ def survey_tank(name: str, folder: Path, settings: Sequence[str] = (), n_pairs: 
 
 
 def height_errors(survey: TankSurvey) -> Array:
-    """Returns estimated minus true height (rows, cols) [m], anchored at the first true pose as the trajectories are.
+    """Returns estimated minus true height (rows, cols) [m]; NaN where a cell was not observed or estimated.
 
-    The motion that maps the first estimated pose to the first true one is applied to the map before the comparison:
-    the estimators do not know the bend and jitter of the track at its start. NaN where a cell was not observed or
-    estimated.
+    The map is anchored at the first true pose, as the trajectories are: the estimators do not know the bend and jitter
+    of the track at its start.
     """
     true_from_map = anchor(survey.result.final.world_from_camera[0], survey.truth.trajectory.world_from_camera[0])
     x, y = np.meshgrid(*survey.mission.grid.centres())
@@ -173,8 +150,7 @@ def height_errors(survey: TankSurvey) -> Array:
 def tank_mission(settings: Sequence[str]) -> Mission:
     """Returns the mission of the scenario `tank`, over the floor with objects, with the map grid of `AREA_M`."""
     mission = prepare(load_scenario("tank", settings))
-    cell_m = mission.scenario.map.cell_m
-    return replace(mission, terrain=tank_floor(SEED), grid=map_grid(cell_m))
+    return replace(mission, terrain=tank_floor(SEED), grid=map_grid(mission.scenario.map.cell_m))
 
 
 def map_grid(cell_m: float) -> MapGrid:
@@ -183,7 +159,7 @@ def map_grid(cell_m: float) -> MapGrid:
     return MapGrid(-(cols + 0.5) * cell_m, (rows + 0.5) * cell_m, cell_m, 2 * rows + 1, 2 * cols + 1)
 
 
-def closures(result: SurveyResult, repeats: Sequence[int]) -> list[Closure]:
-    """Returns the closure errors of a survey at the frames (numbers from 0) that repeat frame 0."""
+def closures(result: SurveyResult, repeats: Sequence[int]) -> list[list[float]]:
+    """Returns the closure errors [m] at the frames `repeats` that repeat frame 0: of F2F, online, after alignment."""
     paths = (result.f2f.positions, result.online.positions, result.final.positions)
-    return [Closure(k + 1, *(float(np.linalg.norm(path[k] - path[0])) for path in paths)) for k in repeats]
+    return [[float(np.linalg.norm(path[k] - path[0])) for path in paths] for k in repeats]

@@ -17,7 +17,7 @@ from twin.core.records import Image, StereoRig
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
 from twin.imaging.light.water import Medium
-from twin.report.figures import log_axis
+from twin.report.plotting import log_axis
 from twin.reproduce.exhibit import Exhibit, Figure, drawn, make_table, write_json
 from twin.reproduce.experiment_floors import block_on_sand
 from twin.scenario.file import load_scenario
@@ -43,10 +43,8 @@ MIN_VISIBLE_CONTRAST = 0.05
 
 
 class TurbidityLevel(NamedTuple):
-    """Results for one turbidity level."""
-
-    scenario: Scenario  #: scenario with this turbidity
-    water: Medium  #: optical properties of the water
+    scenario: Scenario
+    water: Medium
     image: Image  #: (H, W, 3) image of the left camera
     quality: dict[str, Any]  #: measures of the quality of `image`, see `twin.app.look.image_quality`
     ranges_m: Array  #: (n,) ranges at which `contrast` is given
@@ -83,14 +81,11 @@ def render_levels(
 
 
 def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: Array) -> Array:
-    """Returns the contrast of fine detail on a level floor, relative to clear water.
+    """Returns the contrast (n, 3) of fine detail on a level floor at ranges (n,) [m], relative to clear water; R, G, B.
 
     Only the direct signal carries fine detail; forward scatter (a blur) and backscatter add light without it. The
     contrast C relative to its value C0 in clear water is therefore C / C0 = direct / (direct + forward + backscatter)
     (Duntley 1963, here for lamps that are fixed to the camera).
-
-    Returns:
-        (n, 3) relative contrast for R, G, B at the ranges (n,) [m].
     """
     rig: StereoRig = replace(scenario.believed_rig(), width_px=64, height_px=48)
     rig = replace(rig, focal_px=rig.focal_px * 64 / scenario.rig.image_width_px)
@@ -98,9 +93,8 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
     floor = np.full((48, 64, 3), 128, np.uint8)
     contrast = np.empty((len(ranges_m), 3))
     for k, range_m in enumerate(ranges_m):
-        depth = np.full(floor.shape[:2], range_m, np.float32)
+        centre, depth = np.s_[20:28, 28:36], np.full(floor.shape[:2], range_m, np.float32)
         direct, forward, backscatter = optics.parts(floor, depth, 0)
-        centre = np.s_[20:28, 28:36]
         parts = (direct, backscatter if forward is None else forward + backscatter)
         signal, scattered = (np.mean(part[centre], axis=(0, 1), dtype=np.float64) for part in parts)
         contrast[k] = signal / (signal + scattered)
@@ -108,7 +102,6 @@ def relative_contrast(scenario: Scenario, illumination: Illumination, ranges_m: 
 
 
 def _summary(levels: Sequence[TurbidityLevel]) -> dict[str, Any]:
-    """Returns the contents of turbidity.json: water, image quality and contrast at each turbidity level."""
     names = ("gray_level", "contrast", "veil_share", "saturated_share", "snr", "texture_snr")
     return {
         "schema": "twin.turbidity/1",
@@ -156,7 +149,6 @@ def write(levels: Sequence[TurbidityLevel], folder: Path) -> dict[str, Any]:
 
 
 def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
-    """Draws the figure to a PNG file."""
     height, width = levels[0].image.shape[:2]
     image_in = PANEL_IN * height / width
     with drawn(file, PANEL_IN * len(levels), image_in + 1.6 + 3.4 + 0.6) as figure:
@@ -164,7 +156,11 @@ def draw(levels: Sequence[TurbidityLevel], file: Path) -> None:
         figure.suptitle(_title(levels), fontsize=12)
         top = max(_histogram_of(level.image, band).max() for level in levels for band in range(3))
         for k, level in enumerate(levels):
-            _picture(figure.add_subplot(grid[0, k]), level)
+            picture = figure.add_subplot(grid[0, k])
+            picture.imshow(level.image)
+            picture.set_axis_off()
+            turbidity, c = level.scenario.water.turbidity, level.water.attenuation_per_m[1]
+            picture.set_title(f"turbidity {turbidity:g}   (green c = {c:.2f} /m)", loc="left")
             _histogram(figure.add_subplot(grid[1, k]), level, top, first=k == 0)
         _curves(figure.add_subplot(grid[2, :]), levels)
 
@@ -175,13 +171,6 @@ def _title(levels: Sequence[TurbidityLevel]) -> str:
         f"multiplied by the turbidity, two lamps, equal mean exposure, "
         f"{levels[0].quality['depth_median_m']:.2f} m below the camera"
     )
-
-
-def _picture(axes: Axes, level: TurbidityLevel) -> None:
-    axes.imshow(level.image)
-    axes.set_axis_off()
-    c = level.water.attenuation_per_m[1]
-    axes.set_title(f"turbidity {level.scenario.water.turbidity:g}   (green c = {c:.2f} /m)", loc="left")
 
 
 def _histogram_of(image: Any, band: int) -> Any:

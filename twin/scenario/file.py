@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import os
 import re
 import tomllib
@@ -16,7 +15,7 @@ import tomlkit
 from pydantic import BaseModel, ValidationError
 
 from twin.core.user_files import is_file, read_text, resolved
-from twin.errors import ScenarioError, TwinError
+from twin.errors import ScenarioError, TwinError, did_you_mean
 from twin.scenario.model import Scenario, Source
 from twin.scenario.toml_lines import key_lines
 from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVELS, parse_toml, value_errors
@@ -45,15 +44,8 @@ _MAX_ERRORS = 20
 def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins: bool = False) -> Scenario:
     """Returns the validated scenario of a file, merged over the files that it extends, with overrides applied.
 
-    Args:
-        path: path of a scenario file, or name of a scenario in scenes/.
-        overrides: strings `key=value` with a dotted key and a TOML value; other values are taken as strings.
-        allow_plugins: whether a plug-in may be named as module:Class, which runs code of any module that can be
-            imported; the names of installed entry points are always allowed.
-
-    Raises:
-        ScenarioError: there is no such scenario, or a file or an override is invalid; lists the errors of files as
-            `FILE:LINE: key: problem (allowed: ...)`, and those of overrides in lines that begin with `--set`.
+    Arguments and errors are those of `twin.load_scenario`; overrides are strings `key=value` with a dotted key and a
+    TOML value, and other values are taken as strings.
     """
     tree, source, errors = _read_with_base(find_scene(path))
     base = copy.deepcopy(tree)
@@ -75,9 +67,8 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins
 def read_tree(path: str | Path) -> dict[str, Any]:
     """Returns the keys and values of a scenario, merged over those of its base file; the values are not validated.
 
-    Raises:
-        ScenarioError: there is no such scenario, or a file is invalid (`read_toml`), extends itself or an unknown file,
-            or contains the old name of a renamed key.
+    Raises ScenarioError if there is no such scenario, or a file is invalid (`read_toml`), extends itself or an unknown
+    file, or contains the old name of a renamed key.
     """
     tree, _, errors = _read_with_base(find_scene(path))
     if errors:
@@ -86,16 +77,11 @@ def read_tree(path: str | Path) -> dict[str, Any]:
 
 
 def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Source) -> Scenario:
-    """Sets keys of a scenario to new values and returns the validated scenario.
+    """Sets dotted keys of a scenario to new values and returns the validated scenario; `tree` is not modified.
 
-    Args:
-        tree: keys and values of a scenario; not modified.
-        values: dotted keys and their new values; relative file paths refer to the folder of `source.path`. An empty
-            path leaves its key as it is in `tree`, so that a table can set a file in some of its rows only.
-        source: file that the new values come from, for error messages.
-
-    Raises:
-        ScenarioError: a key is renamed or cannot be set, or the scenario is invalid.
+    Relative file paths refer to the folder of `source.path`, the file that the values come from, for messages. An empty
+    path leaves its key as it is in `tree`, so that a table can set a file in some of its rows only. Raises
+    ScenarioError if a key is renamed or cannot be set, or the scenario is invalid.
     """
     changed = copy.deepcopy(dict(tree))
     for key, value in values.items():
@@ -114,9 +100,8 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
 def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Model:
     """Returns the model of a tree of keys and values.
 
-    Raises:
-        ScenarioError: a key or a value is invalid, or a plug-in is named as module:Class and the source does not allow
-            it; lists up to `_MAX_ERRORS` errors and the number of the others.
+    Raises ScenarioError if a key or a value is invalid, or a plug-in is named as module:Class and the source does not
+    allow it; lists up to `_MAX_ERRORS` errors and the number of the others.
     """
     if refused := [] if source.allow_plugins else [source.describe(error) for error in _plugin_errors(tree)]:
         raise ScenarioError(refused)
@@ -130,7 +115,6 @@ def validated(tree: Mapping[str, Any], model: type[Model], source: Source) -> Mo
 
 
 def _on_its_floor(tree: dict[str, Any], base: Mapping[str, Any], source: Source) -> Scenario:
-    """Returns the scenario of a tree, without the objects of its base if they lie on another floor."""
     _leave_objects_on_their_floor(tree, base)
     scenario = validated(tree, Scenario, source)
     scenario._source = source
@@ -138,7 +122,6 @@ def _on_its_floor(tree: dict[str, Any], base: Mapping[str, Any], source: Source)
 
 
 def _plugin_errors(tree: Mapping[str, Any]) -> Iterator[TwinError]:
-    """Yields an error for each key that names a plug-in as module:Class: it would run code of any module."""
     for section, kind in _PLUGIN_SECTIONS.items():
         keys = tree.get(section)
         name = keys.get("plugin") if isinstance(keys, dict) else None
@@ -147,7 +130,6 @@ def _plugin_errors(tree: Mapping[str, Any]) -> Iterator[TwinError]:
 
 
 def plugin_error(key: str, name: str, kind: str) -> TwinError:
-    """Returns the error of a plug-in that is named as module:Class without permission."""
     problem = f"{shown(repr(name))} runs code of any module"
     return TwinError(key, problem, f"an installed entry point of twin.{kind}; any with --allow-plugins ({_IN_PYTHON})")
 
@@ -155,8 +137,7 @@ def plugin_error(key: str, name: str, kind: str) -> TwinError:
 def find_scene(path: str | Path) -> Path:
     """Returns the path of a file, or of the scenario of this name in scenes/, with or without "scenes/" and ".toml".
 
-    Raises:
-        ScenarioError: there is neither a file nor a scenario of this name.
+    Raises ScenarioError if there is neither a file nor a scenario of this name.
     """
     candidate = Path(path)
     if is_file(candidate):
@@ -165,12 +146,11 @@ def find_scene(path: str | Path) -> Path:
     name = str(path).removesuffix(".toml").removeprefix("scenes/")
     if name in files:
         return files[name]
-    hint, allowed = _hint(str(path), list(files)), f"a file, or one of {', '.join(files)}"
+    hint, allowed = did_you_mean(str(path), list(files)), f"a file, or one of {', '.join(files)}"
     raise ScenarioError([f"{shown(str(path))}: no such scenario{hint} (allowed: {allowed})"])
 
 
 def _built_in_scenes() -> dict[str, Path]:
-    """Returns the scenario files in scenes/ by name, in alphabetical order."""
     from twin import scenes
 
     return {file.stem: file for file in sorted(Path(scenes.__file__).parent.glob("*.toml"))}
@@ -187,8 +167,7 @@ def dump_toml(scenario: Scenario) -> str:
 def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
     """Returns the keys and values of one TOML file, and the line number of each dotted key (`key_lines`).
 
-    Raises:
-        ScenarioError: the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
+    Raises ScenarioError if the file cannot be read, is not TOML, or exceeds the limits of `toml_text`.
     """
     try:
         text = read_text(file, most_bytes=4 * MAX_CHARACTERS, encoding="utf-8-sig")
@@ -209,12 +188,9 @@ def read_toml(file: Path) -> tuple[dict[str, Any], dict[str, int]]:
 def _read_with_base(file: Path, including: tuple[Path, ...] = ()) -> tuple[dict[str, Any], Source, list[str]]:
     """Reads a file and merges it over its base file; `including` are the absolute paths of the files that extend it.
 
-    Returns:
-        The merged keys and values, with absolute file paths and without old names of renamed keys; the files and line
-        numbers that they come from; and one error for each old name.
-
-    Raises:
-        ScenarioError: the file extends itself, its base file does not exist, or a file is invalid (`read_toml`).
+    Returns the merged keys and values, with absolute file paths and without old names of renamed keys; the files and
+    line numbers that they come from; and one error for each old name. Raises ScenarioError if the file extends itself,
+    its base file does not exist, or a file is invalid (`read_toml`).
     """
     if resolved(file) in including:
         raise ScenarioError([f"{file}:1: extends: the file extends itself (allowed: another file)"])
@@ -246,19 +222,16 @@ def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any])
 
 
 def _remove(tree: dict[str, Any], key: str) -> bool:
-    """Removes a dotted key of up to two parts from the tree; returns whether it was there."""
     section, _, leaf = key.rpartition(".")
     node = tree.get(section) if section else tree
     return isinstance(node, dict) and node.pop(leaf, tree) is not tree
 
 
 def _is_path_key(key: str) -> bool:
-    """Returns whether a dotted key of the scenario has a file path as its value."""
     return re.sub(r"\.\d+\b", "", key) in _PATH_KEYS
 
 
 def _absolute(key: str, value: Any, folder: Path) -> Any:
-    """Returns the value of a key, with absolute file paths in it; relative paths refer to `folder`."""
     if isinstance(value, dict):
         return {name: _absolute(f"{key}.{name}" if key else name, item, folder) for name, item in value.items()}
     if isinstance(value, list):
@@ -275,7 +248,6 @@ def _expand(value: str, folder: Path) -> Path:
 
 
 def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
-    """Returns the merge of two trees of keys and values at all levels; a value in `top` replaces that in `base`."""
     result = dict(base)
     for key, value in top.items():
         nested = isinstance(value, dict) and isinstance(result.get(key), dict)
@@ -284,7 +256,6 @@ def _merge(base: dict[str, Any], top: dict[str, Any]) -> dict[str, Any]:
 
 
 def _apply_override(tree: dict[str, Any], override: str) -> None:
-    """Sets a key of the tree to the value of an override `key=value`; raises ScenarioError if this is impossible."""
     key, equals, text = override.partition("=")
     key = key.strip()
     if not equals or not key:
@@ -336,7 +307,6 @@ def _assign(tree: dict[str, Any], key: str, value: Any, origin: str) -> None:
 
 
 def _child(node: Any, part: str, origin: str) -> Any:
-    """Returns the value of the key or list item `part` of a node; a missing key gets an empty section as its value."""
     if not isinstance(node, list):
         return node.setdefault(part, {})
     if not part.isdecimal() or int(part) >= len(node):
@@ -346,7 +316,6 @@ def _child(node: Any, part: str, origin: str) -> Any:
 
 
 def _renamed(key: str) -> str | None:
-    """Returns the new name of a renamed key, or of a key in a renamed section; None for any other key."""
     for old, new in _RENAMED_KEYS.items():
         if key == old or key.startswith(f"{old}."):
             return new + key.removeprefix(old)
@@ -354,11 +323,10 @@ def _renamed(key: str) -> str | None:
 
 
 def _as_twin_error(item: Any, model: type[BaseModel]) -> TwinError:
-    """Converts a pydantic error to a TwinError with dotted key, problem and allowed values."""
     field = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         allowed = _fields(item["loc"][:-1], model)
-        return TwinError(field, f"unknown key{_hint(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
+        return TwinError(field, f"unknown key{did_you_mean(str(item['loc'][-1]), allowed)}", ", ".join(allowed))
     value = item.get("input")
     text = "" if isinstance(value, dict) else f"{shown(repr(value))}: "
     if item["type"] == "missing":
@@ -385,13 +353,12 @@ _ALLOWED = {
 }
 
 
-def shown(text: str, longest: int = 200) -> str:
-    """Returns the text for an error message: a longer text is cut off at half of `longest`, and its length stated."""
-    return text if len(text) <= longest else f"{text[: longest // 2]}... ({len(text)} characters)"
+def shown(text: str) -> str:
+    """Returns the text for an error message; of more than 200 characters, the first 100."""
+    return text if len(text) <= 200 else f"{text[:100]}... ({len(text)} characters)"
 
 
 def _fields(location: Iterable[Any], model: Any) -> list[str]:
-    """Returns the keys allowed in a section of the model; `location` are the keys that lead to it."""
     for part in location:
         if part not in model.model_fields:  # an item of a list, a key of a table
             continue
@@ -399,9 +366,3 @@ def _fields(location: Iterable[Any], model: Any) -> list[str]:
         arguments = getattr(annotation, "__args__", (annotation,))
         model = next(a for a in arguments if isinstance(a, type) and issubclass(a, BaseModel))
     return list(model.model_fields)
-
-
-def _hint(word: str, names: Sequence[str]) -> str:
-    """Returns ` (did you mean NAME?)` with the name most similar to the word, or "" if none is similar."""
-    close = difflib.get_close_matches(word[:100], names, n=1)
-    return f" (did you mean {close[0]}?)" if close else ""

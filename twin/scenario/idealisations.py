@@ -37,7 +37,6 @@ def idealisations(scenario: Scenario) -> list[str]:
 
 
 def _absent_in_water(scenario: Scenario) -> dict[str, bool]:
-    """Returns whether the scenario leaves out each effect of real water."""
     water = scenario.water
     clear = water.jerlov == "clear" and water.absorption_per_m is None and water.spectrum_file is None
     given_zero = [value is not None and not any(value) for value in (water.absorption_per_m, water.scattering_per_m)]

@@ -55,7 +55,6 @@ RelativeIntensity = Annotated[Number, Field(ge=0, le=100)]
 
 
 def _path(text: str) -> str:
-    """Returns the text, checked by `path_problem`."""
     if problem := path_problem(Path(text)):
         raise PydanticCustomError("path", "a path; it {problem}", {"problem": problem})
     return text
@@ -78,11 +77,7 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Returns a copy with some fields changed, validated like new values.
-
-        Raises:
-            ValidationError: a field is unknown, or its value is invalid.
-        """
+        """Returns a copy with some fields changed, validated like new values; raises ValidationError."""
         copied = super().model_copy(deep=deep)
         if update:
             changed = type(self).model_validate({**vars(self), **update})
@@ -101,7 +96,6 @@ class Section(BaseModel):
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        """Returns the JSON schema with each description in one line."""
         found = handler(schema)
         for key in handler.resolve_ref_schema(found)["properties"].values():
             if "description" in key:
@@ -134,15 +128,13 @@ class TerrainConfig(Section):
     mesh_scale: float = Field(default=1.0, ge=1e-4, le=1e4)
     """metres per unit of mesh_file"""
     height_file: FilePath | None = None
-    """DEM: GeoTIFF, 16-bit PNG or .npy; heights are in metres unless a GeoTIFF names another unit; ${TWIN_DATA} is
-    expanded"""
+    """DEM: GeoTIFF, 16-bit PNG or .npy; in metres unless a GeoTIFF names another unit; ${TWIN_DATA} is expanded"""
     height_spacing_m: float = Field(default=0.01, gt=0, le=10)
     """grid spacing of a PNG or .npy height file [m]"""
     height_range_m: float = Field(default=1.0, gt=0, le=1000)
     """height of full white above full black in a PNG height file [m]"""
     z: Literal["up", "down"] | None = None
-    """direction in which the values of height_file increase: up for elevations, down for depths; default: determined
-    from the file; an ambiguous file is an error"""
+    """direction of growing values of height_file: up, or down for depths; default: found from the file, or an error"""
     cover: Literal["sand", "rubble", "rock", "reef", "coral", "seagrass", "mud"] | None = None
     """materials of a generated texture; reef: sand, rubble, rock and coral by height and slope; coral: sand, fragments
     of coral and rock with crustose algae; default: that of the kind of floor; not with texture_file"""
@@ -167,8 +159,7 @@ class TerrainConfig(Section):
     roughness_deg: float = Field(default=20.0, ge=0, le=60)
     """standard deviation of the slopes too small for the height grid; oren_nayar only [deg]"""
     specular: float = Field(default=0.0, ge=0, le=1)
-    """fraction of the light of lamps that is mirrored in highlights, for wet or metallic floors; the rest is reflected
-    by the material"""
+    """fraction of the light of lamps mirrored in highlights (wet, metallic floors); the material reflects the rest"""
     specular_width_deg: float = Field(default=15.0, ge=2, le=45)
     """width of the highlights: slope of the mirroring facets (GGX) [deg]"""
 
@@ -212,26 +203,22 @@ class ImagingConfig(Section):
     """Image formation."""
 
     fidelity: Literal["rendered", "surrogate"] = "rendered"
-    """rendered: images are rendered and matched; surrogate: measurements are sampled from a fitted error model, about a
-    hundred times faster"""
+    """rendered: images are rendered and matched; surrogate: measurements of a fitted error model, 100 times faster"""
     error_model: FilePath | None = None
     """error model of the surrogate, written by `twin fit-surrogate`; default: built-in"""
     extrapolate: bool = False
-    """run a surrogate survey that lies outside the fitted range of its error model, with a warning; false: such a
-    survey is refused; set by --extrapolate"""
+    """run a surrogate survey outside the fitted range of its error model, with a warning; set by --extrapolate"""
     gray_level: float = Field(default=0.45, gt=0.01, lt=1)
     """target of auto-exposure: mean image level, a fraction of full scale"""
     noise_sd: float = Field(default=0.008, ge=0, le=0.5)
     """read noise (1 sigma), a fraction of full scale; unused with [sensor]"""
     shot_noise: float = Field(default=0.006, ge=0, le=0.5)
-    """shot noise (1 sigma) at full scale, as a fraction of it; grows as the square root of the signal; unused with
-    [sensor]"""
+    """shot noise (1 sigma) at full scale, a fraction of it; grows as the root of the signal; unused with [sensor]"""
     shadows: bool = False
     """the sea floor and objects cast shadows in the light of lamps and sun"""
     scattering: ScatteringModel = "full"
-    """full: multiple scattering, which softens the beams, blurs the image and brightens the backscatter; single: light
-    scattered once is the backscatter, all other scattered light is lost; none: the water absorbs but does not
-    scatter"""
+    """full: multiple scattering softens the beams, blurs the image and brightens the backscatter; single: light
+    scattered once is the backscatter, other scattered light is lost; none: the water only absorbs"""
 
 
 class SensorConfig(Section):
@@ -306,8 +293,7 @@ class LensConfig(Section):
     lateral_colour: tuple[LateralColour, LateralColour] = (0.0, 0.0)
     """magnification of the images in R and in B relative to that in G, minus 1"""
     focus_m: float = Field(default=0.0, ge=0, le=1000)
-    """depth in focus; other depths are blurred by the aperture (sensor.f_number); 0: all depths are in focus; needs
-    [sensor] [m]"""
+    """depth in focus; the aperture (sensor.f_number) blurs others; 0: all are in focus; needs [sensor] [m]"""
 
 
 class PortConfig(Section):
@@ -394,24 +380,17 @@ class WaterConfig(Section):
 
     @property
     def label(self) -> str:
-        """Returns the name of the water in reports."""
         own = "own values" if self.absorption_per_m else Path(self.spectrum_file).name if self.spectrum_file else ""
-        return f"{own or self._type_label}, turbidity {self.turbidity:g}"
-
-    @property
-    def _type_label(self) -> str:
-        """Returns the name of the Jerlov type with its source, or `jerlov` alone if the water is of no Jerlov type."""
-        return f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
+        name = f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
+        return f"{own or name}, turbidity {self.turbidity:g}"
 
     @property
     def is_jerlov_type(self) -> bool:
-        """Returns whether absorption and scattering are those of a Jerlov type."""
         return self.jerlov != "clear" and self.absorption_per_m is None and self.spectrum_file is None
 
     @field_validator("jerlov")
     @classmethod
     def _require_type_of_source(cls, jerlov: str, info: ValidationInfo) -> str:
-        """Requires a type that the table `source` contains."""
         source = info.data.get("source")
         if source is None or jerlov in (allowed := ("clear", *WATER_SOURCES[source].types)):
             return jerlov
@@ -544,8 +523,7 @@ class PlanConfig(Section):
     pattern: Literal["lawnmower", "loops"] = "lawnmower"
     """lawnmower: parallel legs; loops: circles through the start, which is the centre of a disc"""
     area_m: tuple[Metres, Metres] = (4.0, 2.0)
-    """extent along and across the legs, centred at centre_m; for loops, both are the diameter of the disc; unused with
-    polygon [m]"""
+    """extent along and across the legs, around centre_m; loops: diameter of the disc (both); unused with polygon [m]"""
     centre_m: Vector2 = (0.0, 0.0)
     """centre of the area: x, y in the scene [m]"""
     centre_crs: tuple[Number, Number] | None = None
@@ -556,8 +534,7 @@ class PlanConfig(Section):
     """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with one polygon
     in a CRS that it names, in longitude and latitude, or in the CRS of the DEM; ${TWIN_DATA} is expanded"""
     turns: Literal["reverse", "bow_first"] = "reverse"
-    """reverse: every second leg is flown backwards; bow_first: the vehicle yaws by 180 deg at the end of each leg, so
-    that it flies every leg forwards"""
+    """reverse: every second leg is flown backwards; bow_first: after each leg the vehicle yaws by 180 deg"""
     altitude_m: float = Field(default=2.2, gt=0, le=100)
     """height of the cameras above the reference plane z = 0 [m]"""
     speed_mps: float = Field(default=0.25, gt=0.01, le=2)
@@ -567,8 +544,7 @@ class PlanConfig(Section):
     overlap_across: float = Field(default=0.8, gt=0, lt=1)
     """sidelap of neighbouring swaths, a fraction of the footprint"""
     overlap_reference: Literal["floor", "plane"] = "floor"
-    """floor: 95 % of the keyframes reach the overlaps over the sea floor; plane: the overlaps refer to the reference
-    plane z = 0"""
+    """floor: 95 % of the keyframes reach the overlaps over the sea floor; plane: the overlaps are those at z = 0"""
     height: Literal["plane", "floor"] = "plane"
     """plane: altitude_m above the reference plane; floor: altitude_m above the smoothed sea floor"""
     tracks: int = Field(default=0, ge=0, le=1000)
@@ -594,30 +570,18 @@ class ObjectConfig(Section):
     """Object at `position_m` on the sea floor, or many of one kind, scattered at random with the density `per_m2`."""
 
     shape: Literal[
-        "mesh",
-        "boulder",
-        "brain_coral",
-        "branching_coral",
-        "table_coral",
-        "sponge",
-        "sea_star",
-        "pipe",
-        "crate",
-        "tyre",
-        "bottle",
-        "kelp",
-    ]
+        "mesh", "boulder", "brain_coral", "branching_coral", "table_coral", "sponge", "sea_star", "pipe", "crate",
+        "tyre", "bottle", "kelp",
+    ]  # fmt: skip
     """built-in shape, or mesh for the triangles of mesh_file"""
     mesh_file: FilePath | None = None
     """PLY, OBJ or GLB file with vertex colours or a texture; needs shape = mesh; ${TWIN_DATA} is expanded"""
     mesh_up: Literal["z", "y"] | None = None
     """axis of mesh_file that points up; default: y for GLB, z for other files"""
     size_m: float | None = Field(default=None, gt=0, le=20)
-    """largest extent of an object, the median of a size distribution; default: that of mesh_file in metres, or 0.4
-    [m]"""
+    """largest extent of an object, median of a distribution; default: that of mesh_file in metres, or 0.4 [m]"""
     size_spread: float = Field(default=0.0, ge=0, le=1)
-    """size distribution: standard deviation of the logarithm of the size (log-normal, cut at 2 sigma); 0: all are of
-    size_m"""
+    """standard deviation of the logarithm of the size (log-normal, cut at 2 sigma); 0: all are of size_m"""
     width_m: float | None = Field(default=None, gt=0, le=20)
     """outer diameter of a pipe; default: an eighth of its length [m]"""
     colour: tuple[Albedo, Albedo, Albedo] | None = None
@@ -667,7 +631,6 @@ class _EstimatePlugin(Section):
 
 
 def _keys_of_settings() -> dict[str, Any]:
-    """Returns the types and fields of the keys that `EstimatorSettings` defines."""
     types = get_type_hints(EstimatorSettings)
     keys = [setting for setting in fields(EstimatorSettings) if "description" in setting.metadata]
     return {key.name: (types[key.name], Field(default=key.default, **key.metadata)) for key in keys}
@@ -683,11 +646,9 @@ class MapConfig(Section):
     cell_m: float = Field(default=0.02, gt=0.001, le=1)
     """cell size of the elevation map [m]"""
     orthomosaic: bool = True
-    """make an orthomosaic of the keyframe images at their ground sample distance; false: a mosaic with the cells of the
-    elevation map"""
+    """orthomosaic of the keyframe images at their ground sample distance; false: mosaic with the cells of the map"""
     restore: bool = False
-    """remove lamp pattern and water from the colours of the orthomosaic, by the lamps and the water of this scenario;
-    false: colours as seen"""
+    """remove lamp pattern and water of this scenario from the colours of the orthomosaic; false: colours as seen"""
 
 
 class Source(BaseModel):
@@ -716,7 +677,6 @@ class Source(BaseModel):
         return f"{file.path}:{file.lines.get(key, 1)}: {error}"
 
     def _files(self) -> list[Source]:
-        """Returns this source and the sources of the files that it extends, directly or indirectly."""
         return [self, *(self.base._files() if self.base else [])]
 
 
@@ -768,19 +728,13 @@ class Scenario(Section):
 
     @property
     def delivers_linear_images(self) -> bool:
-        """Returns whether images are proportional to the radiance.
-
-        They are without [sensor], or with a linear tone curve and the white balance "white_light".
-        """
+        """Returns whether images are proportional to the radiance."""
         sensor = self.sensor
         return sensor is None or (sensor.tone_curve == "linear" and sensor.white_balance == "white_light")
 
     @property
     def texel_m(self) -> float:
-        """Returns the size of a texture pixel [m]: `terrain.texture_px_m`, or a default.
-
-        The default is that of an image pixel on the reference plane within limits; for a photo, the upper limit.
-        """
+        """Returns the size of a texture pixel [m]: `terrain.texture_px_m`, or its default."""
         if self.terrain.texture_px_m is not None:
             return self.terrain.texture_px_m
         if self.terrain.texture_file is not None:
@@ -791,20 +745,14 @@ class Scenario(Section):
     def believed_rig(self) -> StereoRig:
         """Returns the calibration that the estimators use; the true cameras differ from it by the calibration error."""
         rig = self.rig
-        focal_px = rig.image_width_px / 2 / float(_tan_deg(rig.hfov_deg / 2))
+        focal_px = rig.image_width_px / 2 / float(np.tan(np.deg2rad(rig.hfov_deg / 2)))
         forward, left, up = rig.mount_m
-        position = [forward, left + rig.baseline_m / 2, up]
-        return StereoRig(
-            rig.image_width_px,
-            rig.image_height_px,
-            focal_px,
-            rig.baseline_m,
-            rig.frame_rate_hz,
-            geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array(position)),
-        )
+        position = np.array([forward, left + rig.baseline_m / 2, up])
+        body_from_camera = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, position)
+        size = rig.image_width_px, rig.image_height_px
+        return StereoRig(*size, focal_px, rig.baseline_m, rig.frame_rate_hz, body_from_camera)
 
     def believed_noise(self) -> SensorNoise:
-        """Returns the sensor noise and the beacon positions that the estimators assume."""
         navigation = self.navigation
         return SensorNoise(
             navigation.pressure_sigma_m,
@@ -818,7 +766,6 @@ class Scenario(Section):
         )
 
     def estimator_settings(self) -> EstimatorSettings:
-        """Returns the settings of the estimators."""
         noise = self.imaging.noise_sd, self.imaging.shot_noise
         settings = self.estimate.model_dump(exclude={"plugin"})
         return EstimatorSettings(**settings, noisy_images=self.sensor is not None or max(noise) >= _VISIBLE_NOISE)
@@ -832,7 +779,3 @@ class Scenario(Section):
         """Returns whether steep parts of the floor have a texture of their own in images (`terrain.wall_texture`)."""
         t = self.terrain
         return t.wall_texture == "triplanar" and t.kind != "mesh" and self.imaging.fidelity == "rendered"
-
-
-def _tan_deg(angle_deg: float) -> float:
-    return float(np.tan(np.deg2rad(angle_deg)))

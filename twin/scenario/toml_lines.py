@@ -39,7 +39,6 @@ class _Reader:
         self.n_items: Counter[str] = Counter()  # of each array of tables so far
 
     def read(self) -> dict[str, int]:
-        """Returns the line of every key."""
         table = ""
         while self._skip("\n"):
             if self.tokens[-1][0] == "[":
@@ -49,7 +48,6 @@ class _Reader:
         return self.lines
 
     def _header(self) -> str:
-        """Reads the header of a table and returns its path."""
         path, is_item = "", self.tokens[-2][0] == "["
         del self.tokens[-1 - is_item :]
         while (token := self.tokens.pop())[0] != "]":
@@ -63,14 +61,12 @@ class _Reader:
         return path
 
     def _pair(self, path: str) -> None:
-        """Reads a key and its value in the table of a path."""
         while (token := self.tokens.pop())[0] != "=":
             if token[0] != ".":
                 path = self._located(path, *token)
         self._value(path)
 
     def _value(self, path: str) -> None:
-        """Reads the value of the key or item of a path."""
         opening, _ = self.tokens.pop()
         count = 0
         while opening in "[{" and self._skip("\n,") not in "]}":
@@ -85,13 +81,11 @@ class _Reader:
             self.tokens.pop()
 
     def _skip(self, skipped: str) -> str:
-        """Leaves out tokens, and returns the next one; "" at the end."""
         while self.tokens and self.tokens[-1][0] in skipped:
             self.tokens.pop()
         return self.tokens[-1][0] if self.tokens else ""
 
     def _located(self, path: str, part: str, line: int) -> str:
-        """Returns the path of a part of a key below a path, and notes its line."""
         name = tomllib.loads(f"key = {part}")["key"] if part[0] in "\"'" else part
         path = f"{path}.{name}" if path else name
         self.lines.setdefault(path, line)

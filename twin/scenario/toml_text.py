@@ -21,10 +21,9 @@ _LONG_KEY = re.compile(r"""(?<![\w"'.-])(?:["'\w-]+[ \t]*\.[ \t]*){100}""")
 def parse_toml(text: str) -> dict[str, Any]:
     """Returns the keys and values of a TOML text; `value_errors` checks the values.
 
-    Raises:
-        ValueError: the text is not TOML, has more than `MAX_CHARACTERS` characters, is nested too deeply to be parsed,
-            or has a key of more than 100 parts or an integer of more than 4300 digits; the message contains the line
-            number if it is known.
+    Raises ValueError, with the line number if it is known, if the text is not TOML, has more than `MAX_CHARACTERS`
+    characters, is nested too deeply to be parsed, or has a key of more than 100 parts or an integer of more than 4300
+    digits.
     """
     if len(text) > MAX_CHARACTERS:
         raise ValueError(f"{len(text)} characters (allowed: up to {MAX_CHARACTERS})")

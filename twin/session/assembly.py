@@ -10,18 +10,14 @@ from twin.core.timing import StageTimer
 from twin.estimate.pipeline import Navigator
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.vision_interface import Vision
-from twin.plugin.navigator import PluginNavigator
+from twin.plugin.navigator import Estimators, navigator_of
 from twin.plugin.protocols import EstimatorSetup
 from twin.world.mission import Mission
 from twin.world.world import World
 
 
 def open_world(mission: Mission, stopwatch: StageTimer) -> World:
-    """Returns the simulated world of a mission, rendered or surrogate.
-
-    Raises:
-        TwinError: OpenGL is missing, the error model cannot be read, or the surrogate cannot simulate the survey.
-    """
+    """Returns the world of a mission; raises TwinError if OpenGL or the error model is missing or cannot be used."""
     # imported here: MuJoCo and OpenGL take 25 MB that a surrogate survey does not need
     if mission.scenario.imaging.fidelity == "rendered":
         from twin.world.rendered_world import RenderedWorld
@@ -34,15 +30,8 @@ def open_world(mission: Mission, stopwatch: StageTimer) -> World:
 
 
 @contextmanager
-def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Generator[Navigator]:
-    """Opens the estimators of a survey, or those of the plug-in that the scenario names.
-
-    Their visual measurements come from rendered images or from the surrogate world. Keyframe images and mosaic tiles
-    are stored in the subfolder "keyframes" of the run folder.
-
-    Raises:
-        TwinError: the plug-in cannot be loaded.
-    """
+def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: StageTimer) -> Generator[Estimators]:
+    """Opens the estimators or the plug-in (TwinError if it is not found); images and tiles go to `folder`/keyframes."""
     if mission.scenario.imaging.fidelity == "surrogate":
         from twin.surrogate.surrogate_world import SurrogateWorld
 
@@ -50,15 +39,10 @@ def make_navigator(mission: Mission, world: World, folder: Path, stopwatch: Stag
         with navigator_with(mission, world.vision, stopwatch) as navigator:
             yield navigator
         return
-    plugin = mission.scenario.estimate.plugin
-    with image_vision(mission, folder, stopwatch) as vision:
-        if plugin is None:
-            made = navigator_with(mission, vision, stopwatch)
-        else:
-            setup = EstimatorSetup(mission.rig, mission.start, mission.scenario.believed_noise())
-            made = PluginNavigator(plugin, setup, mission.scenario.estimator_settings(), vision, stopwatch)
-        with made as navigator:
-            yield navigator
+    plugin, settings = mission.scenario.estimate.plugin, mission.scenario.estimator_settings()
+    setup = EstimatorSetup(mission.rig, mission.start, mission.scenario.believed_noise())
+    with image_vision(mission, folder, stopwatch) as vision, navigator_of(plugin, setup, settings, vision) as navigator:
+        yield navigator
 
 
 def image_vision(mission: Mission, folder: Path, stopwatch: StageTimer) -> StereoVision:

@@ -13,16 +13,17 @@ from twin.core.interrupts import StageGuard
 from twin.core.quality import Finding
 from twin.core.records import ElevationMap, MapGrid, SurveyResult
 from twin.core.timing import Stopwatch, timing_summary
-from twin.estimate.pipeline import Navigator, finish_in_stage
+from twin.errors import SurveyAborted
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_result import RunResult
 from twin.report.run_writer import RunFolder, SurveyRecord
+from twin.session.assembly import Estimators
 
 
 class Estimation(NamedTuple):
     """Estimators that have processed all frames, and what the stages after them use."""
 
-    navigator: Navigator
+    navigator: Estimators
     stopwatch: Stopwatch  #: durations of the stages
     #: limits the effect of an interrupt to one stage; also holds the reason why the frames ended early, if any.
     guard: StageGuard
@@ -47,9 +48,7 @@ class Maps(NamedTuple):
 class RunKind(Protocol):
     """What is special about a flown survey or a replay."""
 
-    def maps(self, estimation: Estimation, result: SurveyResult) -> Maps:
-        """Builds and returns the maps."""
-        ...
+    def maps(self, estimation: Estimation, result: SurveyResult) -> Maps: ...
 
     def findings(self, result: SurveyResult, elevation: ElevationMap | None) -> list[Finding]:
         """Returns the failed checks, each a reason not to trust the result."""
@@ -68,9 +67,7 @@ def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, Evaluatio
     """Aligns all keyframes, builds the maps, compares with the truth, and writes the run folder.
 
     An interrupt ends only the current stage; the run then has the status "aborted" with a reason that names the stage.
-
-    Raises:
-        TwinError: metrics.json cannot be written.
+    Raises TwinError if metrics.json cannot be written.
     """
     navigator, stopwatch, guard, folder, progress, start_s = estimation
     result = finish_in_stage(navigator, guard)
@@ -93,12 +90,23 @@ def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, Evaluatio
     return RunResult(metrics["status"], metrics, folder.path), survey
 
 
-def status(abort_reason: str, findings: Sequence[Finding]) -> dict[str, str]:
-    """Returns the version of the program, the status of a run, and the reason for the status.
+def finish_in_stage(navigator: Estimators, guard: StageGuard) -> SurveyResult:
+    """Returns the result of the estimators, without the final alignment if the alignment fails or is interrupted.
 
-    The status is "aborted" if there is a reason for an abort, otherwise "degraded" if there are findings, otherwise
-    "complete".
+    The alignment is the stage "alignment" of the guard. Why it failed is stored in `guard.cause`, unless a cause is set
+    already; an interrupt adds the stage to `guard.skipped`.
     """
+    try:
+        if (result := guard.attempt("alignment", navigator.finish)) is not None:
+            return result
+    except (SurveyAborted, OSError) as error:
+        guard.cause = guard.cause or str(error)
+    navigator.abandon_alignment()
+    return navigator.finish()
+
+
+def status(abort_reason: str, findings: Sequence[Finding]) -> dict[str, str]:
+    """Returns the version of the program, the status of a run ("aborted", "degraded" or "complete"), and its reason."""
     reason = abort_reason or "; ".join(finding.sentence for finding in findings)
     name = "aborted" if abort_reason else "degraded" if findings else "complete"
     return {"version": version("seabed-twin"), "status": name, "reason": reason}

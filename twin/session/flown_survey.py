@@ -52,11 +52,9 @@ class FlownSurvey:
         return guard.attempt("orthomosaic", without_file_errors) or Maps(elevation)
 
     def findings(self, result: SurveyResult, elevation: ElevationMap | None) -> list[Finding]:
-        """Returns the failed checks of the estimates, the path and the mapped area."""
         return survey_findings(self.mission, result, elevation, self.truth.reference)
 
     def evaluation(self, result: SurveyResult, maps: Maps) -> EvaluationInput:
-        """Returns the input of the evaluation."""
         mission, scenario, actions = self.mission, self.mission.scenario, self.actions
         along, across = planned_overlap(mission)
         plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
@@ -79,7 +77,6 @@ class FlownSurvey:
         )
 
     def record(self, survey: EvaluationInput, written: SurveyRecord) -> SurveyRecord:
-        """Returns the contents of the run folder, with the truth and the plan."""
         mission = self.mission
         return replace(
             written,
@@ -91,7 +88,6 @@ class FlownSurvey:
 
 
 def plugin_notes(scenario: Scenario) -> list[str]:
-    """Returns one note on each plug-in of the survey."""
     notes = (
         (scenario.terrain.plugin, "The heights of the floor are those of the plug-in {}."),
         (scenario.control.plugin, "The vehicle was steered by the plug-in {}."),
@@ -105,15 +101,10 @@ def make_orthomosaic(
 ) -> Maps | None:
     """Makes the orthomosaic of a survey, writes it if the run folder keeps maps, and compares it with the truth.
 
-    The orthomosaic is made from the images, the estimated poses and map, and, for the restoration of colours, from the
-    lamps and the water of the scenario. The true albedo is used for the comparison only.
-
-    Returns:
-        The elevation map with the orthomosaic averaged to its cells, and the errors of the orthomosaic; None without
-        images or mapped cells.
-
-    Raises:
-        OSError: the file could not be written, or an image could not be read.
+    It is made from the images, the estimated poses and map, and, for the restoration of colours, from the lamps and the
+    water of the scenario; the true albedo is for the comparison only. The result has the elevation map with the colours
+    averaged to its cells; it is None without images or mapped cells. Raises OSError if a file cannot be read or
+    written.
     """
     stopwatch, folder, restored = estimation.stopwatch, estimation.folder, mission.scenario.map.restore
     if not np.isfinite(elevation.height_m).any():

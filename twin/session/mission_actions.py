@@ -1,8 +1,4 @@
-"""Actions of a mission in poor visibility.
-
-The vehicle slows down if many frames have no measured motion, and stops if no motion has been measured for more than
-`BLIND_S` seconds.
-"""
+"""Actions of a mission in poor visibility: the vehicle slows down or stops where few or no motions are measured."""
 
 from __future__ import annotations
 
@@ -32,22 +28,15 @@ class MissionActions:
 
     The vehicle stops (`hold`) if no motion was measured for more than `BLIND_S` seconds. From then on, the speed that
     the estimators predict decays with the time constant with which the vehicle brakes (`BRAKING_S`), so prediction and
-    reference agree.
-    The vehicle slows down if many frames of the last second were lost; this is decided at measured frames only, because
-    a predicted motion has the speed of the last measured one.
+    reference agree. The vehicle slows down if many frames of the last second were lost; this is decided at measured
+    frames only, because a predicted motion has the speed of the last measured one.
 
-    Args:
-        mission: the survey to fly.
-        log: called with each new action and the estimate that caused it.
-
-    Attributes:
-        action: the current action.
-        n_frames: number of frames in each action, without those that `add_measured_frames` counts.
+    `log` (`RunFolder.log`) gets each new action. `n_frames` does not count those of `add_measured_frames`.
     """
 
-    def __init__(self, mission: Mission, log: Callable[[Action, Estimate], None] | None = None):
+    def __init__(self, mission: Mission, log: Callable[..., None] | None = None):
         self._log = log
-        self.rate_hz, self._n_per_keyframe = mission.plan.frame_rate_hz, mission.plan.n_frames_per_keyframe
+        self.rate_hz, self._n_per_keyframe = mission.plan.request.frame_rate_hz, mission.plan.n_frames_per_keyframe
         self.action: Action = "fly"
         self.n_frames: dict[Action, int] = dict.fromkeys(RATES, 0)
         self._rate, self._n_blind, self._n_recovered, self._n_stopped = 1.0, 0, 0, 0
@@ -61,7 +50,7 @@ class MissionActions:
         self._lost.append(lost)
         action = self._next_action(lost)
         if action != self.action and self._log is not None:
-            self._log(action, estimate)
+            self._log("action", time_s=estimate.time_s, action=action, status=estimate.status)
         self.action = action
         self.n_frames[self.action] += 1
         if self.action == "fly" and self._rate == 1:
@@ -77,11 +66,9 @@ class MissionActions:
 
     @property
     def times(self) -> ActionTimes:
-        """Returns the total durations for which the vehicle was slowed and stopped [s]."""
         return ActionTimes(self.n_frames["slow"] / self.rate_hz, self.n_frames["hold"] / self.rate_hz)
 
     def _next_action(self, lost: bool) -> Action:
-        """Returns the action after a frame; `lost`: whether no motion was measured at this frame."""
         if self._n_blind > BLIND_S * self.rate_hz:
             return "hold"
         if lost:
@@ -93,7 +80,6 @@ class MissionActions:
         return self.action if self.action != "fly" and self._n_recovered < RECOVERED_S * self.rate_hz else "fly"
 
     def _pace_towards(self, target: float) -> Pace:
-        """Advances the pace by one step of a first-order lag towards the rate `target`, and returns it."""
         change_per_s = (target - self._rate) / BRAKING_S
         self._rate += change_per_s / self.rate_hz
         if abs(target - self._rate) < _SAME_RATE:

@@ -11,7 +11,7 @@ from twin.core.records import Estimate, Frame
 from twin.errors import SurveyAborted
 from twin.estimate.vision.repeated_images import REPEATS
 from twin.report.run_writer import RunFolder
-from twin.session.mission_actions import Action, MissionActions
+from twin.session.mission_actions import MissionActions
 from twin.world.mission import Mission
 
 #: Vision is lost, and the survey is aborted, if fewer than the fraction _MIN_MEASURED of the frames of the last
@@ -36,13 +36,7 @@ class SurveyMonitor:
     """Reports the progress of a survey at the frames that it is given; aborts a survey that cannot continue.
 
     It cannot continue if vision is lost, the vehicle has been stopped for too long, or the position is too uncertain.
-
-    Args:
-        mission: the survey as planned.
-        folder: run folder, for the log.
-        progress: function called with the progress at each of these frames and during the later stages. Frames between
-            keyframes that the compiled loop of a surrogate survey simulates are not among them.
-        live: whether to show the survey in Rerun while it runs.
+    Frames between keyframes that the compiled loop of a surrogate survey simulates are not given to it.
     """
 
     def __init__(
@@ -58,16 +52,11 @@ class SurveyMonitor:
             self.live = LiveViewer(mission.rig)
         self.status = "ok"
         self._measured = deque([True] * round(_MAX_BLIND_S * self.rate_hz))
-        self.actions = MissionActions(mission, self._log_action)
-        self.max_sigma_m = _MAX_SIGMA * min(mission.plan.footprint_m)
+        self.actions = MissionActions(mission, folder.log)
+        self.max_sigma_m = _MAX_SIGMA * min(mission.plan.request.footprint_m)
 
     def __call__(self, estimate: Estimate, frame: Frame) -> None:
-        """Reports the progress and the vision status of one frame.
-
-        Raises:
-            SurveyAborted: vision has been lost for too long, the vehicle has been stopped for too long in total, or the
-                position has become too uncertain to find the neighbouring swath.
-        """
+        """Reports progress and vision status of a frame; raises SurveyAborted if the survey cannot continue."""
         self._measured.append(estimate.status == "ok")
         self._measured.popleft()
         if estimate.status != self.status:
@@ -88,15 +77,10 @@ class SurveyMonitor:
                 f" (at most {self.max_sigma_m:.2f} m allowed)"
             )
 
-    def _log_action(self, action: Action, estimate: Estimate) -> None:
-        """Logs an action of the mission with its time and the status of vision."""
-        self.folder.log("action", time_s=estimate.time_s, action=action, status=estimate.status)
-
     def report_stage(self, stage: str, share: float) -> None:
         """Reports the completed fraction of a stage that follows the flight: "map", "orthomosaic" or "report"."""
         self.progress(SurveyProgress(0.0, self.wall_s, share, 0.0, stage))
 
     @property
     def wall_s(self) -> float:
-        """Returns the wall time since the start of the survey [s]."""
         return time.perf_counter() - self.start_s

@@ -15,9 +15,8 @@ from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame, Image, StereoRig, Truth
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
-from twin.estimate.pipeline import Navigator
 from twin.scenario.model import Scenario
-from twin.session.assembly import make_navigator, open_world
+from twin.session.assembly import Estimators, make_navigator, open_world
 from twin.session.mission_actions import MissionActions
 from twin.world.mission import Mission, prepare
 from twin.world.mission_flight import Flight
@@ -39,13 +38,7 @@ class SteppedWorld:
     `reset` starts the survey and returns its first frame; `step` moves the vehicle by one frame interval and returns
     the next frame of the plan. A frame holds images and sensor readings, no truth. The same seed and the same commands
     give the same frames, bit for bit. One object holds one OpenGL context; use it in one thread. Before `reset`, all
-    methods and properties that need a flight raise RuntimeError.
-
-    Args:
-        scenario: the survey, from `twin.load_scenario`.
-
-    Raises:
-        ScenarioError: the survey cannot be flown.
+    methods and properties that need a flight raise RuntimeError. Raises ScenarioError if the survey cannot be flown.
     """
 
     def __init__(self, scenario: Scenario):
@@ -109,25 +102,18 @@ class SteppedWorld:
         return self.flight.step(values, pace, keyframe)
 
     def capture(self) -> StereoPair:
-        """Returns a stereo pair at the current pose, in addition to the frames; has no effect on later frames.
-
-        Raises:
-            TwinError: the scenario has imaging.fidelity = "surrogate", which has no images.
-        """
+        """Returns a stereo pair at the current pose, without effect on later frames; raises TwinError if surrogate."""
         return StereoPair(*self.world.extra_pair())
 
     def truth(self) -> Truth:
         """Returns the ground truth of the survey so far; it must not reach an estimator."""
         return self.world.truth()
 
-    def estimator(self, folder: Path | None = None) -> Navigator:
+    def estimator(self, folder: Path | None = None) -> Estimators:
         """Returns the estimators of the scenario, which get the believed calibration and no truth; `close` closes them.
 
-        Args:
-            folder: folder for images of keyframes; None: a temporary folder that `close` removes.
-
-        Raises:
-            TwinError: the plug-in that the scenario names cannot be loaded.
+        Images of keyframes go to `folder`; None: to a temporary folder that `close` removes. Raises TwinError if the
+        plug-in that the scenario names cannot be loaded.
         """
         if folder is None:
             folder = Path(self._open.enter_context(TemporaryDirectory(prefix="twin-")))
@@ -136,10 +122,8 @@ class SteppedWorld:
     def pilot(self) -> Callable[[Estimate, Frame], Array]:
         """Returns the controller of the scenario: a function from the estimate of a frame and this frame to a command.
 
-        The function steers to the planned reference of the current frame.
-
-        Raises:
-            TwinError: the plug-in that the scenario names cannot be loaded.
+        It steers to the planned reference of the current frame. Raises TwinError if the plug-in that the scenario names
+        cannot be loaded.
         """
         steer, flight = make_pilot(self._mission), self.flight
         return lambda estimate, frame: steer(
@@ -152,17 +136,14 @@ class SteppedWorld:
 
     @property
     def mission(self) -> Mission:
-        """Returns the survey as planned, with its scenario, floor and map grid."""
         return self._mission
 
     @property
     def rig(self) -> StereoRig:
-        """Returns the believed calibration of the cameras."""
         return self._mission.rig
 
     @property
     def world(self) -> World:
-        """Returns the simulated world of the flight. Raises RuntimeError before `reset`."""
         return self.flight.world
 
     @property

@@ -1,7 +1,4 @@
-"""Checks of a flown survey: whether the vehicle kept to the planned path, and whether the asked area is mapped.
-
-The checks use only the estimates and the plan, and therefore apply to a real survey as well.
-"""
+"""Checks of a flown survey by estimates and plan alone, as for a real one: path kept, and asked area mapped."""
 
 from __future__ import annotations
 
@@ -20,16 +17,13 @@ _OFF_COURSE_S = 1.0  # shorter departures from the path are ignored
 def survey_findings(
     mission: Mission, result: SurveyResult, elevation: ElevationMap | None, reference_m: Array
 ) -> list[Finding]:
-    """Returns the findings of all checks, each a reason not to trust the survey; empty if the survey passes.
-
-    The planned positions (n, 3) are those of the left camera at the frames [m].
-    """
+    """Returns reasons not to trust a survey; `reference_m` (n, 3) are planned positions of the left camera [m]."""
     found = check_survey(result, mission.rig, elevation)
     return [*found, *_off_course(mission, result, reference_m), *_area(mission, elevation)]
 
 
 def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
-    """Returns a list with one sentence on the rectification errors that were removed; empty if none were removed."""
+    """Returns a sentence on the rectification errors that were removed, if any."""
     epipolar = result.quality.epipolar
     if epipolar is None or not epipolar.removed.any():
         return []
@@ -42,15 +36,11 @@ def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
 
 
 def off_course_limit_m(mission: Mission) -> float:
-    """Returns the distance from the planned path beyond which a survey is degraded [m].
-
-    It is `control.off_course_m` or, if that is not set, `MAX_OFF_COURSE` times the shorter side of the footprint.
-    """
-    return mission.scenario.control.off_course_m or MAX_OFF_COURSE * min(mission.plan.footprint_m)
+    """Returns the distance from the planned path beyond which a survey is degraded [m]."""
+    return mission.scenario.control.off_course_m or MAX_OFF_COURSE * min(mission.plan.request.footprint_m)
 
 
 def _off_course(mission: Mission, result: SurveyResult, reference_m: Array) -> list[Finding]:
-    """Returns one finding if the online trajectory was too far from the planned path for a whole second; else none."""
     n = min(len(result.online), len(reference_m))
     limit_m = off_course_limit_m(mission)
     distance_m = np.linalg.norm(result.online.positions[:n] - reference_m[:n], axis=1)
@@ -65,10 +55,7 @@ def _off_course(mission: Mission, result: SurveyResult, reference_m: Array) -> l
 
 
 def _area(mission: Mission, elevation: ElevationMap | None) -> list[Finding]:
-    """Returns one finding if the map covers less than `MIN_AREA_MAPPED` of the asked area; else none.
-
-    An area that is smaller than a cell may contain no cell centre; it is not checked.
-    """
+    """Returns a finding if the map covers less than `MIN_AREA_MAPPED` of an asked area that has any cell centre."""
     asked = mission.asked(*np.meshgrid(*mission.grid.centres()))
     if not asked.any():
         return []

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
-from twin.controllers.tracking import HullModel, PoseController, feedforward_wrench
+from twin.controllers.tracking import ControllerState, HullModel, feedforward_wrench, pole_placement_gains
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.scenes.bluerov2 import BLUEROV2_HEAVY
@@ -18,25 +18,18 @@ from twin.simulate.hydrodynamics import Hull, angular_first
 from twin.simulate.thrusters import steady_thrust_n
 
 
-def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> PoseController:
-    """Returns a pose controller that is designed for the published vehicle and computes one command per frame.
-
-    Args:
-        natural_frequency_radps: natural frequency of the closed loop in position.
-    """
+def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> ControllerState:
+    """Returns a controller for the published vehicle, with this frequency in position and a command per frame."""
     model = _controller_model(trimmed_hull(VehicleConfig.model_validate({})))
-    return PoseController(model, _allocation(), natural_frequency_radps, 1 / frame_rate_hz)
+    gains = pole_placement_gains(natural_frequency_radps)
+    return ControllerState(model, _allocation(), gains, 1 / frame_rate_hz, np.zeros(6))
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
-    """Returns the speed in still water along a direction at which the first thruster reaches full thrust [m/s].
+    """Returns the speed in still water along a direction (3,) in the body at which the first thruster saturates [m/s].
 
-    Drag along each axis is a u + b u |u|, with the velocity u along the axis and the coefficients a of linear and b of
-    quadratic drag. At the speed v, each thruster therefore needs the thrust p v + q v^2; p and q follow from a, b and
-    the thrust allocation. The Munk moment and the net buoyancy are neglected.
-
-    Args:
-        direction: (3,) unit vector of the velocity, in body axes.
+    Drag along each axis is a u + b u |u|, so that each thruster needs the thrust p v + q v^2 at the speed v; p and q
+    follow from the thrust allocation. The Munk moment and the net buoyancy are neglected.
     """
     hull = trimmed_hull(vehicle)
     thrusts_from_force = _allocation().thrusts_from_wrench[:, 3:]
@@ -48,13 +41,10 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
 
 
 def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
-    """Returns the largest absolute thrust (n,) of a thruster at each steady velocity, as a fraction of full thrust.
+    """Returns the largest absolute thrust (n,) of a thruster / full thrust, at steady velocities (n, 3).
 
-    The hull is level. The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the moments in roll and
-    pitch are assumed to be balanced by the righting moment.
-
-    Args:
-        velocities: (n, 3) velocities through the water, in body axes [m/s].
+    Velocities [m/s] are through the water, in the body, which is level. The thrusters balance drag, the Munk moment in
+    yaw, and the net buoyancy; the righting moment balances roll and pitch.
     """
     hull = trimmed_hull(vehicle)
     model = _controller_model(hull)
@@ -74,7 +64,6 @@ def _allocation() -> ThrustAllocation:
 
 
 def _full_thrust_n() -> float:
-    """Returns the steady thrust of a thruster at command 1 [N]."""
     return float(_thrust_n(np.ones(1))[0])
 
 

@@ -79,11 +79,9 @@ class CompiledVehicle:
         return body_twist(self.state)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates `duration_s`, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
+        """Simulates `duration_s`, whole timesteps (else ValueError), under thruster commands (8,) in [-1, 1].
 
-        Raises:
-            SurveyAborted: the physics diverged, or the hull touches the floor.
-            ValueError: the duration is not a whole number of timesteps.
+        Raises SurveyAborted if the physics diverged, or the hull touches the floor.
         """
         advance(self.state, thruster_u, whole_timesteps(duration_s, self.state.timestep_s))
         self.advance_clock(duration_s)
@@ -99,7 +97,6 @@ class CompiledVehicle:
 
 @kernel
 def body_twist(body):
-    """Compiled kernel of `CompiledVehicle.twist_body`."""
     velocity = body.velocity + 0.5 * body.timestep_s * body.acceleration
     return twist_from_free_joint(body.pose[:3, :3], velocity)
 

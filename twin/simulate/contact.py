@@ -29,7 +29,6 @@ class FloorField(NamedTuple):
 
 
 def floor_field(height_m: NDArray[np.float32], spacing_m: float, west_m: float, south_m: float) -> FloorField:
-    """Returns the floor of a height grid; see `FloorField`."""
     n = int(np.ceil(_REACH_M / spacing_m)) + 1
     padding = [(0, -size % n) for size in height_m.shape]
     padded = np.pad(height_m, padding, constant_values=-np.inf)
@@ -42,7 +41,6 @@ OPEN_WATER = floor_field(np.full((2, 2), -np.inf, np.float32), 1.0, 0.0, 0.0)
 
 
 def contact_error(obstacle: str, time_s: float, world_from_body: Array) -> SurveyAborted:
-    """Returns the error that ends a survey by contact of the hull with an obstacle."""
     x, y, z = world_from_body[:3, 3]
     return SurveyAborted(f"contact of the hull with {obstacle} at {time_s:.2f} s, x {x:.2f}, y {y:.2f}, z {z:.2f} m")
 
@@ -108,7 +106,6 @@ def _meets(a, b, c):
 
 @kernel
 def _apart(axis, a, b, c):
-    """Returns whether the projections of the box and of a triangle on an axis are apart."""
     p, q, r, reach = 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         p, q, r = p + axis[k] * a[k], q + axis[k] * b[k], r + axis[k] * c[k]

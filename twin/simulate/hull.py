@@ -21,11 +21,7 @@ def physics_timestep_s(frame_rate_hz: float) -> float:
 
 
 def whole_timesteps(duration_s: float, timestep_s: float) -> int:
-    """Returns the number of timesteps in a duration.
-
-    Raises:
-        ValueError: the duration is not a whole number of timesteps, or shorter than one.
-    """
+    """Returns the number of timesteps in a duration; raises ValueError if it is not a whole number from 1."""
     n_steps = round(duration_s / timestep_s)
     if n_steps < 1 or abs(n_steps * timestep_s - duration_s) > 1e-6 * duration_s:
         raise ValueError(f"{duration_s} s is not a whole number of timesteps of {timestep_s} s")
@@ -33,7 +29,7 @@ def whole_timesteps(duration_s: float, timestep_s: float) -> int:
 
 
 def trimmed_hull(vehicle: VehicleConfig) -> Hull:
-    """Returns the hull parameters of the BlueROV2 with the drag, added mass and buoyancy of a scenario."""
+    """Returns the BlueROV2 with the drag, added mass and buoyancy of a scenario."""
     rov = BLUEROV2_HEAVY
     weight_n = rov.mass_kg * GRAVITY_MPS2
     return Hull(

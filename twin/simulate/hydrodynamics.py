@@ -22,10 +22,7 @@ from twin.kernels import kernel
 
 
 class Hull(NamedTuple):
-    """Parameters of a hull; the body axes are its principal axes, with the origin in the centre of gravity.
-
-    Its arrays (6,) have the angular components first.
-    """
+    """Parameters of a hull about its centre of gravity, in its principal axes; arrays (6,) have angular parts first."""
 
     inertia: Array  #: moments of inertia [kg m2], then the mass three times [kg]
     added_inertia: Array  #: added moments of inertia [kg m2], then added masses [kg]
@@ -37,7 +34,6 @@ class Hull(NamedTuple):
 
 
 def angular_first(linear_first: Array) -> Array:
-    """Returns rows (6, ...) of [surge, sway, heave, roll, pitch, yaw] as [roll, pitch, yaw, surge, sway, heave]."""
     return np.roll(linear_first, 3, axis=0)
 
 
@@ -54,7 +50,7 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, current_mps: 
     """Returns the acceleration nu' (6,) in body axes, which solves the equation of motion [rad/s2, m/s2].
 
     Args:
-        world_from_body: (3, 3) rotation from the body to the world.
+        world_from_body: (3, 3) rotation.
         twist: (6,) [angular, linear] velocity in body axes [rad/s, m/s].
         current_mps: (3,) velocity of the steady current in the world.
         wrench: (6,) [moment, force] of the thrusters in body axes [N m, N].
@@ -87,11 +83,8 @@ def free_joint_acceleration(
 ) -> Array:
     """Returns the `acceleration` (6,) in the velocity coordinates of MuJoCo's free joint [m/s2, rad/s2].
 
-    These coordinates are [linear in world axes, angular in body axes]. The linear part is R (v' + w x v), with R =
-    `world_from_body`, v the linear and w the angular velocity in body axes, and v' the rate of change of v.
-
-    Args:
-        velocity: (6,) velocity in these coordinates [m/s, rad/s].
+    These are [linear in world axes, angular in body axes], as those of `velocity`. The linear part is R (v' + w x v),
+    with R = `world_from_body`, v the linear and w the angular velocity in body axes, and v' the rate of change of v.
     """
     twist = twist_from_free_joint(world_from_body, velocity)
     body_acceleration = acceleration(hull, world_from_body, twist, current_mps, wrench)

@@ -9,17 +9,13 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.simulate.contact import contact_error
-from twin.simulate.inertial_sensor import inertial_quantities
+from twin.simulate.sensors import inertial_quantities
 
 
 class KinematicVehicle:
     """Vehicle that moves at the horizontal part of the commanded velocity, without rotation, thrust, drag or current.
 
-    This is the vehicle simulated by Negahdaripour & Madjidi (2003, section V-A): its vertical translation t_Z and all
-    rotations are zero.
-
-    Args:
-        world_from_body: (4, 4) initial pose, at rest and level.
+    It is that of Negahdaripour & Madjidi (2003, section V-A), at first at rest and level at the pose `world_from_body`.
 
     Attributes:
         inertial: true [angular rate, specific force] (6,) in body axes [rad/s, m/s2]; the acceleration is the change of
@@ -37,14 +33,12 @@ class KinematicVehicle:
 
     @property
     def twist_body(self) -> Array:
-        """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s]; the angular part is zero."""
         return np.concatenate([np.zeros(3), self._velocity @ self.world_from_body[:3, :3]])
 
     def step(self, command: Array, duration_s: float) -> None:
-        """Moves the vehicle for a duration at the horizontal part of a velocity command (3,) in world axes [m/s].
+        """Moves the vehicle by a velocity command (3,) in world axes [m/s], without its vertical part.
 
-        Raises:
-            SurveyAborted: the command is not finite, or the hull touches an obstacle.
+        Raises SurveyAborted if the command is not finite, or the hull touches an obstacle.
         """
         if not np.isfinite(command).all():
             raise SurveyAborted(f"the commanded velocity is not finite at {self.time_s:.3f} s")

@@ -16,7 +16,7 @@ from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.contact import contact_error
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
-from twin.simulate.inertial_sensor import inertial_quantities
+from twin.simulate.sensors import inertial_quantities
 from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, step_thrusters, thruster_wrench
 
 
@@ -65,7 +65,6 @@ class MujocoVehicle:
 
     @property
     def twist_body(self) -> Array:
-        """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
         return twist_from_free_joint(self._rotation, self._velocity_now())
 
     @property
@@ -84,12 +83,7 @@ class MujocoVehicle:
         return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates `duration_s`, a whole number of timesteps, under constant thruster commands (8,) in [-1, 1].
-
-        Raises:
-            SurveyAborted: the physics diverged, or the hull touches an obstacle.
-            ValueError: the duration is not a whole number of timesteps.
-        """
+        """Simulates as `CompiledVehicle.step` does, with all obstacles."""
         n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
         set_thruster_command(self._thrusters, thruster_u)
         for _ in range(n_steps):
@@ -102,7 +96,6 @@ class MujocoVehicle:
         self._history.append(self._described_state())
 
     def _advance(self, wrench: Array) -> None:
-        """Simulates one timestep under the wrench (6,) of the thrusters."""
         model, data = self._model, self._data
         velocity = self._velocity_now()
         target = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
@@ -117,7 +110,6 @@ class MujocoVehicle:
         self._acceleration, self._kick = target, 1.0
 
     def _check_divergence(self, acceleration: Array, velocity: Array) -> None:
-        """Raises SurveyAborted, listing the last states, if a value is not finite or reaches a limit of `hull`."""
         speeds = np.abs(velocity).reshape(2, 3).max(axis=1)
         if np.isfinite(acceleration).all() and speeds[0] < SPEED_LIMIT_MPS and speeds[1] < RATE_LIMIT_RADPS:
             return
@@ -125,7 +117,6 @@ class MujocoVehicle:
         raise SurveyAborted(f"the physics diverged at {self.time_s:.3f} s; last states: {states}")
 
     def _described_state(self) -> str:
-        """Returns time, position and, of half a timestep earlier, velocity of the free joint as text."""
         linear, angular = np.round(self._velocity, 4).reshape(2, 3).tolist()
         position_m = np.round(self._data.xpos[self._body], 4).tolist()
         return f"{self.time_s:.3f} s: at {position_m} m, {linear} m/s, {angular} rad/s"

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import BeaconDetection, Readings, SensorNoise, StereoRig
+from twin.core.records import BeaconDetection, Depth, ImuReadings, Readings, SensorNoise, StereoRig
+from twin.errors import TwinError
 from twin.kernels import kernel
-from twin.scenario.model import NavigationConfig
-from twin.simulate.inertial_sensor import InertialSensor
-
-Depth = NDArray[np.float32]
+from twin.scenario.model import ImuConfig, NavigationConfig
+from twin.simulate.hull import GRAVITY_MPS2
 
 _BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded
 
@@ -42,9 +41,7 @@ class NavigationSensors:
     Args:
         rig: believed calibration of the stereo rig.
         rng: random generators by name: "navigation" (pressure and attitude), "dvl", "usbl", "beacons".
-        project: projects points (n, 3) in left camera axes to pixels (n, 2) with the true calibration; None: the
-            projection of `rig`.
-        imu: inertial measurement unit; None: the vehicle has none.
+        project: projects points (n, 3) in left camera axes to pixels (n, 2) as truly calibrated; None: as `rig`.
 
     Attributes:
         per_frame: parameters of the sensors that are read at every frame, also for compiled code.
@@ -68,11 +65,8 @@ class NavigationSensors:
     ) -> Readings:
         """Returns simulated readings of one frame; acoustic fixes and beacons are read at keyframes only.
 
-        Args:
-            world_from_body: (4, 4) true pose.
-            twist_body: (6,) true [angular, linear] velocity in body axes [rad/s, m/s].
-            depth_m: function that returns the true depth (height, width) of the left image along the optical axis [m];
-                None if the frame is not a keyframe.
+        Pose (4, 4) and [angular, linear] velocity (6,) in body axes [rad/s, m/s] are true; `depth_m` returns the true
+        depth (height, width) of the left image along the optical axis [m], None if the frame is not a keyframe.
         """
         sensors, aiding = self.per_frame, self._settings.aiding
         (numbers,), (dvl_numbers,) = self.draw_noise(1)
@@ -92,25 +86,17 @@ class NavigationSensors:
         )
 
     def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
-        """Samples standard normal numbers of the next frames.
-
-        Returns:
-            Numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the Doppler velocity log.
-        """
+        """Samples standard normal numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the DVL."""
         return self._rng["navigation"].standard_normal((n_frames, 4)), self._rng["dvl"].standard_normal((n_frames, 3))
 
     def _acoustic_fix(self, time_s: float, position_m: Array) -> Array | None:
-        """Returns the ultra-short-baseline (USBL) position (3,) of the left camera at a keyframe.
-
-        None if the interval since the last fix has not elapsed.
-        """
+        """Returns the ultra-short-baseline (USBL) position (3,) of the left camera; None within the interval."""
         if time_s < self._next_fix_s - 1e-9:
             return None
         self._next_fix_s = time_s + self._settings.usbl_interval_s
         return position_m + self._noise.usbl_m * self._rng["usbl"].standard_normal(3)
 
     def _detect_beacons(self, world_from_camera: Array, depth_m: Depth) -> tuple[BeaconDetection, ...]:
-        """Returns the detections of the beacons in the left image that neither floor nor objects occlude."""
         beacons = np.array(self._noise.beacons_m).reshape(-1, 3)
         errors_px = self._noise.beacon_px * self._rng["beacons"].standard_normal((len(beacons), 2))
         points = geometry.transform(geometry.inverse(world_from_camera), beacons)
@@ -123,16 +109,13 @@ class NavigationSensors:
 def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_numbers):
     """Returns simulated readings of the `PerFrameSensors`; the readings of sensors not used for aiding are NaN.
 
-    The pressure sensor is in the housing of the left camera and measures the height of this camera; its reading
-    therefore needs no lever-arm correction, which attitude errors would affect.
+    These are height of the left camera [m], roll, pitch and yaw of the body (3,) [rad], and velocity (3,) of the body's
+    origin over ground in body axes [m/s]. The pressure sensor is in the housing of the left camera: its reading needs
+    no lever-arm correction, which attitude errors would affect.
 
     Args:
-        world_from_body: (4, 4) true pose.
-        twist_body: (6,) true [angular, linear] velocity in body axes [rad/s, m/s].
+        world_from_body, twist_body: true, as in `NavigationSensors.read`.
         numbers, dvl_numbers: (4,) and (3,) standard normal numbers, see `NavigationSensors.draw_noise`.
-    Returns:
-        Height of the left camera [m], roll, pitch and yaw of the body (3,) [rad], and velocity (3,) of the body's
-        origin over ground, in body axes [m/s].
     """
     up, arm = world_from_body[2], sensors.body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
@@ -154,3 +137,65 @@ def _in_view(pixel: Array, distance_m: float, depth_m: Depth) -> bool:
         return False
     column, row = np.rint(pixel).astype(int)
     return bool(distance_m < depth_m[row, column] + _BEACON_HEIGHT_M)
+
+
+def inertial_quantities(rotation: Array, rate_radps: Array, acceleration_mps2: Array) -> Array:
+    """Returns the true [angular rate, specific force R' (a + g z)] (6,) in body axes [rad/s, m/s2].
+
+    R is the rotation (3, 3) world_from_body, a the acceleration (3,) of the origin of the body in world axes, z up.
+    """
+    return np.concatenate([rate_radps, rotation.T @ (acceleration_mps2 + [0.0, 0.0, GRAVITY_MPS2])])
+
+
+def imu_rate_hz(settings: ImuConfig, motion_rate_hz: float) -> float:
+    """Returns the rate of the readings [Hz], by default that of the simulated motion; TwinError if it is above that."""
+    if settings.rate_hz is None:
+        return motion_rate_hz
+    if settings.rate_hz > motion_rate_hz * (1 + 1e-9):
+        problem = f"{settings.rate_hz:g}: above the rate of the simulated motion"
+        raise TwinError("imu.rate_hz", problem, f"up to {motion_rate_hz:g} with this vehicle and rig.frame_rate_hz")
+    return settings.rate_hz
+
+
+class InertialSensor:
+    """Inertial measurement unit at the origin of the body.
+
+    The true motion is interpolated linearly at the times of the readings, k / rate. Noise model of Kalibr: at a rate f,
+    white noise of density s has the standard deviation s sqrt(f), and the bias changes from reading to reading by steps
+    of w / sqrt(f), with w the density of its random walk.
+
+    Args:
+        motion_rate_hz: rate of the values given to `add`.
+        start: (6,) true [angular rate, specific force] at 0 s, in body axes [rad/s, m/s2].
+        rng: random generator of this sensor only.
+    """
+
+    def __init__(self, settings: ImuConfig, motion_rate_hz: float, start: Array, rng: np.random.Generator):
+        self._rate_hz, self._motion_rate_hz, self._rng = imu_rate_hz(settings, motion_rate_hz), motion_rate_hz, rng
+        densities = settings.gyroscope_noise_density, settings.accelerometer_noise_density
+        walks = settings.gyroscope_random_walk, settings.accelerometer_random_walk
+        biases = settings.gyroscope_bias_sigma_radps, settings.accelerometer_bias_sigma_mps2
+        self._sigma = np.repeat(densities, 3) * math.sqrt(self._rate_hz)
+        self._walk = np.repeat(walks, 3) / math.sqrt(self._rate_hz)
+        self._bias = np.repeat(biases, 3) * rng.standard_normal(6)
+        self._true, self._first = [start], 0  # values since the last call of `read`, and the number of the first one
+        self._n_read = 0
+
+    def add(self, true: Array) -> None:
+        """Adds the true [angular rate, specific force] (6,) of the next step of the motion."""
+        self._true.append(true)
+
+    def read(self) -> ImuReadings:
+        """Returns the readings since the last call, or since 0 s, up to the time of the last value added."""
+        last = self._first + len(self._true) - 1
+        ratio = self._motion_rate_hz / self._rate_hz
+        end = math.floor(last / ratio + 1e-9) + 1
+        numbers = np.arange(self._n_read, end)
+        positions, known = numbers * ratio, np.arange(self._first, last + 1)
+        true = np.column_stack([np.interp(positions, known, column) for column in np.transpose(self._true)])
+        white, steps = self._rng.standard_normal((len(numbers), 2, 6)).transpose(1, 0, 2)
+        biases = self._bias + np.cumsum(np.vstack([np.zeros(6), self._walk * steps]), axis=0)
+        self._bias = biases[-1]
+        values = true + biases[:-1] + self._sigma * white
+        self._true, self._first, self._n_read = self._true[-1:], last, end
+        return ImuReadings(numbers / self._rate_hz, values[:, :3], values[:, 3:])

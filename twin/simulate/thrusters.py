@@ -16,12 +16,7 @@ from twin.simulate.hydrodynamics import angular_first
 
 @kernel
 def steady_thrust_n(command: Array, coefficients: Array) -> Array:
-    """Returns the steady thrust (n,) [N] of a thruster at rest in the water for commands u in [-1, 1].
-
-    Args:
-        command: (n,) commands.
-        coefficients: coefficients of the odd polynomial in u, from the highest power down to u.
-    """
+    """Returns the thrust (n,) [N] at rest, an odd polynomial (highest power first) of commands u (n,) in [-1, 1]."""
     thrust = np.zeros_like(command)
     for coefficient in coefficients:  # Horner's scheme in u^2
         thrust = thrust * command * command + coefficient
@@ -44,7 +39,7 @@ class ThrusterState(NamedTuple):
 def lagged_thrusters(vehicle: VehicleParameters, timestep_s: float) -> ThrusterState:
     """Returns the thrusters of a vehicle at rest: the thrust of each follows its steady thrust with a linear lag.
 
-    The lag is discretised exactly for commands that are constant over a timestep (zero-order hold).
+    Exact for commands that are constant over a timestep (zero-order hold).
     """
     numerator, denominator = vehicle.thruster_lag
     a, b = _zero_order_hold(denominator, timestep_s)
@@ -64,7 +59,6 @@ def set_thruster_command(thrusters, command):
 
 @kernel
 def step_thrusters(thrusters):
-    """Advances the thrusts by one timestep under the last commands."""
     previous, order = thrusters.lag_state.copy(), len(thrusters.a)
     for i in range(order):
         for n in range(thrusters.lag_state.shape[1]):

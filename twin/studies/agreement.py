@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from twin.judge.map_error import INFINITE_WITH_HOLES
-from twin.report.wording import percent, plain
-from twin.studies import wording
+from twin.report.number_formats import percent, plain
+from twin.studies import sentences
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.statistics import LEVEL, RESAMPLES, UNDEFINED, Array, Interval, wilson_interval
 
@@ -35,7 +35,7 @@ LIMITS = (
 class MetricAgreement(NamedTuple):
     """Comparison of one metric over the pairs in which both surveys were flown to their end; NaN without a pair."""
 
-    metric: str  #: dotted name of the metric
+    metric: str
     #: number of pairs with a value in both surveys; a missing value of a metric that is infinite if the map has too
     #: many holes counts as infinite
     pairs: int
@@ -49,14 +49,11 @@ class MetricAgreement(NamedTuple):
 
     @property
     def agrees(self) -> bool:
-        """Returns whether the ratio of medians and the p-value are within their limits."""
         within = 1 / (1 + MEDIAN_LIMIT) <= self.ratio.value <= 1 + MEDIAN_LIMIT
         return bool(within and self.p_value >= P_LIMIT)
 
 
 class Agreement(NamedTuple):
-    """Agreement of all pairs of a study."""
-
     pairs: int  #: number of pairs in which both surveys have a result
     metrics: list[MetricAgreement]
     #: fraction of the pairs in which both surveys pass or both do not pass, with its confidence interval
@@ -66,12 +63,10 @@ class Agreement(NamedTuple):
 
     @property
     def verdicts_agree(self) -> bool:
-        """Returns whether the fraction of pairs with equal verdicts is at least `PASS_LIMIT`."""
         return self.verdicts.value >= PASS_LIMIT
 
     @property
     def agrees(self) -> bool:
-        """Returns whether every metric and the verdicts agree."""
         return bool(self.metrics) and self.verdicts_agree and all(metric.agrees for metric in self.metrics)
 
 
@@ -105,10 +100,7 @@ def pairs(analysis: StudyAnalysis) -> tuple[NDArray[np.int64], NDArray[np.int64]
 
 
 def values_of_pairs(analysis: StudyAnalysis, metric: str) -> tuple[Array, Array]:
-    """Returns the values (n,) of a metric in the rendered and the surrogate surveys of the pairs that can be compared.
-
-    These are the pairs in which both surveys were flown to their end and have a value; see `MetricAgreement`.
-    """
+    """Returns the values (n,) of a metric in the rendered and surrogate surveys of the pairs of `MetricAgreement`."""
     rendered, surrogate = pairs(analysis)
     values = analysis.numbers(metric)
     if metric in INFINITE_WITH_HOLES:
@@ -119,7 +111,6 @@ def values_of_pairs(analysis: StudyAnalysis, metric: str) -> tuple[Array, Array]
 
 
 def _compare(metric: str, rendered: Array, surrogate: Array) -> MetricAgreement:
-    """Returns the comparison of the values (n,) of a metric in rendered and surrogate surveys."""
     n = len(rendered)
     if n == 0:
         return MetricAgreement(metric, 0, np.nan, np.nan, UNDEFINED, np.nan)
@@ -133,21 +124,20 @@ def _compare(metric: str, rendered: Array, surrogate: Array) -> MetricAgreement:
 
 
 def _median(values: Array) -> Array:
-    """Returns the lower median along the last axis, which is one of the values, so that infinite values are allowed."""
+    """Returns the lower median along the last axis: one of the values, so that they may be infinite."""
     return np.quantile(values, 0.5, axis=-1, method="inverted_cdf")
 
 
 def _ratio(numerator: Array, denominator: Array) -> Array:
-    """Returns the ratio of non-negative values; 1 where they are equal, also if both are zero or infinite."""
+    """Returns the ratio of non-negative values; 1 also if both are zero or infinite."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(numerator == denominator, 1.0, numerator / denominator)
 
 
 def table(result: Agreement) -> list[tuple[str, ...]]:
-    """Returns the rows of the table, one row per metric, with the columns `HEADER`."""
     return [
         (
-            wording.metric_name(one.metric),
+            sentences.metric_name(one.metric),
             str(one.pairs),
             _value(one.metric, one.rendered),
             _value(one.metric, one.surrogate),
@@ -160,10 +150,9 @@ def table(result: Agreement) -> list[tuple[str, ...]]:
 
 
 def verdict_line(result: Agreement) -> str:
-    """Returns a sentence with the verdict and the fraction of the pairs whose surveys have the same verdict."""
     return (
         f"{'PASS' if result.agrees else 'FAIL'}: {result.pairs} pairs; both surveys pass or both do not pass in "
-        f"{wording.percent_interval(result.verdicts)} of them ({_verdict(result.verdicts_agree)}; only the rendered "
+        f"{sentences.percent_interval(result.verdicts)} of them ({_verdict(result.verdicts_agree)}; only the rendered "
         f"survey passes in {result.only_rendered}, only the surrogate survey in {result.only_surrogate})."
     )
 
@@ -171,7 +160,7 @@ def verdict_line(result: Agreement) -> str:
 def _value(metric: str, value: float) -> str:
     if np.isinf(value):
         return "infinite"
-    return wording.metric_value(metric, value) if metric.endswith("_m") else plain(value)
+    return sentences.metric_value(metric, value) if metric.endswith("_m") else plain(value)
 
 
 def _verdict(agrees: bool) -> str:

@@ -13,7 +13,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from twin.judge.map_error import with_completeness
-from twin.judge.require import more_is_better
+from twin.judge.verdict import more_is_better
 from twin.studies import statistics
 from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values, range_text
 from twin.studies.statistics import UNDEFINED, Array, Interval, SobolIndex
@@ -25,8 +25,6 @@ Mask = NDArray[np.bool_]
 
 
 class MetricSummary(NamedTuple):
-    """Distribution of a metric over the surveys."""
-
     name: str
     surveys: int  #: number of surveys in these statistics; see `StudyAnalysis.included`
     median: Interval
@@ -35,8 +33,6 @@ class MetricSummary(NamedTuple):
 
 
 class Sensitivity(NamedTuple):
-    """Dependence of a metric on a key."""
-
     key: str
     metric: str
     correlation: Interval  #: rank correlation; NaN if the values of the key are not numbers
@@ -49,7 +45,7 @@ class Sensitivity(NamedTuple):
 
 
 class FailureReason(NamedTuple):
-    """Status of surveys that did not pass, the reason, and the number of surveys with this status and reason."""
+    """Number of surveys with a status and a reason for it."""
 
     status: str
     reason: str
@@ -57,7 +53,7 @@ class FailureReason(NamedTuple):
 
 
 class RefusedSample(NamedTuple):
-    """A sample with refused surveys: its number, number of refused surveys, value of each varied key, reason."""
+    """A sample with refused surveys: its number, their number, value of each varied key, reason."""
 
     sample: int
     surveys: int
@@ -72,10 +68,7 @@ class StudyAnalysis:
     that only the surrogate refuses (`unmodelled`) also count in pass probabilities, as unknown results. Surveys of the
     same scenario with the same seed are identical and count once, except in `sobol`.
 
-    Args:
-        rows: results table.
-        study: the study.
-        planned: number of surveys of the study; None: all of them are in the table.
+    `planned` is the number of surveys of the study; None: all of them are in the table.
     """
 
     def __init__(self, rows: pa.Table, study: Study, planned: int | None = None):
@@ -124,11 +117,7 @@ class StudyAnalysis:
         return {name: float(np.nanmax(v)) if np.isfinite(v).any() else np.nan for name, v in limits.items()}
 
     def included(self, metric: str) -> Mask:
-        """Returns the mask (n,) of the surveys that are included in the statistics of a metric.
-
-        These are the complete surveys with a finite value of the metric. The statistics of image quality metrics
-        ("vision.") also include degraded and aborted surveys.
-        """
+        """Returns the complete surveys (n,) with a finite metric; "vision." also counts degraded and aborted ones."""
         flown = self.evaluated if metric.startswith("vision.") else self.complete
         return flown & np.isfinite(self.numbers(metric))
 
@@ -140,7 +129,6 @@ class StudyAnalysis:
 
     @cached_property
     def clusters(self) -> Array:
-        """Returns the label of the cluster of each survey (n,): the surveys of a cluster share a sample or a seed."""
         return self.numbers(self.cluster_name)
 
     @cached_property
@@ -149,21 +137,18 @@ class StudyAnalysis:
         return self.proportion(self.counted)
 
     def proportion(self, chosen: Mask | NDArray[np.int64]) -> Interval:
-        """Returns the pass probability of the chosen surveys (a mask or row numbers), which are all in `counted`."""
+        """Returns the pass probability of the chosen surveys, which are all in `counted`."""
         return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unmodelled[chosen])
 
     @property
     def possible_fractions(self) -> tuple[float, float]:
-        """Returns the fraction of the surveys that passed if none, and if all, of the unknown results are passes."""
+        """Returns the fraction that passed if none, and if all, of the unknown results are passes."""
         n, passed = max(int(self.counted.sum()), 1), int(self.passed.sum())
         return passed / n, (passed + int(self.unmodelled.sum())) / n
 
     @property
     def requirement_missed(self) -> bool:
-        """Returns whether the fraction of surveys that passed is below the required value, or is not known.
-
-        Unknown results count as not passed. False if no pass probability is required.
-        """
+        """Returns whether the fraction that passed (unknown counts as not) is below the required one, or not known."""
         required = self.required_probability
         return required is not None and not (self.evaluated.any() and self.possible_fractions[0] >= required)
 
@@ -174,11 +159,7 @@ class StudyAnalysis:
         return self.numbers(f"vary.{key}") if is_number else None
 
     def key_groups(self, key: str, chosen: Mask) -> tuple[NDArray[np.int64], list[str]]:
-        """Groups the surveys of the mask `chosen` (n,) by the value of a key; see `statistics.group_indices`.
-
-        Returns:
-            The group index of each chosen survey, and the name of each group: its value or its range of values.
-        """
+        """Returns the group (`statistics.group_indices`) of each chosen survey, and values or ranges as names."""
         values = self.key_numbers(key)
         if values is None:
             names, index = np.unique(self._texts(f"vary.{key}")[chosen].astype(str), return_inverse=True)
@@ -188,7 +169,6 @@ class StudyAnalysis:
 
     @cached_property
     def metric_summaries(self) -> list[MetricSummary]:
-        """Returns the summary of the distribution of each metric."""
         return [self._metric_summary(name) for name in self.metrics]
 
     def _metric_summary(self, name: str) -> MetricSummary:
@@ -230,7 +210,6 @@ class StudyAnalysis:
         }
 
     def _mean_of_samples(self, metric: str) -> Array:
-        """Returns the mean of a metric over the surveys of each sample, by sample number."""
         values = np.where(self.status == "complete", self.numbers(metric), np.nan)  # also duplicates
         sample = self.numbers("sample").astype(np.int64)
         return np.bincount(sample, values) / np.bincount(sample)
@@ -239,10 +218,8 @@ class StudyAnalysis:
     def answers(self) -> dict[str, list[Answer]]:
         """Returns, for each varied key, the verdicts on whether the pass probability reaches the required value.
 
-        A key with a continuous distribution has one answer per range. A key with listed values has one answer per
-        value, or per range if it has more than 12 different numbers. The other keys vary as the study specifies. The
-        result is empty without a required pass probability, or if no survey was evaluated. The `unmodelled` surveys
-        count as unknown.
+        A key with a continuous distribution, or with more than 12 listed numbers, has one answer per range, another one
+        per value. Empty without a required pass probability, or if no survey was evaluated.
         """
         if self.required_probability is None or not self.evaluated.any():
             return {}
@@ -262,7 +239,6 @@ class StudyAnalysis:
 
     @cached_property
     def refused_samples(self) -> list[RefusedSample]:
-        """Returns the samples with refused surveys, in ascending order of their numbers."""
         rows = np.flatnonzero(self.refused)
         numbers, first, counts = np.unique(self.numbers("sample")[rows], return_index=True, return_counts=True)
         values = [{key: self.rows[f"vary.{key}"][int(k)].as_py() for key in self.keys} for k in rows[first]]
@@ -271,7 +247,7 @@ class StudyAnalysis:
 
     @cached_property
     def refusal_reasons(self) -> list[FailureReason]:
-        """Returns the reasons why surveys were refused, at most 12, the most frequent first; see `count_similar`."""
+        """Returns the reasons of refusals, at most 12, the most frequent first; see `count_similar`."""
         counts = count_similar(self.reason[self.refused])
         return [FailureReason("refused", reason, count) for reason, count in counts.items()][:_MAX_REASONS]
 
@@ -285,7 +261,7 @@ class StudyAnalysis:
 
     @cached_property
     def warning_counts(self) -> dict[str, int]:
-        """Returns the number of surveys with each warning, the most frequent first; see `count_similar`."""
+        """Returns the number of surveys with each warning; see `count_similar`."""
         return count_similar(self.warning[(self.warning != "") & ~self.duplicate])
 
     def _missed_limits(self, row: int) -> str:
@@ -294,10 +270,7 @@ class StudyAnalysis:
 
 
 def mask_numbers(reason: str) -> str:
-    """Returns a reason with its numbers replaced by "…", so that reasons that differ only in numbers become equal.
-
-    Digits within a word, e.g. in "LE90", are kept.
-    """
+    """Returns a reason with its numbers, but not digits within a word such as "LE90", replaced by "…"."""
     return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "…", reason)
 
 

@@ -27,7 +27,7 @@ class Answer(NamedTuple):
     label: str  #: the range or the value as text, e.g. "1.6 to 1.9".
     low: float  #: smallest value in the range; NaN for text
     high: float  #: largest value in the range; NaN for text
-    surveys: int  #: number of surveys in the range
+    surveys: int
     probability: Interval  #: pass probability in the range, with its 95 % confidence interval
     #: number of further surveys that would decide the verdict if the observed fractions stay the same; 0 if it is
     #: decided, infinite if the observed fraction equals the required one or the required one is 1, or if the verdict
@@ -39,9 +39,9 @@ class Answer(NamedTuple):
 class PassRecord(NamedTuple):
     """Pass or fail of n surveys with their cluster labels, and the required pass probability."""
 
-    passed: NDArray[np.bool_]  #: (n,) whether each survey passed
-    clusters: Array  #: (n,) cluster label of each survey
-    required: float  #: required pass probability
+    passed: NDArray[np.bool_]  #: (n,)
+    clusters: Array  #: (n,)
+    required: float
     pass_level: float = LEVEL  #: confidence level of the lower bound for the verdict "passes"
     fail_level: float = LEVEL  #: confidence level of the upper bound for the verdict "fails"
     #: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at the lower
@@ -49,7 +49,7 @@ class PassRecord(NamedTuple):
     unknown: NDArray[np.bool_] | np.bool_ = np.False_
 
     def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
-        """Returns the answer for the surveys that the mask `chosen` (n,) selects, of which there is at least one."""
+        """Returns the answer for the surveys of the mask `chosen` (n,), of which there is at least one."""
         clusters, unknown = self.clusters[chosen], (self.unknown & chosen)[chosen]
         passed = self.passed[chosen] & ~unknown
         verdict: Verdict = "undecided"
@@ -83,7 +83,7 @@ class PassRecord(NamedTuple):
 
 
 def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
-    """Returns the verdict on the pass probability for each distinct value of a key: `names` (n,), numbers or text."""
+    """Returns the answer for each distinct value of a key: `names` (n,), numbers or text."""
     values = np.asarray(names)
     if np.issubdtype(values.dtype, np.number):
         return [record.answer(values == value, f"{value:.4g}", value, value) for value in np.unique(values).tolist()]
@@ -91,7 +91,7 @@ def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
 
 
 def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
-    """Returns the answers for a continuous key, as ranges in ascending order.
+    """Returns the answers for a continuous key with the values x (n,), as ranges in ascending order.
 
     The surveys are sorted by the key and divided into bins, see `pass_bins`. A decided range is a run of consecutive
     bins that is decided as a whole, begins and ends with bins whose observed fraction agrees with the verdict, and
@@ -99,9 +99,6 @@ def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
     surveys are chosen first; the bins between them form undecided ranges. The confidence levels allow for this search,
     see `PassRecord.for_ranges`. A range extends from the smallest to the largest value of the key in its surveys; no
     claim is made beyond them.
-
-    Args:
-        x: (n,) value of the key in each survey.
     """
     bins = pass_bins(x, np.where(record.unknown, 2, record.passed))
     n_bins = int(bins.max()) + 1
@@ -182,7 +179,6 @@ def _decided_runs(
 
 
 def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], required: float) -> bool:
-    """Returns whether the verdict on a range of consecutive bins (first, last) is supported by these bins."""
     verdict = runs[run].verdict
     if verdict == "undecided":
         return False
@@ -195,7 +191,7 @@ def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], re
 
 
 def rounded(value: float) -> str:
-    """Returns a number with three significant digits, or all digits before the decimal point, without an exponent."""
+    """Returns a number as text with three significant digits, without an exponent."""
     return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
 
 

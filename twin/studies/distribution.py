@@ -52,23 +52,22 @@ class Distribution(Section):
 
     @property
     def kind(self) -> str:
-        """Returns the name of the only field that is not None, e.g. "uniform"."""
         return next(name for name in KINDS if getattr(self, name) is not None)
 
     @property
     def values(self) -> tuple[Any, ...]:
-        """Returns the parameters of the distribution, or the listed values of a choice or grid."""
         return getattr(self, self.kind)
 
     @property
     def is_sampled(self) -> bool:
-        """Returns whether the key is sampled; the values of a grid are enumerated instead."""
+        """Returns whether values are sampled; those of a grid are enumerated instead."""
         return self.kind != "grid"
 
     def quantiles(self, probability: Array) -> list[Any]:
         """Returns the quantiles at probabilities (n,), 0 to 1; the values of a choice or grid are equally probable."""
         if self.kind not in _LAWS:
-            return equally_probable(self.values, probability)
+            n = len(self.values)
+            return [self.values[k] for k in np.minimum((probability * n).astype(np.int64), n - 1)]
         inside = np.clip(probability, 1e-12, 1 - 1e-12)  # where the quantiles of normal distributions are finite
         return [float(value) for value in _LAWS[self.kind][2](inside, *self.values)]
 
@@ -103,9 +102,3 @@ _LAWS: dict[str, tuple[Any, Any, Any]] = {
         _truncated_normal,
     ),
 }
-
-
-def equally_probable(values: tuple[Any, ...], probability: Array) -> list[Any]:
-    """Returns the value at each probability (n,), 0 to 1, if all values are equally probable."""
-    index = np.minimum((probability * len(values)).astype(np.int64), len(values) - 1)
-    return [values[k] for k in index]

@@ -26,9 +26,9 @@ KEPT: dict[str, tuple[tuple[str, ...] | None, tuple[str, ...] | None]] = {
 def fly(survey: Survey) -> Row:
     """Flies a survey, writes the files of its run folder that are kept, and returns its row of results.
 
-    The row has the status "refused" if a ScenarioError was raised, and "failed" if another TwinError or an OSError was
-    raised; if only the surrogate refuses the scenario, `unmodelled` is true. The survey writes to a hidden folder that
-    is renamed at the end, so a folder with the final name is complete.
+    The row has the status "refused" if a ScenarioError was raised, with `unmodelled` if only the surrogate refuses the
+    scenario, and "failed" after another TwinError or an OSError. The survey writes to a hidden folder that is renamed
+    at the end, so a folder with the final name is complete.
     """
     import cv2
 
@@ -57,12 +57,11 @@ def _move_kept_files(scratch: Path, survey: Survey) -> None:
     """Deletes the files that are not kept and renames the folder `scratch` to its final name."""
     shutil.rmtree(survey.folder, ignore_errors=True)
     kept = KEPT[survey.keep][1]
-    if kept == ():
-        return
     for entry in scratch.iterdir():
         if kept is not None and entry.name not in kept:
             shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
-    scratch.replace(survey.folder)
+    if kept != ():
+        scratch.replace(survey.folder)
 
 
 def _status(metrics: Mapping[str, Any]) -> str:
@@ -75,36 +74,27 @@ def _status(metrics: Mapping[str, Any]) -> str:
 def row_of(survey: Survey, status: str, reason: str) -> Row:
     """Returns a row without metrics: sample, seed, scenario hash, fidelity, status, reason, values of the varied keys.
 
-    Args:
-        status: "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
-            "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if the program or the
-            computer failed.
+    The status is "complete"; "degraded" if the survey was flown to its end but fails a check of the estimators;
+    "aborted" if it ended early; "refused" if its scenario cannot be flown; "failed" if program or computer failed.
     """
     identity = {"scenario_hash": survey.scenario_hash, "fidelity": survey.scenario.imaging.fidelity}
-    return _row(survey.key, identity, status, reason, survey.values)
+    row = {"sample": survey.sample, "seed": survey.seed, **identity, "status": status, "reason": reason}
+    return row | {f"vary.{name}": value for name, value in survey.values.items()}
 
 
 def refused_row(sample: Sample, seed: int, reason: str) -> Row:
     """Returns the row of a survey whose scenario is not valid; its scenario hash is empty."""
-    return _row((sample.number, seed), {"scenario_hash": ""}, "refused", reason, sample.values)
-
-
-def _row(key: tuple[int, int], identity: Row, status: str, reason: str, values: Mapping[str, Any]) -> Row:
-    row = {"sample": key[0], "seed": key[1], **identity, "status": status, "reason": reason}
-    return row | {f"vary.{name}": value for name, value in values.items()}
+    row = {"sample": sample.number, "seed": seed, "scenario_hash": "", "status": "refused", "reason": reason}
+    return row | {f"vary.{name}": value for name, value in sample.values.items()}
 
 
 def has_passed(row: Row) -> bool:
-    """Returns whether the survey has the status "complete" and met every requirement."""
     verdicts = (value for name, value in row.items() if name.startswith("require.") and name.endswith(".passed"))
     return row["status"] == "complete" and all(verdicts)
 
 
 def flatten(metrics: Mapping[str, Any]) -> Row:
-    """Returns the values in the sections of metrics.json, keyed by dotted name, e.g. "map.le90_m".
-
-    Names of measured run times begin with "timing.". Top-level values, such as the status, are left out.
-    """
+    """Returns the values in sections of metrics.json by dotted name, e.g. "map.le90_m"; run times begin "timing."."""
     row = dict(_leaves({name: section for name, section in metrics.items() if isinstance(section, Mapping)}, ""))
     for track in metrics.get("tracks", ()):
         for name, value in track.items():

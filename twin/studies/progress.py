@@ -12,18 +12,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as ProgressBar
 
-from twin.report.wording import plain
+from twin.report.number_formats import plain
 from twin.studies.flight import Row, has_passed
 from twin.studies.statistics import wilson_interval
 
 
 class StudyProgress:
-    """Display of a study's progress: numbers of finished, failed and refused surveys, and the current pass probability.
-
-    Args:
-        bar: progress bar on a terminal; None: no bar.
-        print_surveys: whether to print one line per survey.
-    """
+    """Display of finished, failed and refused surveys and pass probability: a bar, or lines of `print_surveys`."""
 
     def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
         self.total, self.ended = 0, Counter[str]()
@@ -32,23 +27,19 @@ class StudyProgress:
 
     @property
     def done(self) -> int:
-        """Returns the number of surveys that have ended."""
         return self.ended["all"]
 
     def begin(self, total: int) -> None:
-        """Sets the number of surveys that this run flies in total."""
         self.total = total
         self._update_bar()
 
     def print_line(self, text: str) -> None:
-        """Prints a line on stderr."""
         if self.bar:
             self.bar.console.print(text, markup=False, highlight=False)
         else:
             print(text, file=sys.stderr, flush=True)
 
     def add(self, row: Row) -> None:
-        """Counts a survey that has ended, and updates the display."""
         self.ended.update(["all", row["status"]])
         self.ended.update(passed=has_passed(row), unmodelled=bool(row.get("unmodelled")))
         if self.print_surveys:
@@ -72,7 +63,6 @@ class StudyProgress:
 
 @contextmanager
 def study_progress(print_surveys: bool) -> Iterator[StudyProgress]:
-    """Yields the progress of a study, with a progress bar if stderr is a terminal."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield StudyProgress(print_surveys=print_surveys)
@@ -83,7 +73,6 @@ def study_progress(print_surveys: bool) -> Iterator[StudyProgress]:
 
 
 def survey_line(row: Row) -> str:
-    """Returns one line with a survey's sample, seed, status, reason, and values of the varied keys."""
     missed = "" if has_passed(row) else ", requirements not met"
     result = row["status"] + (f" ({row['reason']})" if row["reason"] else missed)
     varied = ", ".join(f"{name[5:]} {plain(value)}" for name, value in row.items() if name.startswith("vary."))

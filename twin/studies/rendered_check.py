@@ -1,7 +1,4 @@
-"""Check of a surrogate study: the surveys with the least certain verdicts are repeated with rendered images.
-
-These are the surveys whose metrics lie closest to the limits.
-"""
+"""Check of a surrogate study: the surveys whose metrics lie closest to the limits are repeated with rendered images."""
 
 from __future__ import annotations
 
@@ -11,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.judge.require import more_is_better
-from twin.studies import wording
+from twin.judge.verdict import more_is_better
+from twin.studies import sentences
 from twin.studies.analysis import Mask, StudyAnalysis
 from twin.studies.flight import has_passed
 from twin.studies.results_log import key_of
@@ -27,7 +24,7 @@ class RenderedCheck(NamedTuple):
     """Verdicts of the rendered surveys and of the surrogate surveys with the same scenarios and seeds."""
 
     rendered: Mask  #: (n,) whether each rendered survey was completed and met every requirement
-    surrogate: Mask  #: (n,) whether each of the surrogate surveys was completed and met every requirement
+    surrogate: Mask  #: (n,) the same of the surrogate surveys
     interrupted: bool = False  #: whether Ctrl-C ended the check, so that some of the rendered surveys are missing
     has_limits: bool = True  #: whether the study has a limit, so that there are verdicts to check
     n_lost: int = 0  #: number of rendered surveys that were refused or failed, and therefore have no verdict
@@ -39,25 +36,20 @@ class RenderedCheck(NamedTuple):
 
     @property
     def pass_probability(self) -> Interval:
-        """Returns the fraction of the rendered surveys that passed, with its confidence interval (Wilson)."""
         return wilson_interval(float(self.rendered.sum()), len(self.rendered))
 
     @property
     def agrees(self) -> bool:
-        """Returns whether the fraction of the surrogate surveys that passed lies in the interval of `pass_probability`.
-
-        False without a rendered survey.
-        """
+        """Returns whether the fraction of surrogate surveys that passed lies in the interval of the rendered ones."""
         interval = self.pass_probability
         return len(self.rendered) > 0 and interval.low <= float(self.surrogate.mean()) <= interval.high
 
     def sentence(self) -> str:
-        """Returns the result in one sentence, and another one if the check is incomplete."""
+        """Returns the result of the rendered surveys in one sentence, and another one if the check is incomplete."""
         partial = " The check was interrupted and is incomplete; --resume continues it." if self.interrupted else ""
         return self._result() + partial
 
     def _result(self) -> str:
-        """Returns, in one sentence, the result of the rendered surveys flown so far."""
         n = len(self.rendered)
         if not self.has_limits:
             return "No survey was flown rendered: the study has no limit in [require], so there is no verdict to check."
@@ -68,7 +60,8 @@ class RenderedCheck(NamedTuple):
         if n == 0:
             return "No survey was flown rendered: none of the surrogate surveys has a value of every required metric."
         same = int((self.rendered == self.surrogate).sum())
-        passed, verdict = wording.percent_interval(self.pass_probability), "agrees" if self.agrees else "does not agree"
+        passed = sentences.percent_interval(self.pass_probability)
+        verdict = "agrees" if self.agrees else "does not agree"
         return (
             f"Of the {n} surveys closest to the limits, {int(self.rendered.sum())} pass when rendered ({passed}) and "
             f"{int(self.surrogate.sum())} with the surrogate, which {verdict}; {same} have the same verdict."
@@ -78,15 +71,9 @@ class RenderedCheck(NamedTuple):
 def check(analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> RenderedCheck:
     """Flies n rendered surveys and returns the comparison with the surrogate; finished rendered surveys are reused.
 
-    Ctrl-C ends the check early; the comparison then contains the rendered surveys flown until then.
-
-    Args:
-        folder: results folder of the study; the rendered surveys are written to its subfolder `FOLDER`.
-
-    Raises:
-        TwinError: the subfolder cannot be written, or contains the results of another study; or the engine lost its
-            connection.
-        OSError: the results cannot be written.
+    They are written to the subfolder `FOLDER` of the study's folder. Ctrl-C ends the check early. Raises TwinError if
+    the subfolder cannot be written or has results of another study, or the engine lost its connection; OSError if
+    results cannot be written.
     """
     study, nearest = analysis.study, nearest_surveys(analysis, n)
     keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
@@ -109,7 +96,6 @@ def check(analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> Render
 
 
 def summary(checked: RenderedCheck) -> dict[str, Any]:
-    """Returns the check as JSON values."""
     return {
         "surveys": len(checked.rendered),
         "rendered_passed": int(checked.rendered.sum()),
@@ -123,9 +109,9 @@ def summary(checked: RenderedCheck) -> dict[str, Any]:
 def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
     """Returns the row numbers of the n surrogate surveys whose metrics are closest to the limits, the closest first.
 
-    The distance of a metric from its limit is the number of surveys whose value lies between the two, so that metrics
-    of any unit can be compared. The worst metric of a survey counts: the one that is farthest beyond its limit,
-    or else closest to it. Surveys without a finite value of every required metric are left out.
+    The distance of a metric from its limit is the number of surveys whose value lies between the two. Of a survey, the
+    metric farthest beyond its limit counts, or else the one closest to it. Surveys without a finite value of every
+    required metric are left out.
     """
     is_surrogate = np.array([value == "surrogate" for value in analysis.rows["fidelity"].to_pylist()], bool)
     chosen = np.flatnonzero(analysis.evaluated & is_surrogate)
@@ -139,14 +125,13 @@ def nearest_surveys(analysis: StudyAnalysis, n: int) -> NDArray[np.int64]:
 
 
 def _excess(values: Array, limit: float) -> Array:
-    """Returns, for each of the values (n,), the number of values between it and a limit; negative below the limit."""
+    """Returns, for each of the values (n,), the number of values from it to a limit; negative below the limit."""
     ascending = np.sort(values)
     rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
     return rank - np.searchsorted(ascending, limit, "right")
 
 
 def _rendered(survey: Survey) -> Survey:
-    """Returns the rendered survey with the scenario and seed of a surrogate survey."""
     imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
     scenario = survey.scenario.model_copy(update={"imaging": imaging})
     return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint())

@@ -14,7 +14,7 @@ import numpy as np
 from twin.core.user_files import read_text
 from twin.report.html import render_page
 from twin.report.style import FIGURE_STYLE
-from twin.studies import agreement, figures, wording
+from twin.studies import agreement, sentences, study_figures
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.statistics import RESAMPLES
 
@@ -23,17 +23,16 @@ _STATUSES = ("complete", "degraded", "aborted", "refused", "failed")
 
 
 def write_report(analysis: StudyAnalysis, page: Path) -> None:
-    """Writes the report of a study to the file `page`."""
     compared = agreement.agreement(analysis)
     context = {
         "study": analysis.study,
         "agreement": agreement,
         "compared": compared,
         "analysis": analysis,
-        "wording": wording,
-        "headline": wording.headline(analysis),
+        "sentences": sentences,
+        "headline": sentences.headline(analysis),
         "sensitivities": [s for s in analysis.sensitivities if np.isfinite(s.correlation.value) or s.explained > 0],
-        "figures": figures.draw_all(analysis, compared is not None),
+        "figures": study_figures.draw_all(analysis, compared is not None),
         "refused_samples": analysis.refused_samples[:_MAX_REFUSED],
         "resamples": RESAMPLES,
         "text": read_text(analysis.study.source.path),
@@ -43,17 +42,14 @@ def write_report(analysis: StudyAnalysis, page: Path) -> None:
 
 
 def write_agreement(analysis: StudyAnalysis, folder: Path) -> None:
-    """Writes agreement.md, with the command and the table, and its figure agreement.png to a folder.
-
-    Writes nothing if the study compares no metrics or no pair of surveys has two results.
-    """
+    """Writes agreement.md, with the command and the table, and its figure, if the study has an agreement."""
     result, study = agreement.agreement(analysis), analysis.study
     if result is None:
         return
     with matplotlib.rc_context(FIGURE_STYLE):
-        figures.agreement_of_pairs(analysis).savefig(folder / "agreement.png", bbox_inches="tight")
+        study_figures.agreement_of_pairs(analysis).savefig(folder / "agreement.png", bbox_inches="tight")
     limits = ", ".join(
-        f"{wording.metric_name(name)} {wording.metric_value(name, v)}" for name, v in study.limits.items()
+        f"{sentences.metric_name(name)} {sentences.metric_value(name, v)}" for name, v in study.limits.items()
     )
     table = [agreement.HEADER, ("---",) * len(agreement.HEADER), *agreement.table(result)]
     lines = [
@@ -69,7 +65,6 @@ def write_agreement(analysis: StudyAnalysis, folder: Path) -> None:
 
 
 def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns the summary of a study as JSON values, after those of `identity`."""
     compared = agreement.agreement(analysis)
     return json_tree(
         dict(identity)
@@ -83,7 +78,13 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
             "probability": analysis.pass_probability._asdict() | {"required": analysis.required_probability},
             "requirement_missed": analysis.requirement_missed,
             "seek": analysis.study.seek,
-            "agreement": compared and _agreement(compared),
+            "agreement": compared
+            and {
+                "agrees": compared.agrees,
+                "pairs": compared.pairs,
+                "verdicts": compared.verdicts._asdict() | {"agrees": compared.verdicts_agree},
+                "metrics": {one.metric: _metric(one) for one in compared.metrics},
+            },
             "answers": analysis.answers,
             "metrics": {
                 metric.name: {"surveys": metric.surveys, "median": metric.median, "bound_95_percent": metric.bound}
@@ -97,12 +98,8 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
     )
 
 
-def _agreement(result: agreement.Agreement) -> dict[str, Any]:
-    metrics = {one.metric: one._asdict() | {"agrees": one.agrees} for one in result.metrics}
-    for values in metrics.values():
-        del values["metric"]
-    verdicts = result.verdicts._asdict() | {"agrees": result.verdicts_agree}
-    return {"agrees": result.agrees, "pairs": result.pairs, "verdicts": verdicts, "metrics": metrics}
+def _metric(one: agreement.MetricAgreement) -> dict[str, Any]:
+    return {name: value for name, value in one._asdict().items() if name != "metric"} | {"agrees": one.agrees}
 
 
 def json_tree(value: Any) -> Any:

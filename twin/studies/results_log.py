@@ -32,7 +32,7 @@ class ResultsLog:
         self._unwritten: list[str] = []
 
     def add(self, row: Row) -> None:
-        """Writes a row, together with earlier rows that could not be written; ignores a failure of the write."""
+        """Writes a row and earlier ones that could not be written; ignores a failure of the write."""
         self._unwritten.append(json.dumps(row) + "\n")
         with suppress(OSError):
             self.flush()
@@ -66,14 +66,11 @@ class ResultsLog:
 
     def done(self) -> set[tuple[int, int]]:
         """Returns (sample, seed) of every survey whose last row does not have the status "failed"."""
-        status = {key_of(row): row["status"] for row in self.rows()}
-        return {key for key, last in status.items() if last != "failed"}
+        last = {key_of(row): row["status"] for row in self.rows()}
+        return {key for key, status in last.items() if status != "failed"}
 
     def table(self, wanted: Container[tuple[int, int]] | None = None) -> pa.Table:
-        """Returns the last row of each of the `wanted` surveys (None: of all) as a table, sorted by sample and seed.
-
-        The table does not depend on the order in which the rows were written.
-        """
+        """Returns the last row of each of the `wanted` surveys (None: of all) as a table, sorted by sample and seed."""
         last = {key_of(row): number for number, row in enumerate(self.rows())}
         included = {number for key, number in last.items() if wanted is None or key in wanted}
 
@@ -95,26 +92,24 @@ class ResultsLog:
 
 
 def key_of(row: Row) -> tuple[int, int]:
-    """Returns (sample, seed) of the survey of a row."""
     return row["sample"], row["seed"]
 
 
 def write_parquet(rows: pa.Table, file: Path) -> None:
-    """Writes a table to a Parquet file atomically; raises OSError if the file cannot be written."""
+    """Writes a table to a Parquet file atomically."""
     part = file.with_name(f".{file.name}.part")
     pq.write_table(rows, part)
     part.replace(file)
 
 
 def _column_order(name: str) -> tuple[int, int, str]:
-    """Returns the sort key of a column: identity, varied keys, metrics, timing."""
     if name in _IDENTITY:
         return 0, _IDENTITY.index(name), name
     return {"vary": 1, "timing": 3}.get(name.partition(".")[0], 2), 0, name
 
 
 def _column_type(kinds: set[type]) -> pa.DataType:
-    """Returns the type of a column with values of these kinds; lists, dictionaries and mixtures are stored as text."""
+    """Returns the type of a column; lists, dictionaries and mixtures of these kinds are stored as text."""
     if not kinds:
         return pa.null()
     columns = (({bool}, pa.bool_()), ({int}, pa.int64()), ({int, float}, pa.float64()))

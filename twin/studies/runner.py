@@ -31,9 +31,7 @@ class Throughput(NamedTuple):
 
 
 class StudyResult(NamedTuple):
-    """Outcome of `run_study`."""
-
-    analysis: StudyAnalysis  #: statistics of the surveys
+    analysis: StudyAnalysis
     page: Path  #: file of the report
     write_errors: list[str]  #: messages of the errors that occurred while the results were written
     interrupted: bool  #: whether Ctrl-C ended the study
@@ -48,11 +46,7 @@ class Fleet(NamedTuple):
     function: Callable[[Survey], Row] = fly  #: flies one survey; must be importable by name on the workers
 
     def fly(self, study: Study, missing: Iterable[Survey], add_row: Callable[[Row], None]) -> bool:
-        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C.
-
-        Raises:
-            TwinError: the engine lost its connection.
-        """
+        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C."""
         try:
             for outcome in self.engine.run_many(self.function, missing, TaskLimits(study.timeout_s, study.retries)):
                 row = row_of_outcome(outcome)
@@ -64,15 +58,11 @@ class Fleet(NamedTuple):
 
 
 def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyResult:
-    """Flies the surveys for which the folder has no result, and writes results.parquet and study.html.
+    """Flies the surveys for which the folder has no result; writes results.parquet, study.html and any agreement.
 
-    For a study that compares rendered and surrogate surveys, agreement.md and its figure are written too. Ctrl-C ends
-    the study early; the results obtained until then are written.
-
-    Raises:
-        TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written,
-            or belongs to another study; or the engine lost its connection.
-        ScenarioError: no sample has a valid scenario; nothing was flown.
+    Ctrl-C ends the study early; the results obtained until then are written. Raises TwinError if the folder is not
+    empty and `resume` is not set, is written by another process, cannot be written or belongs to another study, or if
+    the engine lost its connection; ScenarioError, before any flight, if no sample has a valid scenario.
     """
     refused, planned, run_times_s = refusals(study), set(survey_keys(study)), []
     with open_folder(folder, resume) as log:
@@ -115,7 +105,6 @@ def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLo
 
 
 def refusal_notice(refused: dict[int, str]) -> str:
-    """Returns a line with the number of refused samples, and the number and reason of the first one."""
     number, reason = min(refused.items())
     if len(refused) == 1:
         return f"1 sample cannot be flown and is left out: sample {number}: {reason}"
@@ -124,18 +113,16 @@ def refusal_notice(refused: dict[int, str]) -> str:
 
 @contextmanager
 def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[ResultsLog]:
-    """Locks a new folder or, with `resume`, that of an earlier run, and yields its results log.
+    """Locks a new folder or, with `resume`, that of an earlier run without unfinished surveys; yields its results log.
 
-    Creates the folder if it does not exist, and deletes unfinished run folders.
-
-    Raises:
-        TwinError: the folder is not empty and `resume` is not set, is written by another process, cannot be written, or
-            has other contents than results of this kind.
+    Raises TwinError if it is not empty and `resume` is not set, is in use, cannot be written, or has other contents.
     """
     with sole_writer(folder, used=resume, allowed=f"{NEW_FOLDER}, or --resume"):
         log = ResultsLog(folder)
         names = {path.name for path in folder.iterdir()} - {LOCK_FILE}
-        if names and not _is_results_folder(names, log, search):
+        has_journal = JOURNAL_FILE in names  # of a search, which has it before its first row
+        is_own = log.file.name in names and (has_journal == search or (search and not any(log.rows())))
+        if names and not is_own:
             kind = "search" if search else "study"
             raise TwinError("--resume", f"{folder} is not the folder of a {kind}", f"the folder of this {kind}")
         try:
@@ -146,12 +133,6 @@ def open_folder(folder: Path, resume: bool, search: bool = False) -> Iterator[Re
         for leftover in (folder / "runs").glob(".*"):
             shutil.rmtree(leftover, ignore_errors=True)
         yield log
-
-
-def _is_results_folder(names: set[str], log: ResultsLog, search: bool) -> bool:
-    """Returns whether these are the files of a search, which has its journal before its first row, or of a study."""
-    has_journal = JOURNAL_FILE in names
-    return log.file.name in names and (has_journal == search or (search and not any(log.rows())))
 
 
 def check_results(log: ResultsLog, planned: Mapping[tuple[int, int], str]) -> None:
@@ -167,13 +148,12 @@ def _another_study(log: ResultsLog) -> TwinError:
 
 
 def row_of_outcome(outcome: Outcome[Survey, Row]) -> Row:
-    """Returns the row of a survey from the outcome of its task, with status "failed" if the task failed."""
     row = outcome.result or row_of(outcome.task, "failed", outcome.failure)
     return row | {"timing.attempts": outcome.attempts}
 
 
 def _write_errors(*writes: Callable[[], object]) -> list[str]:
-    """Calls every function, also after one has raised an OSError, and returns the messages of these errors."""
+    """Calls every function and returns the messages of the OSErrors."""
     errors = []
     for write in writes:
         try:

@@ -60,10 +60,7 @@ def clustered_proportion(
     by its variance for independent surveys. The effective number is limited to the range from the number of clusters
     to the number of surveys.
 
-    Args:
-        passed: (n,) whether each survey passed.
-        clusters: (n,) cluster label of each survey: the number of its sample, or its seed.
-        unknown: (n,) whether the result of each survey is unknown; see `wilson_interval`.
+    `clusters` (n,) are labels of the surveys; `unknown` (n,) results as in `wilson_interval`.
     """
     success = np.asarray(passed, dtype=float)
     if len(success) == 0:
@@ -77,7 +74,7 @@ def clustered_proportion(
 
 
 def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:
-    """Returns the effective number of surveys for a proportion, at most their number; see `clustered_proportion`."""
+    """Returns the effective number of surveys for a proportion; see `clustered_proportion`."""
     success = np.asarray(passed, dtype=float)
     labels, index = np.unique(np.asarray(clusters), return_inverse=True)
     n, k = len(success), len(labels)
@@ -109,15 +106,10 @@ def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, l
 def bootstrap_interval(
     values: ArrayLike, statistic: Callable[[Array], Array], clusters: ArrayLike | None = None
 ) -> Interval:
-    """Returns a statistic of the data with its percentile bootstrap interval; whole clusters are resampled.
+    """Returns a statistic of data (n,) with its percentile bootstrap interval; whole clusters (n,) are resampled.
 
     It is NaN without data. The bounds are NaN if there are fewer than five clusters, or if both bounds are equal: data
-    without variation do not show how much further data would vary.
-
-    Args:
-        values: (n,) data.
-        statistic: function of data (..., n).
-        clusters: (n,) label of the cluster of each value; None if the values are independent.
+    without variation do not show how much further data would vary. `statistic` is a function of data (..., n).
     """
     data = np.asarray(values, dtype=float)
     table = _by_cluster(data, np.arange(len(data)) if clusters is None else np.asarray(clusters))
@@ -151,12 +143,10 @@ def _by_cluster(values: Array, clusters: NDArray) -> Array:
 
 
 def median(values: Array) -> Array:
-    """Returns the median along the last axis, ignoring NaN."""
     return percentile(values, 50)
 
 
 def percentile(values: Array, percent: float) -> Array:
-    """Returns the percentile `percent` (0 to 100) along the last axis, ignoring NaN."""
     function = np.nanpercentile if np.isnan(values).any() else np.percentile
     return function(values, percent, axis=-1)
 
@@ -196,10 +186,7 @@ def explained_variance(groups: NDArray[np.int64], y: ArrayLike) -> float:
 
 
 class SobolIndex(NamedTuple):
-    """First-order and total Sobol index of one sampled input: a key, or keys that vary jointly.
-
-    They are the fractions of a metric's variance that the input explains alone, and together with its interactions.
-    """
+    """Fractions of a metric's variance that a key, or joint keys, explain alone and together with interactions."""
 
     first: Interval
     total: Interval
@@ -208,12 +195,9 @@ class SobolIndex(NamedTuple):
 def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
     """Returns the Sobol indices of each axis of a Saltelli design, with bootstrap intervals of the design points.
 
-    The estimators are those of `scipy.stats.sobol_indices` (Saltelli et al. 2010, Jansen 1999). If an interval is not
-    defined, its bounds equal the index.
-
-    Args:
-        values: (n (n_axes + 2),) metric at the n design points of each block A, B, AB_1, AB_2, ..., where AB_k is A
-            with column k of B (`surveys.design_points`).
+    The values are the metric at the points of each block of `surveys.design_points`. The estimators are those of
+    `scipy.stats.sobol_indices` (Saltelli et al. 2010, Jansen 1999). If an interval is not defined, its bounds equal the
+    index.
     """
     blocks = np.asarray(values, dtype=float).reshape(n_axes + 2, -1)
     blocks = blocks - blocks[:2].mean()
@@ -237,7 +221,7 @@ def sobol_indices(values: ArrayLike, n_axes: int) -> list[SobolIndex]:
 
 
 def group_indices(x: ArrayLike) -> NDArray[np.int64]:
-    """Returns the group index (n,) of each of n numbers.
+    """Returns the group of each of n numbers.
 
     If there are at most 12 distinct values, and fewer than n, each distinct value is a group. Otherwise, the numbers
     are divided into 2 to 10 bins of about equal count; equal numbers may be in different bins.

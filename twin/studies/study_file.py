@@ -12,10 +12,10 @@ from pydantic import Field, PrivateAttr
 from twin.core.user_files import is_file
 from twin.errors import ScenarioError, TwinError
 from twin.judge.metrics import empty_metrics
-from twin.judge.require import SIGNED, check_metric_names
+from twin.judge.verdict import SIGNED, check_metric_names
 from twin.scenario.file import find_scene, load_scenario, read_toml, shown, validated
 from twin.scenario.model import Section, Source
-from twin.studies.distribution import KINDS, Array, Distribution, equally_probable
+from twin.studies.distribution import KINDS, Distribution
 
 SamplingMethod = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KeepLevel = Literal["all", "report", "metrics", "none"]
@@ -35,20 +35,6 @@ class JointValues(Section):
     """dotted keys of the scenario"""
     rows: Annotated[tuple[tuple[Any, ...], ...], Field(min_length=1)]
     """one value per key in each row; all rows have equal probability"""
-
-    @property
-    def values(self) -> tuple[tuple[Any, ...], ...]:
-        """Returns the rows, as `Distribution.values`."""
-        return self.rows
-
-    @property
-    def is_sampled(self) -> bool:
-        """Returns True, as `Distribution.is_sampled`."""
-        return True
-
-    def quantiles(self, probability: Array) -> list[tuple[Any, ...]]:
-        """Returns the row at each probability (n,), 0 to 1."""
-        return equally_probable(self.rows, probability)
 
 
 class SamplingConfig(Section):
@@ -135,40 +121,35 @@ class Study(Section):
 
     @property
     def source(self) -> Source:
-        """Returns the study file and the line number of each of its keys."""
         return self._source
 
     @property
     def limits(self) -> dict[str, float]:
-        """Returns the limits on the metrics of each survey."""
         return {name: limit for name, limit in self.require.items() if name != "probability"}
 
     @property
     def probability(self) -> float | None:
-        """Returns the required pass probability; None if the study does not set one."""
         return self.require.get("probability")
 
     @property
     def varied_keys(self) -> list[str]:
-        """Returns every key that varies, alone or jointly with others."""
         return [*self.vary, *(key for table in self.together for key in table.keys)]
 
-    def axes(self, listed: bool) -> dict[str | tuple[str, ...], Distribution | JointValues]:
+    def axes(self, listed: bool) -> dict[str | tuple[str, ...], Distribution]:
         """Returns the varied keys, or jointly varied ones, whose values are listed as a grid, or else are sampled."""
-        is_grid, joint = self.sampling.method == "grid", {table.keys: table for table in self.together}
-        laws: dict[Any, Any] = {**self.vary, **joint}
+        is_grid, joint = self.sampling.method == "grid", {t.keys: Distribution(choice=t.rows) for t in self.together}
+        laws: dict[Any, Distribution] = {**self.vary, **joint}
         return {keys: law for keys, law in laws.items() if (is_grid or not law.is_sampled) == listed}
 
     @property
     def n_surveys(self) -> int:
-        """Returns the number of surveys, without enumerating them."""
         plan, n_axes = self.sampling, len(self.axes(listed=False))
         points = (plan.samples or 1) * (n_axes + 2 if plan.method == "saltelli" and n_axes else 1)
         return points * math.prod(len(law.values) for law in self.axes(listed=True).values()) * plan.seeds
 
     @property
     def scenario_file(self) -> Path:
-        """Returns the path of the scenario file whose keys the study varies; raises ScenarioError if there is none."""
+        """Returns the path of the scenario file; raises ScenarioError if there is none."""
         relative = self.source.path.parent / self.scenario
         return find_scene(relative if is_file(relative) else self.scenario)
 
@@ -200,7 +181,6 @@ def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
 
 
 def _find_study(path: str | Path) -> Path:
-    """Returns the path of a study file; raises ScenarioError if there is neither such a file nor such a name."""
     from twin import scenes
 
     folder = Path(scenes.__file__).parent / "studies"
@@ -232,7 +212,6 @@ Rule = tuple[bool, str, str, str]
 
 
 def _key_rules(study: Study) -> Iterator[Rule]:
-    """Yields the rules for the names of keys and for the tables of joint values."""
     first: dict[str, str] = {}
     for name, key in named_keys(study):
         other, is_seed, section = first.setdefault(key, name), key == "seed", key.partition(".")[0]
@@ -248,7 +227,6 @@ def _key_rules(study: Study) -> Iterator[Rule]:
 
 
 def _sampling_rules(study: Study) -> Iterator[Rule]:
-    """Yields the rules for the method and the number of samples."""
     method, n, field = study.sampling.method, study.sampling.samples, "sampling.samples"
     is_grid, is_sampled = method == "grid", bool(study.axes(listed=False))
     yield is_grid and n is not None, field, "a grid determines the number of samples", "no value"
@@ -268,7 +246,6 @@ def _sampling_rules(study: Study) -> Iterator[Rule]:
 
 
 def _metric_rules(study: Study) -> Iterator[Rule]:
-    """Yields the rules for the names of metrics, and for the keys of the search."""
     known, tune = empty_metrics(), study.tune
     objectives = [name for name in tune.objectives if name != "risk"] if tune else []
     named = {"": study.limits, "show": study.show, "compare": study.compare, "tune.objectives": objectives}

@@ -20,7 +20,7 @@ _MAX_ERRORS = 20
 
 
 class Sample(NamedTuple):
-    """Sample of the varied keys: its number (from 0), the index of its design point, and the value of every key."""
+    """Sample of the varied keys: its number, the index of its design point, and the value of every key."""
 
     number: int
     point: int
@@ -28,7 +28,7 @@ class Sample(NamedTuple):
 
 
 def samples(study: Study) -> Iterator[Sample]:
-    """Yields all samples of a study: each design point combined with every cell of the grids.
+    """Yields the samples of a study: each design point combined with every cell of the grids.
 
     With the methods "random" and "sobol", the first samples stay the same if the number of samples is increased.
     """
@@ -44,7 +44,7 @@ def samples(study: Study) -> Iterator[Sample]:
 
 
 def seeds_of_sample(study: Study, sample: Sample) -> list[int]:
-    """Returns the seeds of a sample: the same for all samples if `sampling.paired`, else those of its design point."""
+    """Returns the seeds of a sample: the same for all if `sampling.paired`, else those of its design point."""
     plan = study.sampling
     first = plan.seed + (0 if plan.paired else sample.point * plan.seeds)
     return [(first + k) % 2**32 for k in range(plan.seeds)]
@@ -74,28 +74,26 @@ class Survey(NamedTuple):
     sample: int  #: number of the sample
     seed: int
     values: dict[str, Any]  #: values of the varied keys
-    scenario: Scenario  #: scenario with these values and this seed
-    scenario_hash: str  #: fingerprint of the scenario
+    scenario: Scenario
+    scenario_hash: str
     folder: Path  #: run folder
-    keep: str  #: which files of the run folder to keep; see `flight.KEPT`
+    keep: str  #: a key of `flight.KEPT`
 
     @property
     def key(self) -> tuple[int, int]:
-        """Returns (sample, seed), which identifies a survey within its study."""
         return self.sample, self.seed
 
 
 class SampleSource(Source):
     """Source of a sample's scenario: locates an error in it at the line of the study file that sets the faulty key.
 
-    An error in a key that the study does not set is located at the line of the key `scenario`.
+    An error in another key is located at the line of the key `scenario`.
     """
 
     sample: int
     given: dict[str, str]  #: for each scenario key, its dotted name in the study file
 
     def describe(self, error: TwinError) -> str:
-        """Returns the error as `FILE:LINE: key: problem (allowed: ...)`, followed by the number of the sample."""
         key = error.field
         while key not in self.given and "." in key:
             key = key.rpartition(".")[0]
@@ -116,7 +114,6 @@ def surveys(study: Study, folder: Path, without: Container[int] = ()) -> Iterato
 
 
 def surveys_of_sample(study: Study, folder: Path, sample: Sample, scenario: Scenario) -> Iterator[Survey]:
-    """Yields the surveys of one sample: one per seed."""
     for seed in seeds_of_sample(study, sample):
         seeded = scenario.model_copy(update={"seed": seed})
         run_folder = folder / "runs" / f"{sample.number:05d}_s{seed}"
@@ -129,11 +126,7 @@ def survey_keys(study: Study) -> Iterator[tuple[int, int]]:
 
 
 def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) -> Scenario:
-    """Returns the scenario `base` with the values of a sample and of [set], and the limits of the study, if any.
-
-    Raises:
-        ScenarioError: lists every error of the scenario, each with a line of the study file.
-    """
+    """Returns `base` with a sample's values, [set] and limits; raises ScenarioError with all errors and their lines."""
     given = {key: study_key for study_key, key in named_keys(study)}
     source = SampleSource(**dict(study.source), sample=sample.number, given=given)
     tree = dict(base) | ({"require": study.limits} if study.limits else {})
@@ -141,11 +134,7 @@ def scenario_of_sample(study: Study, base: Mapping[str, Any], sample: Sample) ->
 
 
 def refusals(study: Study) -> dict[int, str]:
-    """Returns {sample number: errors, as one text} of the samples whose scenario is not valid.
-
-    Raises:
-        ScenarioError: no sample is valid; lists the errors of all samples, each key once.
-    """
+    """Returns {sample number: errors} of the invalid samples; raises ScenarioError, each key once, if none is valid."""
     base, refused, errors, planned = read_tree(study.scenario_file), {}, [], list(samples(study))
     for sample in planned:
         try:
@@ -160,7 +149,7 @@ def refusals(study: Study) -> dict[int, str]:
 
 
 def merge_errors(errors: Iterable[str]) -> list[str]:
-    """Returns the first error of each line and key of the study file, of at most 20, with the numbers of the others."""
+    """Returns the first error of each line and key of the study file, of at most 20, and how many others there are."""
     by_key: dict[str, list[str]] = {}
     for error in errors:
         by_key.setdefault(": ".join(error.split(": ")[:2]), []).append(error)

@@ -23,11 +23,10 @@ def compiled_loop(
 ) -> FastForward:
     """Returns a function that runs the compiled closed loop from a given frame up to the next keyframe.
 
-    The function performs the same operations with the same random numbers as the loop in `survey.fly`, so the results
-    are equal. It returns the index of the next frame to simulate: that of the next keyframe, or the number of frames if
-    the sequence has no further keyframe. If F2F has no points to track, it simulates no frames and returns the given
-    index. If the physics diverges or the hull touches the floor, it records the frames up to the one after which this
-    was detected, and raises SurveyAborted.
+    It performs the same operations with the same random numbers as the loop in `survey.fly`, and returns the index of
+    the next frame to simulate: that of the next keyframe or, without one, the number of frames; the given one if F2F
+    has no points to track. If the physics diverges or the hull touches the floor, the frames up to the one after which
+    this was detected are recorded, and SurveyAborted is raised.
     """
     rate_hz = world.mission.rig.frame_rate_hz
     interval_s = 1 / rate_hz
@@ -59,13 +58,10 @@ def compiled_loop(
 
 @kernel
 def _fly(last, last_normals, body, sensors, errors, state, aiding, pilot, reference, normals, n_steps, interval_s):
-    """Runs the closed loop over n frames.
+    """Runs the closed loop over at most n frames, until `has_ended`.
 
-    Returns:
-        Number of simulated frames (the last one is that after which the flight ended, `has_ended`),
-        dead-reckoning state after the last frame, three arrays of poses (n, 4, 4): true poses, poses accumulated
-        from F2F alone, and online estimates, and `PoseLog.steps` with their variances (n, 6); only the simulated frames
-        are set.
+    Returns the number of simulated frames, the dead-reckoning state after the last one, the poses (n, 4, 4), true, by
+    F2F alone and online, and `PoseLog.steps` with their variances (n, 6); only the simulated frames are set.
     """
     positions, velocities, yaws, accelerations = reference
     vision_normals, sensor_normals, dvl_normals = normals

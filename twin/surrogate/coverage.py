@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Literal, NamedTuple
 
+from twin.errors import TwinError, UnmodelledError
 from twin.surrogate.matchability import Matchability
 from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Mission
 
 Range = tuple[float, float]
+RENDERED = 'imaging.fidelity = "rendered"'  #: what flies surveys that the surrogate cannot simulate
 _OVERLAP_PAIRS = 40  # largest number of pairs of images whose overlap is computed, along and across the legs each
 
 
@@ -39,30 +41,17 @@ QUANTITIES = {
 
 
 def survey_conditions(mission: Mission, matchability: Matchability) -> dict[str, Range]:
-    """Returns the smallest and the largest value of each quantity in a survey, by name.
-
-    An overlap is left out if no pair of planned images has one.
-    """
+    """Returns smallest and largest value of each quantity in a survey; no overlap if no planned pair has one."""
     overlap = planned_overlap(mission, _OVERLAP_PAIRS)._asdict()
-    overlaps = {f"overlap_{name}": (value, value) for name, value in overlap.items() if value is not None}
+    single = {"bound_px": matchability.medium_bound_px, "lamp_share": matchability.lamp_share}
+    single |= {f"overlap_{name}": value for name, value in overlap.items() if value is not None}
     unevenness_px = matchability.unevenness_px
-    return {
-        "bound_px": (matchability.medium_bound_px, matchability.medium_bound_px),
-        "unevenness_px": (float(unevenness_px.min()), float(unevenness_px.max())),
-        "lamp_share": (matchability.lamp_share, matchability.lamp_share),
-        **overlaps,
-    }
+    ranges = {"unevenness_px": (float(unevenness_px.min()), float(unevenness_px.max()))}
+    return ranges | {name: (value, value) for name, value in single.items()}
 
 
-class QuantityOutsideFit(NamedTuple):
-    """Quantity whose values in a survey lie outside the range in which the error model may be used, as texts."""
-
-    value_text: str  #: the quantity and its range of values in the survey
-    allowed_text: str  #: the allowed range
-
-
-def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[QuantityOutsideFit]:
-    """Returns the quantities whose values in a survey lie outside the allowed range.
+def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str, Range]) -> list[tuple[str, str]]:
+    """Returns, as texts, each quantity outside the allowed range with its values in a survey, and the allowed range.
 
     The allowed range is the fitted one, extended by `Quantity.factor` at the ends that `Quantity.limits` names; an end
     that is not named is unlimited. Quantities without a fitted range are not checked.
@@ -75,8 +64,14 @@ def quantities_outside_fit(conditions: Mapping[str, Range], fitted: Mapping[str,
             "both": _text((lowest, highest)), "lower": f"at least {lowest:.3g}", "upper": f"at most {highest:.3g}",
         }  # fmt: skip
         if not ((limits == "upper" or lowest <= low) and (limits == "lower" or high <= highest)):
-            found.append(QuantityOutsideFit(f"{label} of {_text((low, high))}{unit}", allowed[limits] + unit))
+            found.append((f"{label} of {_text((low, high))}{unit}", allowed[limits] + unit))
     return found
+
+
+def unmodelled(mission: Mission, faults: Iterable[tuple[str, str]]) -> UnmodelledError:
+    """Returns the error of a survey that the surrogate cannot simulate, given each problem and what is allowed."""
+    describe = mission.scenario.source.describe
+    return UnmodelledError([describe(TwinError("imaging.fidelity", *fault)) for fault in faults])
 
 
 def _text(values: Range) -> str:

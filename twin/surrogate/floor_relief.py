@@ -31,9 +31,7 @@ class FloorRelief(NamedTuple):
 def floor_relief(height_m: Map, cell_m: float, rig: StereoRig, depth_m: float) -> FloorRelief:
     """Returns the relief of a floor of heights (rows, cols); in images, NaN is as low as the lowest height.
 
-    Args:
-        rig: calibration of the images that are matched.
-        depth_m: typical depth of the floor along the optical axis.
+    `rig` is the calibration of the images that are matched, `depth_m` a typical depth along the optical axis.
     """
     slope = np.stack(map_slopes(np.asarray(height_m, np.float64), cell_m), axis=-1).astype(np.float32)
     filled = np.where(np.isfinite(height_m), height_m, np.nanmin(height_m)).astype(np.float64)
@@ -45,10 +43,7 @@ def floor_relief(height_m: Map, cell_m: float, rig: StereoRig, depth_m: float) -
 
 
 def roughness(height_m: Array, window_cells: float) -> Map:
-    """Returns the RMS deviation (rows, cols) of the floor from its best-fit plane within a square window [m].
-
-    Its square is the variance of the heights minus the part that a linear regression on both coordinates explains.
-    """
+    """Returns the RMS deviation (rows, cols) [m] of the floor from the plane that best fits a square window."""
     side, height = _odd(window_cells), height_m - height_m.mean()
 
     def mean(values: Array) -> Array:
@@ -63,16 +58,10 @@ def roughness(height_m: Array, window_cells: float) -> Map:
 
 
 def step_slope(height_m: Array, cell_m: float) -> Map:
-    """Returns the slope (rows, cols) of the largest steps from a cell to its neighbours in x and in y [m/m].
-
-    A central difference would halve the slope of a wall between two cells.
-    """
-    steps = []
-    for axis in (0, 1):
-        padding = [(1, 1) if k == axis else (0, 0) for k in (0, 1)]
-        step = np.pad(np.abs(np.diff(height_m, axis=axis)), padding)
-        before, after = (step[:-1], step[1:]) if axis == 0 else (step[:, :-1], step[:, 1:])
-        steps.append(np.maximum(before, after))
+    """Returns the slope (rows, cols) [m/m] of the largest step to a neighbour; a central difference would halve it."""
+    down = np.pad(np.abs(np.diff(height_m, axis=0)), ((1, 1), (0, 0)))
+    across = np.pad(np.abs(np.diff(height_m, axis=1)), ((0, 0), (1, 1)))
+    steps = np.maximum(down[:-1], down[1:]), np.maximum(across[:, :-1], across[:, 1:])
     return (np.hypot(*steps) / cell_m).astype(np.float32)
 
 
@@ -87,8 +76,8 @@ def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
     resolves large structures better.
 
     Args:
-        roughness_px: (rows, cols) roughness [px of disparity]; see `roughness`.
-        slope: (rows, cols) slope of the cells [m/m]; see `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
+        roughness_px: (rows, cols) `roughness` [px of disparity].
+        slope: (rows, cols) `step_slope`. A cell steeper than `WALL_SLOPE` is a wall.
     """
     side = _odd(window_cells)
     near_wall = maximum_filter(slope, side) > WALL_SLOPE
@@ -97,5 +86,5 @@ def edge_strength(roughness_px: Map, slope: Map, window_cells: float) -> Map:
 
 
 def _odd(window_cells: float) -> int:
-    """Returns the side of a window of cells, rounded to an odd number of cells, at least 3."""
+    """Returns the side of a window, rounded to an odd number of cells, at least 3."""
     return 2 * max(round((window_cells - 1) / 2), 1) + 1

@@ -58,12 +58,7 @@ class KeyframeRuns(NamedTuple):
 def cell_conditions(
     matchability: Matchability, rig: StereoRig, relief: FloorRelief, index: NDArray[np.int64], views: KeyframeRuns
 ) -> CellConditions:
-    """Returns the conditions of n cells of a map.
-
-    Args:
-        rig: calibration of the images that are matched.
-        index: (n,) numbers of the cells, row by row.
-    """
+    """Returns the conditions of the cells `index` (n,), numbered row by row; `rig` is that of the matched images."""
     slope = relief.slope.reshape(-1, 2)[index].astype(np.float64)
     bound_px = matchability.bound_at(views.depth_m)
     metres_per_px = views.depth_m**2 / (rig.focal_px * rig.baseline_m)
@@ -94,7 +89,7 @@ class HeightSigmas(NamedTuple):
 
 
 def height_sigmas(model: ErrorModel, cells: CellConditions) -> HeightSigmas:
-    """Returns the standard deviations of the height errors under n conditions.
+    """Returns the standard deviations of the height errors.
 
     With n keyframes at distances B, the variance is divided by 1 + g (n - 1), with g = depth_gain B^2 / (B^2 +
     depth_half_step^2) + s, where s is the fraction of the variance that image noise causes: noise is independent

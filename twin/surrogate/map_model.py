@@ -40,11 +40,9 @@ class ObservedCells(NamedTuple):
     """The n cells that both cameras of a keyframe see."""
 
     cells: Index  #: (n,) numbers of the cells, row by row
-    depth_m: Array  #: (n,) depth of the floor point that is mapped to each cell [m]
-    border_px: Array  #: (n,) distance of this point from the nearest border of the two images [px]
-    #: (n,) 1 / r^2 for the ratio r of the Cramér-Rao bound at the point's position in the left image to that of the
-    #: whole image
-    information: Array
+    depth_m: Array  #: (n,) depth of the floor point that is mapped to each cell
+    border_px: Array  #: (n,) distance of this point from the nearest border of the two images
+    information: Array  #: (n,) 1 / r^2 for `PositionDependence.bounds` r at its position in the left image
     true: Array  #: (4, 4) true pose of the keyframe
     estimated: Array  #: (4, 4) estimated pose of the keyframe
 
@@ -64,29 +62,20 @@ class MapModel:
     """Samples the height patch of each keyframe: true heights of the floor plus errors.
 
     Args:
-        grid: grid of the map.
-        height_m: (rows, cols) true height at the cell centres [m].
+        height_m: (rows, cols) true height at the cell centres.
         rig: believed calibration, at the scale of the matched images.
-        floor: the true floor as a height field, for ray casting.
-        matchability: precision of image matching.
-        view: positions at which true points are measured.
+        floor: the true floor, for ray casting.
 
     Attributes:
         seen: (rows, cols) mask of the cells that at least one keyframe observed; updated by `mark_seen`.
-        relief: relief of the floor.
         conditions: conditions of the latest height of each cell, (rows * cols,) each.
         n_heights: (rows * cols,) number of heights that were fused into the cell.
     """
 
     def __init__(
-        self,
-        grid: MapGrid,
-        height_m: Map,
-        rig: StereoRig,
-        floor: HeightField,
-        matchability: Matchability,
+        self, grid: MapGrid, height_m: Map, rig: StereoRig, floor: HeightField, matchability: Matchability,
         view: MeasuredView = IDEAL_VIEW,
-    ):
+    ):  # fmt: skip
         self.grid, self.height_m, self.seen = grid, height_m, np.zeros(height_m.shape, np.bool_)
         self._rig, self._floor, self._matchability, self._view = rig, floor, matchability, view
         self.relief = floor_relief(height_m, grid.cell_m, rig, matchability.medium_depth_m)
@@ -100,7 +89,6 @@ class MapModel:
 
     @property
     def correlated_cells(self) -> int:
-        """Returns the side of the square over which errors are correlated [cells]."""
         return max(round(_CORRELATED_WINDOWS * self.relief.window_cells), 1)
 
     def new_noise(self, model: ErrorModel, rng: np.random.Generator) -> MapNoise:
@@ -121,21 +109,19 @@ class MapModel:
         self.seen.ravel()[visible] = True
 
     def observe(self, true: Array, estimated: Array) -> ObservedCells:
-        """Returns the cells that a keyframe observes, with their depths and distances from the image border.
+        """Returns the cells that a keyframe with a true and an estimated pose (4, 4) observes.
 
-        Args:
-            true: (4, 4) true pose of the keyframe.
-            estimated: (4, 4) estimated pose of the keyframe. With calibration errors or an approximated port, it
-                determines which floor point is mapped to a cell.
+        With calibration errors or an approximated port, the estimated pose determines which point is mapped to a cell.
         """
         index = self._in_reach(true)
         visible, points = self._seen_from(true, index, self._sources(true, estimated, index))
         measured = self._view.measure(points)
-        pixels = measured[:, :2] * self._rig.focal_px + [self._rig.cx_px, self._rig.cy_px]
-        return ObservedCells(
-            visible, self._rig.baseline_m / points[:, 2], _border_px(measured, self._rig),
-            _block_values(self._information, pixels, self._rig), true, estimated,
-        )  # fmt: skip
+        rig, table = self._rig, self._information
+        pixels = measured[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]
+        blocks = (pixels + 0.5) / [rig.width_px, rig.height_px] * table.shape[::-1] - 0.5
+        information = map_coordinates(table, blocks.T[::-1], order=1, mode="nearest")
+        depth_m, border_px = rig.baseline_m / points[:, 2], _border_px(measured, rig)
+        return ObservedCells(visible, depth_m, border_px, information, true, estimated)
 
     def sample_patch(
         self,
@@ -146,17 +132,14 @@ class MapModel:
         noise: MapNoise,
         rng: np.random.Generator,
     ) -> HeightPatch | None:
-        """Samples the height patch of a keyframe: the heights of the cells that it sees and the next keyframe does not.
+        """Samples the heights of the cells that a keyframe sees and the next one does not; None if it sees none.
 
-        The keyframes must be passed in the order of the path, from the first to the last one: the consecutive keyframes
-        that observed a cell determine the standard deviation of its height and whether it has one.
+        The keyframes must be passed in the order of the path: the consecutive keyframes that observed a cell determine
+        the standard deviation of its height and whether it has one.
 
         Args:
             following: cells that the next keyframe observes; None for the last one.
             cov: (6, 6) covariance of the estimated pose, in camera axes.
-
-        Returns:
-            The patch, or None if no cell of the map is in view.
 
         Raises:
             FloatingPointError: a height or a variance is not finite.
@@ -211,7 +194,7 @@ class MapModel:
         return last, cells
 
     def _heights(self, observed: ObservedCells, index: Index) -> Array:
-        """Returns the heights (n,) of the cells without errors of measurement, mapped from the estimated pose [m]."""
+        """Returns the heights (n,) of the cells without errors of measurement, mapped from the estimated pose."""
         slope, centres = self.relief.slope.reshape(-1, 2)[index], self._centres(index)
         sources = self._sources(observed.true, observed.estimated, index)
         mapped = self._mapped(observed.true, observed.estimated, sources)
@@ -226,12 +209,11 @@ class MapModel:
         return np.einsum("ni,ij,nj->n", jacobian, cov, jacobian)
 
     def _window(self, index: Index) -> tuple[int, int, tuple[int, int]]:
-        """Returns first row, first column, and shape of the rectangle around cells."""
         rows, cols = index // self.grid.cols, index % self.grid.cols
         return int(rows[0]), int(cols.min()), (int(rows[-1] - rows[0]) + 1, int(np.ptp(cols)) + 1)
 
     def _centres(self, index: Index) -> Array:
-        """Returns the true floor points (n, 3) at the centres of cells [m]."""
+        """Returns the true floor points (n, 3) at the centres of cells."""
         x, y = self.grid.centres()
         heights = self.height_m.ravel()[index].astype(np.float64)
         return np.column_stack([x[index % self.grid.cols], y[index // self.grid.cols], heights])
@@ -246,7 +228,7 @@ class MapModel:
         return centres - np.column_stack([shift, np.einsum("nk,nk->n", slope, shift)])
 
     def _mapped(self, true: Array, estimated: Array, points: Array) -> Array:
-        """Returns the estimated positions (n, 3) of world points (n, 3) that a camera sees from its true pose."""
+        """Returns the estimated positions (n, 3) of world points (n, 3) seen from a true pose."""
         measured = self._view.measure(self._normalised(true, points))
         depth_m = self._rig.baseline_m / measured[:, 2:]
         return geometry.transform(estimated, np.column_stack([measured[:, :2], np.ones(len(points))]) * depth_m)
@@ -296,19 +278,13 @@ def window_noise(shape: tuple[int, int], window_cells: int, rng: np.random.Gener
     """Returns standard normal numbers (rows, cols) that are correlated over a square window, as matching errors are.
 
     Their standard deviation exceeds 1 if the array has fewer rows or columns than the window.
-
-    Args:
-        window_cells: side of the window [cells].
     """
     noise = rng.standard_normal(shape, np.float32)
     return np.asarray(uniform_filter(noise, window_cells, mode="wrap") * window_cells, np.float32)
 
 
 def heavy_tailed(noise: Map) -> Map:
-    """Returns n |n| / sqrt(3) for standard normal numbers n (rows, cols): zero mean, unit variance and heavy tails.
-
-    Dense matching resolves most cells near a wall, and assigns others, in patches, to the wrong surface.
-    """
+    """Returns n |n| / sqrt(3), of unit variance: heavy tails, because cells near a wall may match the wrong surface."""
     return np.asarray(noise * np.abs(noise) / np.float32(np.sqrt(3)), np.float32)
 
 
@@ -317,12 +293,6 @@ def _border_px(points: Array, rig: StereoRig) -> Array:
     u, v = (points[:, :2] * rig.focal_px + [rig.cx_px, rig.cy_px]).T
     u_right = u - rig.focal_px * points[:, 2]
     return np.min([v, rig.height_px - 1 - v, rig.width_px - 1 - u, u_right], axis=0)
-
-
-def _block_values(table: Array, pixels: Array, rig: StereoRig) -> Array:
-    """Returns the values (n,) of a table (rows, cols) over the blocks of an image at pixels (n, 2), interpolated."""
-    blocks = (pixels + 0.5) / [rig.width_px, rig.height_px] * table.shape[::-1] - 0.5
-    return map_coordinates(table, blocks.T[::-1], order=1, mode="nearest")
 
 
 def _may_be_hidden(height_m: Map, cell_m: float) -> NDArray[np.bool_]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -22,14 +23,13 @@ from numpy.typing import NDArray
 
 from twin import terrains
 from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
-from twin.core.records import Image, StereoRig
+from twin.core.records import Image, Radiance, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import BINNINGS
 from twin.imaging.camera.photo_sensor import sensor_of
-from twin.imaging.image_formation import ImageFormation, RadianceComponents, StampedPose
+from twin.imaging.image_formation import ImageFormation, RadianceComponents, RenderedView, StampedPose
 from twin.imaging.light.illumination import Illumination
-from twin.imaging.light.optics import Optics, Radiance
-from twin.imaging.stereo_camera import Depth
+from twin.imaging.light.optics import Optics
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
 from twin.terrains.ground_cover import DEFAULT_COVERS
@@ -84,11 +84,6 @@ class FloorImages:
     """Simulated images of a level floor under the vehicle, without shadows, which the surrogate does not model.
 
     Tone curve and white balance scale texture and noise of a pixel alike, so that images are linear, in white light.
-    The tables of the light are computed once, here.
-
-    Args:
-        scenario: description of the survey.
-        illumination: optical properties of the water, and daylight in the water.
     """
 
     def __init__(self, scenario: Scenario, illumination: Illumination):
@@ -100,11 +95,9 @@ class FloorImages:
         self._formation = ImageFormation(self.scenario, illumination, None, np.random.default_rng(0))
 
     def radiance(self, albedo: Image, depth_m: float) -> Radiance:
-        """Returns the radiance (H, W, 3) of a floor with an albedo image at a depth, without marine snow."""
-        return self._formation.radiance_without_snow(albedo, *self._level_floor(depth_m))
+        return self._formation.radiance_without_snow(self._level_floor(albedo, depth_m))
 
     def matched(self, albedo: Image, depth_m: float, rng: np.random.Generator) -> MatchedImages:
-        """Returns what matching sees of a floor with an albedo image at a depth."""
         light, sensor = self.radiance(albedo, depth_m), sensor_of(self.scenario, self.rig)
         setting = sensor.meter(light)
         signal = _levels(light, setting.gain) - _levels(self.radiance(_mean_colour(albedo), depth_m), setting.gain)
@@ -113,22 +106,18 @@ class FloorImages:
 
     def components(self, albedo: Image, depth_m: float) -> RadianceComponents:
         """Returns the components of the light of a floor that has the mean colour of an albedo image."""
-        return self._formation.components(_mean_colour(albedo), *self._level_floor(depth_m))
+        return self._formation.components(self._level_floor(_mean_colour(albedo), depth_m))
 
-    def snow_views(self, albedo: Image, depth_m: float) -> tuple[list[Radiance], list[Radiance]]:
+    def snow_views(self, albedo: Image, depth_m: float) -> list[list[Radiance]]:
         """Returns views (H, W, 3) of a floor without snow, and the same with different particles of marine snow."""
-        depth, camera, camera_pose = self._level_floor(depth_m)
-        clean, snowy = (
-            [view(albedo, depth, camera, p) for p in snow_poses(camera_pose)]
-            for view in (self._formation.radiance_without_snow, self._formation.radiance)
-        )
-        return clean, snowy
+        view = self._level_floor(albedo, depth_m)
+        views = [view._replace(pose=shifted) for shifted in snow_poses(view.pose)]
+        return [[*map(light, views)] for light in (self._formation.radiance_without_snow, self._formation.radiance)]
 
-    def _level_floor(self, depth_m: float) -> tuple[Depth, int, StampedPose]:
-        """Returns the depth image of a level floor, the left camera, and its pose at the planned altitude."""
+    def _level_floor(self, albedo: Image, depth_m: float) -> RenderedView:
         world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))
         depth = np.full((self.rig.height_px, self.rig.width_px), depth_m, np.float32)
-        return depth, 0, StampedPose(world_from_left, 0.0)
+        return RenderedView(albedo, depth, 0, StampedPose(world_from_left, 0.0))
 
 
 def _mean_colour(albedo: Image) -> Image:
@@ -140,13 +129,7 @@ def _levels(light: Radiance, gain: float) -> NDArray[np.float32]:
 
 
 class Matchability:
-    """Cramér-Rao bound of image matching and unevenness of the floor, tabulated over the range of floor depths.
-
-    Args:
-        scenario: description of the survey.
-        illumination: optical properties of the water, and daylight in the water.
-        terrain: true floor.
-        locate: see `unevenness_px`.
+    """Cramér-Rao bound of image matching and unevenness of the true floor, tabulated over the range of floor depths.
 
     Attributes:
         depths_m: (m,) ascending depths of the floor along the optical axis [m].
@@ -155,8 +138,7 @@ class Matchability:
             prevents all matches.
         dependence: dependence of the bound on the position in the image, at the medium depth.
         texture: distribution of the bound over the windows of dense matching, at the medium depth.
-        unevenness_px: (m,) unevenness of the floor under a patch at these depths [px of the binned images per unit of
-            baseline / depth].
+        unevenness_px: (m,) the result of `unevenness_px` at these depths.
         lamp_share: fraction of the light reflected by the floor that comes from the lamps.
         clear_share: (m,) fraction of the matches that remain in the presence of marine snow, at these depths.
     """
@@ -187,16 +169,15 @@ class Matchability:
 
     @property
     def medium_bound_px(self) -> float:
-        """Returns the Cramér-Rao bound of a patch's position at `medium_depth_m` [px of the binned images]."""
+        """Returns the Cramér-Rao bound at `medium_depth_m` [px of the binned images]."""
         return float(self.bounds_px[_MIDDLE])
 
     @property
     def medium_depth_m(self) -> float:
-        """Returns the geometric mean of the smallest and the largest of `depths_m` [m]."""
+        """Returns the geometric mean of the smallest and the largest of `depths_m`."""
         return float(self.depths_m[_MIDDLE])
 
     def _set_image_scale(self, images: FloorImages, albedos: list[Image], found: Sequence[MatchedImages]) -> None:
-        """Sets `binning`, `bounds_px` and `clear_share`."""
         self.bounds_px, patch_px = np.zeros(0), images.scenario.estimator_settings().patch_px
         for binning in BINNINGS:
             if images.rig.width_px % binning or images.rig.height_px % binning:
@@ -211,20 +192,16 @@ class Matchability:
                 break
 
     def bound_at(self, depth_m: Array | float) -> Array:
-        """Returns the Cramér-Rao bound of a patch's position [px of the binned images] at depths [m].
-
-        Its logarithm is interpolated by the parabola in the logarithm of the depth, and constant outside the table.
-        """
+        """Returns the bound [px of the binned images] at depths [m]: a parabola in logarithms, constant outside."""
         depth_m, bounds_px = np.clip(depth_m, *self.depths_m[[0, -1]]), np.clip(self.bounds_px, *_BOUND_LIMITS_PX)
         parabola = np.polyfit(np.log(self.depths_m / self.medium_depth_m), np.log(bounds_px), 2)
         return np.exp(np.polyval(parabola, np.log(depth_m / self.medium_depth_m)))
 
     def clear_share_at(self, depth_m: float) -> float:
-        """Returns the fraction of the matches that remain in the presence of marine snow, at a depth [m]."""
+        """Returns the fraction of the matches that remain in marine snow at a depth."""
         return float(np.interp(depth_m, self.depths_m, self.clear_share))
 
     def unevenness_at(self, depth_m: float) -> float:
-        """Returns the unevenness [px of the binned images per unit of baseline / depth] at a depth [m]."""
         return float(np.interp(depth_m, self.depths_m, self.unevenness_px))
 
 
@@ -236,17 +213,12 @@ def in_snow(
     gain = sensor_of(images.scenario, images.rig).meter(snowy[0]).gain
     noise = float(matching.gray(matched.noise, binning).std()) / np.sqrt(2)
     signals = [[matching.gray(_levels(light, gain), binning) for light in lights] for lights in (clean, snowy)]
-    effect = snow_effect(signals[0], signals[1], noise, images.scenario.estimator_settings().patch_px)
-    return float(np.sqrt(effect.variance_px2)), effect.matched_share
+    variance_px2, share = snow_effect(signals[0], signals[1], noise, images.scenario.estimator_settings().patch_px)
+    return float(np.sqrt(variance_px2)), share
 
 
 def lamp_share(images: FloorImages, floor_lx: Radiance, depth_m: float) -> float:
-    """Returns the fraction of the light reflected by a level floor that is due to the lamps.
-
-    Args:
-        floor_lx: (H, W, 3) illuminance of the floor by lamps and daylight [lx].
-        depth_m: depth of the floor.
-    """
+    """Returns the lamps' fraction of the light reflected by a level floor of illuminance `floor_lx` (H, W, 3) [lx]."""
     scenario = images.scenario
     if not scenario.lamps or scenario.sun.illuminance_lx == 0:
         return float(bool(scenario.lamps))
@@ -258,16 +230,12 @@ def lamp_share(images: FloorImages, floor_lx: Radiance, depth_m: float) -> float
 
 
 def position_dependence(contrast: Radiance, noise: NDArray[np.float32]) -> PositionDependence:
-    """Returns the dependence of matching on the position in the image.
+    """Returns the dependence of matching on the position; `NO_DEPENDENCE` if a block has no light or no noise.
 
     Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The gradients of
-    an even texture are proportional to the unscattered light of an even floor. The squares of gradients and noise are
-    averaged over each block; the logarithm of the noise is smoothed by a polynomial in the position. The result is
-    `NO_DEPENDENCE` if a block has no light or no noise.
-
-    Args:
-        contrast: (H, W, 3) unscattered light of an even floor [cd/m2].
-        noise: (H, W, 3) difference of two images by their noise [grey levels].
+    an even texture are proportional to the unscattered light `contrast` (H, W, 3) of an even floor. The squares of
+    gradients and noise, `MatchedImages.noise`, are averaged over each block; the logarithm of the noise is smoothed by
+    a polynomial in the position.
     """
     gradients, variance = (_block_means(matching.gray(image) ** 2) for image in (contrast, noise))
     if not gradients.min() > 1e-12 * gradients.max() or not variance.min() > 0:
@@ -277,7 +245,6 @@ def position_dependence(contrast: Radiance, noise: NDArray[np.float32]) -> Posit
 
 
 def _block_means(values: NDArray[np.floating]) -> Array:
-    """Returns the means of an image (rows, cols) over the blocks of a `PositionDependence`."""
     return np.asarray(cv2.resize(values.astype(np.float64), _BLOCKS[::-1], interpolation=cv2.INTER_AREA), np.float64)
 
 
@@ -295,13 +262,9 @@ def window_texture(signal: NDArray[np.floating], relative_gradients: Array) -> W
     The bound of an image contains the RMS gradient of the whole image. Dense matching fits a plane of disparities in a
     small Gaussian window, so the bound of a pixel contains the RMS gradient in that window. Over even texture, such as
     sand, it is nearly the same in all windows; over reefs, it is several times larger at bright edges than in dark
-    areas without texture. Gradients also vary with the light over the image; that part is removed, because it belongs
-    to the position in the image (`PositionDependence`). The result is `EVEN_TEXTURE` for an image that has no texture
-    or is smaller than a window.
-
-    Args:
-        signal: (rows, cols) grey levels of the part of the image that the texture causes, without noise.
-        relative_gradients: (r, c) RMS gradients of an even texture in blocks of the image, relative to the whole image.
+    areas without texture. What belongs to the position in the image (`PositionDependence.gradients`) is removed from
+    the gradients of the grey levels `signal` (rows, cols) that the texture causes. The result is `EVEN_TEXTURE` for an
+    image that has no texture or is smaller than a window.
     """
     squares = np.diff(signal.astype(np.float64), axis=1) ** 2
     squares /= cv2.resize(np.square(relative_gradients), squares.shape[::-1], interpolation=cv2.INTER_LINEAR)
@@ -329,10 +292,8 @@ def unevenness_px(
     limit the influence of matches with large residuals.
 
     Args:
-        depths_m: (n,) depths of the floor along the optical axis [m].
         locate: maps fractions (..., 2) of the planned area's extent along and across the legs, -0.5 to 0.5 from its
             centre, to world (x, y) (..., 2) [m]; None: the area is centred at the origin, with legs along x.
-        binning: see `precision`.
     """
     focal_px, patch_px = scenario.believed_rig().binned(binning).focal_px, scenario.estimator_settings().patch_px
     side = np.linspace(-0.5, 0.5, _SAMPLES)
@@ -368,8 +329,11 @@ def _texture(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> 
         return _painted_centre(scenario, terrain, extent_m)
     extent_m = float(min(max(extent_m, 4 * t.grid_m), *t.size_m))
     source = terrains.TextureSource(scenario.texel_m, cover=t.cover, coarsen=True)
-    generated = terrains.generate(t.kind, (extent_m, extent_m), t.relief_m, t.base_m, t.grid_m, source, scenario.seed)
+    generated = _generated(t.kind, (extent_m, extent_m), t.relief_m, t.base_m, t.grid_m, source, scenario.seed)
     return generated.texture, generated.texture_px_m
+
+
+_generated = lru_cache(maxsize=1)(terrains.generate)  # surveys of a study often differ in other keys only
 
 
 def _painted_centre(scenario: Scenario, terrain: terrains.Terrain, extent_m: float) -> tuple[Image, float]:
@@ -385,7 +349,6 @@ def _painted_centre(scenario: Scenario, terrain: terrains.Terrain, extent_m: flo
 
 
 def _albedo(texture: Image, texel_m: float, rig: StereoRig, depth_m: float) -> Image:
-    """Returns the albedo image (height_px, width_px, 3) of the texture's centre for a camera at the given distance."""
     texels_per_px = depth_m / rig.focal_px / texel_m
     height, width = texture.shape[:2]
     rows, cols = (min(round(n * texels_per_px), most) for n, most in ((rig.height_px, height), (rig.width_px, width)))

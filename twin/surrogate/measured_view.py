@@ -35,25 +35,19 @@ _INVERSE_ITERATIONS = 8
 
 
 class ViewTable(NamedTuple):
-    """Measured (x, y, disparity) on a regular grid of true (disparity, y, x)."""
+    """Measured values on a regular grid of true (disparity, y, x)."""
 
-    #: (n_disparity, n_y, n_x, 3) measured position; NaN where a point is not imaged. Empty if all points are measured
-    #: at their true positions.
+    #: (n_disparity, n_y, n_x, 4) measured x, y and disparity, and remaining row difference, right minus left; NaN where
+    #: a point is not imaged. Empty if all points are measured at their true positions.
     values: Array
     first: Array  #: (3,) true disparity, y and x of the first grid point
     step: Array  #: (3,) spacing of the grid
 
 
-IDEAL_TABLE = ViewTable(np.zeros((0, 0, 0, 3)), np.zeros(3), np.ones(3))
-
-
 class MeasuredView(NamedTuple):
     """Measured positions and row differences of true points after the estimators have removed rectification errors."""
 
-    #: measured positions on a grid of true positions; without values if all points are measured at their true positions
     table: ViewTable
-    #: (n_disparity, n_y, n_x) remaining row difference, right minus left, normalised; on the grid of `table`
-    row_table: Array
     removed: Array  #: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove
 
     @property
@@ -62,18 +56,14 @@ class MeasuredView(NamedTuple):
 
     def measure(self, points: Array) -> Array:
         """Returns the measured positions (n, 3) of true points (n, 3); NaN for points that are not imaged."""
-        return measure_all(self.table, points)
+        return np.ascontiguousarray(_measure_all(self.table, points)[:, :3])
 
     def row_difference(self, points: Array) -> Array:
-        """Returns the remaining row differences (n,), right minus left (normalised), of true points (n, 3).
-
-        The view must not be ideal.
-        """
-        rows = ViewTable(np.repeat(self.row_table[..., None], 3, axis=-1), self.table.first, self.table.step)
-        return measure_all(rows, points)[:, 0]
+        """Returns the remaining row differences (n,), right minus left, of true points (n, 3)."""
+        return _measure_all(self.table, points)[:, 3]
 
     def true_directions(self, measured_xy: Array, disparity: float) -> Array:
-        """Returns the true (x, y) (n, 2) of points at the given true disparity that are measured at `measured_xy`."""
+        """Returns the true (x, y) (n, 2) of points at a true disparity that are measured at `measured_xy`."""
         if self.is_ideal:
             return measured_xy
         true = measured_xy.copy()
@@ -85,12 +75,8 @@ class MeasuredView(NamedTuple):
     def motion_gain(self, points: Array, baseline_m: float) -> Array:
         """Returns the (6, 6) matrix that maps the twist of a small true motion to the twist estimated from images.
 
-        The motion of the left camera is estimated by least squares from the measured flow and depth of points; see
-        `sampling.unit_motion_cov`. The matrix is empty if all points are measured at their true positions.
-
-        Args:
-            points: (n, 3) true points, normalised (x, y, disparity).
-            baseline_m: believed baseline [m].
+        The motion of the left camera is estimated by least squares from the measured flow and depth of true points
+        (n, 3); see `sampling.unit_motion_cov`. The matrix is empty if all are measured at their true positions.
         """
         if self.is_ideal:
             return np.zeros((0, 0))
@@ -101,7 +87,7 @@ class MeasuredView(NamedTuple):
         return np.asarray(np.linalg.lstsq(model_flow[known], true_flow[known], rcond=None)[0], np.float64)
 
 
-IDEAL_VIEW = MeasuredView(IDEAL_TABLE, np.zeros((0, 0, 0)), np.zeros(4))
+IDEAL_VIEW = MeasuredView(ViewTable(np.zeros((0, 0, 0, 4)), np.zeros(3), np.ones(3)), np.zeros(4))
 
 
 def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> MeasuredView:
@@ -113,9 +99,10 @@ def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> Meas
     left, right = _images(cameras, rig, grid)
     removed = _removed(left, right, grid, rig)
     right = _without(right, removed)
-    values = np.stack([left[..., 0], (left[..., 1] + right[..., 1]) / 2, left[..., 0] - right[..., 0]], axis=-1)
+    (x, y), (x_right, y_right) = (np.moveaxis(image, -1, 0) for image in (left, right))
+    values = np.stack([x, (y + y_right) / 2, x - x_right, y_right - y], axis=-1)
     first, step = np.array([axis[0] for axis in axes]), np.array([axis[1] - axis[0] for axis in axes])
-    return MeasuredView(ViewTable(values, first, step), right[..., 1] - left[..., 1], removed)
+    return MeasuredView(ViewTable(values, first, step), removed)
 
 
 def _axes(rig: StereoRig, depths_m: Array) -> tuple[Array, Array, Array]:
@@ -142,7 +129,6 @@ def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, A
 
 
 def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
-    """Returns the rectification errors (4,) that the estimators remove from the right image: `MeasuredView.removed`."""
     middle = _SHAPE[0] // 2
     left, right = left[middle].reshape(-1, 2), right[middle].reshape(-1, 2)
     half = np.array([rig.width_px, rig.height_px]) / 2 / rig.focal_px
@@ -153,8 +139,7 @@ def _removed(left: Array, right: Array, grid: Array, rig: StereoRig) -> Array:
     removed = np.zeros(4)
     for _ in range(_FIT_ITERATIONS):
         corrected = _without(right, removed)
-        x, y = corrected.T
-        jacobian = row_jacobian(x, y)
+        jacobian = row_jacobian(*corrected.T)
         change = np.linalg.lstsq(jacobian, corrected[:, 1] - left[:, 1], rcond=None)[0] * CORRECTED
         removed = removed + change
     shift = np.abs(_without(right, removed)[:, 1] - right[:, 1]).max()
@@ -185,15 +170,15 @@ def _flow(points: Array, baseline_m: float, image_of) -> Array:
 
 @kernel
 def measure_point(table, x, y, disparity):
-    """Returns the measured (x, y, disparity) of a true point; outside the grid, the table is extrapolated linearly."""
+    """Returns the measured x, y, disparity and row difference of a true point; the table is extrapolated linearly."""
     values = table.values
     if values.size == 0:
-        return x, y, disparity
+        return x, y, disparity, 0.0
     n, rows, cols, _ = values.shape
     c, a = _interval((disparity - table.first[0]) / table.step[0], n)
     r, b = _interval((y - table.first[1]) / table.step[1], rows)
     k, e = _interval((x - table.first[2]) / table.step[2], cols)
-    m0 = m1 = m2 = 0.0
+    m0 = m1 = m2 = m3 = 0.0
     for i in range(2):
         wi = a if i else 1 - a
         for j in range(2):
@@ -203,7 +188,8 @@ def measure_point(table, x, y, disparity):
                 m0 += w * values[c + i, r + j, k + h, 0]
                 m1 += w * values[c + i, r + j, k + h, 1]
                 m2 += w * values[c + i, r + j, k + h, 2]
-    return m0, m1, m2
+                m3 += w * values[c + i, r + j, k + h, 3]
+    return m0, m1, m2, m3
 
 
 @kernel(inline="always")
@@ -214,11 +200,11 @@ def _interval(position, n):
 
 
 @kernel
-def measure_all(table, points):
-    """Returns the measured positions (n, 3) of true points (n, 3)."""
-    measured = np.empty_like(points)
+def _measure_all(table, points):
+    measured = np.empty((len(points), 4))
     for k in range(len(points)):
-        measured[k, 0], measured[k, 1], measured[k, 2] = measure_point(table, points[k, 0], points[k, 1], points[k, 2])
+        values = measure_point(table, points[k, 0], points[k, 1], points[k, 2])
+        measured[k, 0], measured[k, 1], measured[k, 2], measured[k, 3] = values
     return measured
 
 
@@ -236,22 +222,18 @@ class MeasuredRows:
 
     def are_matched(self, points: Array) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the true points (n, 3) whose measured positions satisfy the epipolar constraint."""
-        left, right = self._positions_px(points)
-        return stereo.satisfies_epipolar(left, right)
+        return stereo.satisfies_epipolar(*self._positions_px(points))
 
     def observe(
         self, observation: StereoObservation, points: Array, sigma_px: float
     ) -> tuple[StereoObservation, float]:
-        """Adds the row differences of a stereo pair.
+        """Adds the row differences of a stereo pair; returns the observation with their statistics, and a noise ratio.
+
+        The noise ratio is that of `stereo.row_noise_ratio`, but for any number of points.
 
         Args:
-            points: (n, 3) true normalised (x, y, disparity) of points that are matched; they represent
-                `observation.n_points` points.
+            points: (n, 3) true matched points, which represent `observation.n_points` points.
             sigma_px: standard deviation of a match in one image [px].
-
-        Returns:
-            The observation with the statistics of the row differences, and their noise ratio. The noise ratio is
-            defined as in `stereo.row_noise_ratio`, but for any number of points.
         """
         rows_px, row_sigma_px = self._view.row_difference(points) * self._rig.focal_px, np.sqrt(2) * sigma_px
         of_raster = row_sigma_px * np.sqrt(len(points) / observation.n_points)
@@ -268,17 +250,14 @@ class MeasuredRows:
         return self._calibration.report()
 
     def _add(self, points: Array, rows_px: Array, sigma_px: float) -> None:
-        """Updates the estimate of the rectification errors with the row differences (n,) [px] of true points (n, 3)."""
+        """Updates the estimate of the rectification errors with the row differences (n,) of true points (n, 3)."""
         n, (left, _) = len(points), self._positions_px(points)
         cov = np.tile(np.eye(3) * (sigma_px / 2 / self._rig.focal_px) ** 2, (n, 1, 1))
         measured, zeros = self._view.measure(points), np.zeros((n, 2))
-        pair = StereoPoints(
-            left.astype(np.float32), zeros, zeros[:, 0], measured, cov, np.zeros((n, 3)), rows_px
-        )  # fmt: skip
+        pair = StereoPoints(left.astype(np.float32), zeros, zeros[:, 0], measured, cov, np.zeros((n, 3)), rows_px)
         self._calibration.add(pair, self._rig, self._patch_px)
 
     def _positions_px(self, points: Array) -> tuple[Array, Array]:
-        """Returns the measured positions (n, 2) of points in the left and the right image [px]."""
         measured, rows = self._view.measure(points), self._view.row_difference(points)
         centre = [self._rig.cx_px, self._rig.cy_px]
         left = np.column_stack([measured[:, 0], measured[:, 1] - rows / 2])

@@ -40,8 +40,6 @@ class MosaicView(NamedTuple):
 
 
 class MosaicModel:
-    """Mosaic without images: for each floor cell, the number of the first keyframe that shows it."""
-
     def __init__(self) -> None:
         self._first_keyframe: dict[int, int] = {}
         self._estimated: dict[int, Array] = {}

@@ -33,9 +33,9 @@ def sample_link(
     points, later_noise, earlier_noise, relief_noise, normals, earlier_pose, later_pose, camera, cov, error_root,
     bias_fraction, relief_sigma, distance_growth, common_sigma, noise_share,
 ):  # fmt: skip
-    """Samples the motion between two keyframes: estimates it from points with sampled noise.
+    """Samples the motion between two keyframes: estimates it from points with sampled noise, as from matched points.
 
-    The equations are the same as for matched points. Standard deviations and covariances are in normalised coordinates.
+    Standard deviations and covariances are in normalised coordinates.
 
     Args:
         points: (n, 3) true points of the later keyframe, normalised (x, y, disparity).
@@ -54,8 +54,8 @@ def sample_link(
             independent matches that a point represents, divided by that of a single match.
 
     Returns:
-        Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6).
-        Motion and covariance are valid only if at least `MIN_POINTS` points are seen.
+        Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6),
+        valid only if at least `MIN_POINTS` points are seen.
     """
     focal, cx, cy, width, height, margin, baseline, table = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_sigma
@@ -129,11 +129,7 @@ def unit_motion_cov(points: Array, baseline: float, n_effective: float) -> Array
     """Returns the covariance (6, 6) of a motion estimated from flow and known depth.
 
     The motion is estimated by least squares, Negahdaripour & Madjidi (2003), eq. (2), from `n_effective` flow vectors
-    of unit standard deviation. The vectors have the same distribution over image and depth as `points`.
-
-    Args:
-        points: (n, 3) normalised (x, y, disparity).
-        baseline: stereo baseline [m].
+    of unit standard deviation, distributed over image and depth as `points` (n, 3), normalised (x, y, disparity).
     """
     n = len(points)
     jacobian = observation_equations.image_jacobian(points[:, 0], points[:, 1], baseline / points[:, 2])
@@ -161,13 +157,8 @@ def mosaic_correction(estimated, measured_motions, fractions, predicted_pose):
     """Returns the correction (6,) of a predicted pose by a registration with the mosaic without matching errors.
 
     Each keyframe in the mosaic is displaced by the error of the pose at which it was added. The correction is the mean
-    over the keyframes in view, weighted by `fractions`.
-
-    Args:
-        estimated: (n, 4, 4) estimated poses of the keyframes in view.
-        measured_motions: (n, 4, 4) pose of the frame to register relative to each keyframe, without matching errors.
-        fractions: (n,) fraction of the mosaic in view that comes from each keyframe.
-        predicted_pose: (4, 4) predicted pose of the frame to register.
+    over the keyframes in view, weighted by `MosaicView.fractions`, given the pose (n, 4, 4) of the frame relative to
+    each of them without matching errors.
     """
     predicted_from_world, correction = geometry.inverse(predicted_pose), np.zeros(6)
     for k in range(len(fractions)):

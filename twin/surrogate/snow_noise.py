@@ -9,7 +9,6 @@ images is too low. Images, defocus and illumination of the particles are compute
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,13 +25,6 @@ _LEAST_VARIANCE_PX2 = 1e-12  # of a match that neither noise nor a particle dist
 _VIEWS = 3  # number of views with different particles
 
 
-class SnowEffect(NamedTuple):
-    """Effect of marine snow on the matching of patches between two images."""
-
-    variance_px2: float  #: variance of the weighted mean of n matches, times n [px^2]; includes the image noise
-    matched_share: float  #: fraction of the patches that are matched in spite of the snow
-
-
 def snow_poses(pose: StampedPose) -> list[StampedPose]:
     """Returns poses of the camera that show different particles, shifted by fractions of the periodic snow box."""
     poses = []
@@ -43,14 +35,12 @@ def snow_poses(pose: StampedPose) -> list[StampedPose]:
     return poses
 
 
-def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patch_px: int) -> SnowEffect:
-    """Returns the effect of snow on matches between images with different particles.
+def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patch_px: int) -> tuple[float, float]:
+    """Returns the effect of snow on matches between views with different particles.
 
-    If no patch is matched, the variance is infinite.
-
-    Args:
-        clean: noise-free images of the same floor without snow, one for each view [grey levels].
-        noise: standard deviation of the image noise [grey levels].
+    The variance of the weighted mean of n matches, times n [px^2], with the image noise; infinite without a match. The
+    fraction of the patches that are matched. `clean` are noise-free images of the same floor without snow, one for each
+    view, and `noise` is the standard deviation of the image noise [grey levels].
     """
     weights, errors, n_patches = [], [], 0
     for k in range(len(clean)):
@@ -62,19 +52,16 @@ def snow_effect(clean: Sequence[Gray], snowy: Sequence[Gray], noise: float, patc
         errors.append(error_px[matched])
     weight, error = np.concatenate(weights), np.concatenate(errors)
     if not len(weight):
-        return SnowEffect(np.inf, 0.0)
+        return np.inf, 0.0
     noise_px2 = 2 * noise**2 / _information(clean[0], patch_px)
     mean = float(np.mean(weight**2 * (noise_px2 + error**2)) / np.mean(weight) ** 2)
-    return SnowEffect(mean, len(weight) / n_patches)
+    return mean, len(weight) / n_patches
 
 
 def _patches(
     clean: Gray, snow: tuple[Gray, Gray], noise: float, patch_px: int
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Returns how patches at every second pixel are matched.
-
-    Three arrays (n,): variance of the matched position [px^2], its error due to snow [px], whether it is matched.
-    """
+    """Returns, of patches at every second pixel, variance of the matched position, its error, whether it is matched."""
     n = patch_px**2
     gradient = np.gradient(clean, axis=1)
     information = np.maximum(n * _mean(gradient**2, patch_px), _information(clean, patch_px))
@@ -101,6 +88,5 @@ def _mean(image: NDArray[np.floating], side_px: int) -> Array:
 
 
 def _variance(image: NDArray[np.floating], side_px: int) -> Array:
-    """Returns the variance of an image over a square around each pixel."""
     values = image.astype(np.float64)
     return np.maximum(_mean(values**2, side_px) - _mean(values, side_px) ** 2, 0.0)

@@ -1,15 +1,15 @@
 """Visual measurements of a surrogate survey: true values with errors sampled from an error model.
 
 The surrogate is part of the simulated world: it uses the truth and returns only measurements, each with the covariance
-that the image-based estimators would report. A raster of points represents all matched points of a keyframe. As one
-raster point stands for several matched points, its noise is that of their mean. Links are computed from the raster
-points by the same equations as from matched points. The noise of a stereo pair is sampled once and enters all links of
-the keyframe: in full if the keyframe is the later one of the link, otherwise with the fraction
-`ErrorModel.match_bias_fraction`.
+that the image-based estimators would report. A raster of points represents all matched points of a keyframe; the noise
+of one is that of the mean of the matched points that it represents. Links are computed from the raster points by the
+same equations as from matched points. The noise of a stereo pair is sampled once and enters all links of the keyframe:
+in full if it is the later one of the link, else with the fraction `ErrorModel.match_bias_fraction`.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from threading import Lock
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, cast_pixels
+from twin.core.height_field import cast_pixels, height_field
 from twin.core.quality import EpipolarError
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE, EstimatorSettings, braking_factor
@@ -27,16 +27,20 @@ from twin.core.timing import StageTimer
 from twin.estimate.mapping import elevation
 from twin.estimate.vision import stereo
 from twin.estimate.vision.f2f import MAX_POINTS as F2F_POINTS
-from twin.estimate.vision.f2f import MIN_MATCHED, constant_velocity_motion
+from twin.estimate.vision.f2f import MIN_MATCHED, NOT_MATCHED, constant_velocity_motion
 from twin.estimate.vision.mosaic import Registration
 from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 from twin.surrogate import sampling
+from twin.surrogate.coverage import RENDERED, unmodelled
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.map_model import MapModel
 from twin.surrogate.matchability import Matchability
-from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, MeasuredView
+from twin.surrogate.measured_view import MeasuredRows, measured_view
 from twin.surrogate.mosaic_model import Cells, MosaicModel, floor_cells
+from twin.world.mission import Mission
+from twin.world.top_surface import true_heights
+from twin.world.world import streams
 
 _RASTER = (6, 8)  # rows and columns of the raster of points
 _RELIEF_CELLS = 128  # number of floor cells in x and in y after which the sampled errors due to relief repeat
@@ -54,8 +58,8 @@ class KeyframeTruth(NamedTuple):
     points: Array  #: (n, 3) true normalised (x, y, disparity) of the raster points that are inside both images
     raster_indices: NDArray[np.int64]  #: (n,) index of each point in the raster
     noise: Array  #: (rows, cols, 3) standard normal samples of the stereo errors of the raster points
-    bound_px: float  #: Cramér-Rao bound of a patch's position [px]
-    unevenness_px: float  #: unevenness of the floor under a patch [px per unit of baseline / depth], see `matchability`
+    bound_px: float  #: Cramér-Rao bound of a patch's position
+    unevenness_px: float  #: `Matchability.unevenness_at` its depth
     n_points: float  #: number of matched points that the raster points represent
     baseline_m: float  #: stereo baseline [m]
     #: (6, 6) covariance of a motion estimated from known depth and flow vectors of unit standard deviation
@@ -66,11 +70,11 @@ class KeyframeTruth(NamedTuple):
 
     @property
     def stereo_parallax_px(self) -> float:
-        """Returns the RMS parallax of the relief in a patch between the two cameras [px]."""
+        """Returns the RMS parallax of the relief in a patch between the two cameras."""
         return self.unevenness_px * float(np.mean(self.points[:, 2]))
 
     def parallax_px(self, earlier_pose: Array) -> float:
-        """Returns the RMS parallax of the relief in a patch between the keyframe and an earlier pose (4, 4) [px]."""
+        """Returns the RMS parallax of the relief in a patch between the keyframe and an earlier pose (4, 4)."""
         distance_m = float(np.linalg.norm(self.pose[:3, 3] - earlier_pose[:3, 3]))
         return self.unevenness_px * distance_m * float(np.mean(self.points[:, 2])) / self.baseline_m
 
@@ -84,60 +88,52 @@ class FrameErrors(NamedTuple):
 
     root: Array  #: (6, 6) lower Cholesky factor of the true covariance of the independent error of a motion
     cov: Array  #: (6, 6) reported covariance of a motion
-    anticorrelation: float  #: fraction of the independent error of a motion that the next motion cancels
-    #: (6, 6) matrix that maps the twist of the true motion to that of the measured one, to model calibration errors and
-    #: an approximated port; empty without these
-    gain: Array
-
-
-class TrueScene(NamedTuple):
-    """True scene from which measurements are sampled."""
-
-    left_camera: Callable[[], Array]  #: function that returns the current true pose (4, 4) of the left camera
-    floor: HeightField  #: the true floor
-    matchability: Matchability  #: Cramér-Rao bound and unevenness of the floor
-    map_model: MapModel  #: model of the elevation map, with the true heights on its grid
-    view: MeasuredView = IDEAL_VIEW  #: positions at which the estimators measure true points
+    anticorrelation: float  #: `ErrorModel.f2f_anticorrelation`
+    gain: Array  #: `MeasuredView.motion_gain`
 
 
 class SurrogateVision:
     """Implementation of `Vision` that samples measurements from an error model.
 
     Args:
-        rig: calibration that the estimators use, at the scale of the images that they match, which may be binned.
-        rng: random generator of all errors.
+        true_pose: returns the current true world_from_camera (4, 4) of the left camera.
 
     Attributes:
+        rig: calibration that the estimators use, at the scale of the images that they match, which may be binned.
+        view: positions at which the estimators measure true points.
         last_pose: (4, 4) true pose of the last frame; None before the first one.
         last_normals: (6,) standard normal samples of the last frame-to-frame motion; 0 if there was none since tracking
             was restarted.
-        n_corners: number of points of a keyframe that the estimators try to match, see `corner_count`.
+        frame_errors: error distribution of the current frame-to-frame motions; None if there are no points to track.
+        n_corners: `corner_count`.
+
+    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
 
-    def __init__(
-        self,
-        rig: StereoRig,
-        settings: EstimatorSettings,
-        model: ErrorModel,
-        scene: TrueScene,
-        rng: np.random.Generator,
-        stopwatch: StageTimer,
-    ):
-        self.rig, self.settings, self.model, self.stopwatch = rig, settings, model, stopwatch
-        self.scene, self._rng = scene, rng
+    def __init__(self, mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer):
+        scenario, terrain = mission.scenario, mission.terrain
+        rng, settings = streams(scenario.seed)["surrogate"], scenario.estimator_settings()
+        self.matchability = matchability = _matchability(mission)
+        self.view = view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
+        self.floor = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
+        self.rig = rig = mission.rig.binned(matchability.binning)
+        heights = true_heights(mission.grid, terrain.height_at)
+        self.map_model = MapModel(mission.grid, heights, rig, self.floor, matchability, view)
+        self.settings, self.model, self.stopwatch = settings, model, stopwatch
+        self._true_pose, self._rng = true_pose, rng
         margin_px = float(stereo.margin_px(settings.patch_px))
         self._camera = (
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), margin_px, rig.baseline_m,
-            scene.view.table,
+            view.table,
         )  # fmt: skip
         self.n_corners = corner_count(rig, settings)
         self._pixels = _raster(rig, margin_px)
-        middle = rig.baseline_m / float(np.median(scene.matchability.depths_m))
-        self._rays = scene.view.true_directions(rig.normalised(self._pixels), middle)  # of the true points
+        middle = rig.baseline_m / float(np.median(matchability.depths_m))
+        self._rays = view.true_directions(rig.normalised(self._pixels), middle)  # of the true points
         self._true_pixels = self._rays * rig.focal_px + [rig.cx_px, rig.cy_px]
-        self._rows = None if scene.view.is_ideal else MeasuredRows(scene.view, rig, settings.patch_px, rng)
+        self._rows = None if view.is_ideal else MeasuredRows(view, rig, settings.patch_px, rng)
         self.last_pose: Array | None = None
         self.last_normals = np.zeros(6)
         self._tracking_cov: Array | None = None
@@ -146,7 +142,7 @@ class SurrogateVision:
         self._keyframes: dict[int, KeyframeTruth] = {}  # keyframes that may still be linked
         self._latest: KeyframeTruth | None = None
         self.stereo_observations: list[StereoObservation] = []
-        self._f2f: FrameErrors | None = None
+        self.frame_errors: FrameErrors | None = None
         self._last_motion, self._blind_s = np.eye(4), 0.0  # blind: time without points to track
         self._mosaic = MosaicModel()
         self._link_key, self._link_lock = int(rng.integers(2**63)), Lock()
@@ -160,54 +156,38 @@ class SurrogateVision:
         self._unit_root = np.linalg.cholesky(self._unit_cov)
 
     @property
-    def binning(self) -> int:
-        return self.scene.matchability.binning
-
-    @property
-    def lamp_share(self) -> float:
-        """Returns the fraction of the reflected light that comes from the lamps."""
-        return self.scene.matchability.lamp_share
-
-    @property
     def latest(self) -> KeyframeTruth:
         """Returns the last keyframe with a stereo observation."""
         assert self._latest is not None
         return self._latest
 
-    @property
-    def frame_errors(self) -> FrameErrors | None:
-        """Returns the error distribution of the current F2F motions; None if there are no points to track."""
-        return self._f2f
-
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        pose = self.scene.left_camera()
+        pose = self._true_pose()
         previous, self.last_pose = self.last_pose, pose
         if previous is None:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
-        if self._f2f is None:
+        if (errors := self.frame_errors) is None:
             self._tracking_cov = None
             interval_s = 1 / self.rig.frame_rate_hz
             factor, self._blind_s = braking_factor(self._blind_s, interval_s), self._blind_s + interval_s
             if factor < 1:
                 self._last_motion = geometry.exp(factor * geometry.log(self._last_motion))
-            return constant_velocity_motion(self._last_motion)
+            return constant_velocity_motion(self._last_motion), NOT_MATCHED
         self._blind_s = 0.0
         normals = self.draw_normals(1)[0]
-        self._last_motion = sampling.sample_f2f_motion(self._f2f, previous, pose, normals, self.last_normals)
+        self._last_motion = sampling.sample_f2f_motion(errors, previous, pose, normals, self.last_normals)
         self.last_normals = normals
-        return Motion(self._last_motion, self._f2f.cov, F2F_POINTS, 0.0), "ok"
+        return Motion(self._last_motion, errors.cov, F2F_POINTS, 0.0), "ok"
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
-        self._f2f = None  # no points to track until `restart_tracking`
+        self.frame_errors = None  # no points to track until `restart_tracking`
         with self.stopwatch("stereo"):
-            pose = self.scene.left_camera()
-            self.scene.map_model.mark_seen(pose)
-            depth_m = cast_pixels(self.scene.floor, pose[None], self.rig, self._true_pixels)[0]
+            pose = self._true_pose()
+            self.map_model.mark_seen(pose)
+            depth_m = cast_pixels(self.floor, pose[None], self.rig, self._true_pixels)[0]
             hits = np.flatnonzero((depth_m > 0) & (depth_m < np.inf))  # 0: the camera is below the floor
-            if len(hits) < sampling.MIN_POINTS:
-                self.stereo_observations.append(StereoObservation(row, 0, None))
-                return None
-            seen, n_points = self._matched_points(hits, depth_m)
+            enough = len(hits) >= sampling.MIN_POINTS
+            seen, n_points = self._matched_points(hits, depth_m) if enough else (hits, 0.0)
             if n_points < _MIN_POINTS or len(seen) < sampling.MIN_POINTS:
                 self.stereo_observations.append(StereoObservation(row, int(n_points), None))
                 return None
@@ -216,7 +196,7 @@ class SurrogateVision:
 
     def _matched_points(self, hits: NDArray[np.int64], depth_m: Array) -> tuple[NDArray[np.int64], float]:
         """Returns the raster points (n,) that are matched, of those that show the floor, and the number of matches."""
-        matchability, mean_m = self.scene.matchability, float(depth_m[hits].mean())
+        matchability, mean_m = self.matchability, float(depth_m[hits].mean())
         share = self.model.point_fraction(float(matchability.bound_at(mean_m))) * matchability.clear_share_at(mean_m)
         points = self._true_points(hits, depth_m)
         matched = np.ones(len(hits), np.bool_) if self._rows is None else self._rows.are_matched(points)
@@ -226,10 +206,10 @@ class SurrogateVision:
     def _sample_stereo(
         self, pose: Array, row: int, hits: NDArray[np.int64], depth_m: Array, n_points: float, mean_m: float
     ) -> StereoPoints:
-        """Samples the positions of the raster points `hits` in a stereo pair, and stores the keyframe's truth."""
-        points, rig, matchability = self._true_points(hits, depth_m), self.rig, self.scene.matchability
+        """Samples the positions of the raster points `hits` in a stereo pair, and keeps the keyframe's truth."""
+        points, rig, matchability = self._true_points(hits, depth_m), self.rig, self.matchability
         bound_px, n = float(matchability.bound_at(mean_m)), len(points)
-        measured = self.scene.view.measure(points)
+        measured = self.view.measure(points)
         noise = self._rng.standard_normal((*_RASTER, 3))
         n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, rig, self.settings.patch_px)
         unit_cov = sampling.unit_motion_cov(measured, rig.baseline_m, n_tracked)
@@ -250,12 +230,11 @@ class SurrogateVision:
         return StereoPoints(pixels, np.zeros((n, 2)), around_px, measured, cov, xyz, np.zeros(n))
 
     def _true_points(self, indices: NDArray[np.int64], depth_m: Array) -> Array:
-        """Returns the true normalised (x, y, disparity) (n, 3) of points of the raster that samples the left image."""
         return np.column_stack([self._rays[indices], self.rig.baseline_m / depth_m[indices]])
 
     def _in_both_images(self, points: Array) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the true points (n, 3) whose patches lie inside both images."""
-        measured = self.scene.view.measure(points)
+        measured = self.view.measure(points)
         left_px = measured[:, :2] * self.rig.focal_px + [self.rig.cx_px, self.rig.cy_px]
         right_px = left_px - np.column_stack([self.rig.focal_px * measured[:, 2], np.zeros(len(measured))])
         in_left, in_right = (stereo.well_inside(px, self.rig, self.settings.patch_px) for px in (left_px, right_px))
@@ -270,8 +249,8 @@ class SurrogateVision:
             return  # vision is lost until the next keyframe
         root, cov = self._motion_errors(float(model.difference_sigma_px(self.latest.bound_px)))
         independent = 1 / np.sqrt(1 + model.f2f_anticorrelation**2)
-        gain = self.scene.view.motion_gain(self.latest.points, self.rig.baseline_m)
-        self._f2f = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
+        gain = self.view.motion_gain(self.latest.points, self.rig.baseline_m)
+        self.frame_errors = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
         self.last_normals, self._tracking_cov = np.zeros(6), cov
 
     def _motion_errors(self, sigma_px: float) -> tuple[Array, Array]:
@@ -316,7 +295,6 @@ class SurrogateVision:
             self._keyframes.pop(number, None)
 
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
-        """Returns links as `measure_motions` does, sampled from the given error model."""
         with self.stopwatch("network"):
             later = self._keyframes.get(node.number, self.latest)
             return [self._sample_link(later, self._keyframes[k.number], node.number, k.number, model) for k in others]
@@ -324,11 +302,7 @@ class SurrogateVision:
     def _sample_link(
         self, later: KeyframeTruth, earlier: KeyframeTruth, number: int, other: int, model: ErrorModel
     ) -> Motion | None:
-        """Samples the motion between two keyframes; None if too few points or too small a fraction are matched.
-
-        It is estimated from noisy points by least squares from the true motion: in one iteration, or in several if
-        `TrueScene.view` is not ideal.
-        """
+        """Samples the motion between two keyframes; None if too few points or too small a fraction are matched."""
         n, parallax_px = len(later.points), later.parallax_px(earlier.pose)
         bound_px = max(later.bound_px, earlier.bound_px)
         stereo_sigma_px = model.match_sigma_px(bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
@@ -336,7 +310,7 @@ class SurrogateVision:
         n_matches = later.n_points * match_fraction
         inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
         noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
-        sigma_px, lamp_factor = stereo_sigma_px * noise_scale, model.lamp_factor(self.lamp_share)
+        sigma_px, lamp_factor = stereo_sigma_px * noise_scale, model.lamp_factor(self.matchability.lamp_share)
         in_view, motion, cov = sampling.sample_link(
             later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise,
             self._link_normals(number, other, n + 1), earlier.pose, later.pose, self._camera,
@@ -354,7 +328,7 @@ class SurrogateVision:
         return Motion(motion, cov * growth, n_matched, float(residual))
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
-        """Returns standard normal numbers (n, 3) of a link; in a survey, they depend only on its keyframe numbers."""
+        """Returns standard normal numbers (n, 3) of a link, which depend on seed and keyframe numbers only."""
         state = self._link_rng_state | {"state": {"key": [self._link_key, 0], "counter": [0, 0, number, other]}}
         with self._link_lock:  # links may be measured in several threads at once
             self._link_rng.bit_generator.state = state
@@ -366,7 +340,7 @@ class SurrogateVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        mapper, map_model, rng = elevation.ElevationMapper(grid), self.scene.map_model, self._rng
+        mapper, map_model, rng = elevation.ElevationMapper(grid), self.map_model, self._rng
         noise = map_model.new_noise(self.model, rng)
         estimated = result.final.world_from_camera[result.keyframe_rows]
         true = [self._pose_at[row] for row in result.keyframe_rows.tolist()]
@@ -381,7 +355,7 @@ class SurrogateVision:
         return mapper.result()
 
     def draw_normals(self, n: int) -> Array:
-        """Returns the next standard normal numbers (n, 6) of the random stream, which is generated in blocks."""
+        """Returns the next standard normal numbers (n, 6), which are generated in blocks."""
         while self._n_used + n > len(self._normals):
             fresh = self._rng.standard_normal((_BLOCK, 6))
             self._normals, self._n_used = np.concatenate([self._normals[self._n_used :], fresh]), 0
@@ -389,11 +363,18 @@ class SurrogateVision:
         return self._normals[self._n_used - n : self._n_used]
 
 
-def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:
-    """Returns the number of points of an image that the estimators try to match; see `matching.corners`.
+def _matchability(mission: Mission) -> Matchability:
+    """Returns the matchability of a mission; raises UnmodelledError if marine snow prevents all matches."""
+    found = Matchability(mission.scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
+    if not math.isfinite(found.medium_bound_px):
+        where = f"marine snow prevents all matches of the floor at a depth of {found.medium_depth_m:.3g} m"
+        problem = f"the surrogate cannot simulate this survey: {where}"
+        raise unmodelled(mission, [(problem, f"less [snow], or {RENDERED}")])
+    return found
 
-    A small image has fewer corners than requested. If it has fewer than half as many, a grid of points is matched.
-    """
+
+def corner_count(rig: StereoRig, settings: EstimatorSettings) -> float:
+    """Returns the number of points to match in an image; a small one has fewer, or a grid (`matching.corners`)."""
     corners = rig.width_px * rig.height_px / _CORNER_AREA_PX2
     return float(settings.points if corners < settings.points / 2 else min(corners, settings.points))
 
@@ -409,9 +390,7 @@ def overlap_inflation(n_points: float, rig: StereoRig, patch_px: int) -> float:
 
 def _raster(rig: StereoRig, margin_px: float) -> Array:
     """Returns the pixels (n, 2) of the raster points, evenly spaced over the part of the image with matches."""
-    sides = (rig.height_px, rig.width_px)
-    rows, cols = (
-        margin_px + (np.arange(n) + 0.5) / n * (side - 2 * margin_px) for n, side in zip(_RASTER, sides, strict=True)
-    )
-    v, u = (a.ravel() for a in np.meshgrid(rows, cols, indexing="ij"))
+    sides = zip(_RASTER, (rig.height_px, rig.width_px), strict=True)
+    axes = (margin_px + (np.arange(n) + 0.5) / n * (side - 2 * margin_px) for n, side in sides)
+    v, u = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
     return np.column_stack([u, v]) - 0.5

@@ -9,6 +9,7 @@ the surveys do not determine keeps its value in the compared model.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from scipy.optimize import least_squares
 from twin.core.geometry import Array
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.height_errors import CellConditions, height_sigmas
-from twin.surrogate_fit.comparison import BIAS_FRACTION, RELIEF_GAIN
+from twin.surrogate_fit.comparison_vision import BIAS_FRACTION, RELIEF_GAIN
 
 _NORMAL_MAD = 1.4826  # standard deviation of a normal distribution, divided by its median absolute value
 _PRIOR = 0.01  # weight of the logarithm of a parameter relative to its value in the compared model
@@ -36,7 +37,6 @@ class SurveyStatistics(NamedTuple):
     classes: Mapping[str, Sequence[Sequence[float]]]
 
     def median(self, name: str) -> float:
-        """Returns the median of the samples of a name."""
         return float(np.median(self.samples[name]))
 
 
@@ -49,16 +49,12 @@ class Comparison(NamedTuple):
 
     @property
     def residuals(self) -> Array:
-        """Returns the residuals (n,), with a total weight that does not depend on their number."""
+        """Returns the residuals (n,), whose total weight does not depend on their number."""
         return (self.predicted - self.measured) / np.sqrt(len(self.measured))
 
 
 def fit_error_model(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> ErrorModel:
-    """Returns the error model that reproduces the statistics of rendered surveys.
-
-    Args:
-        compared: error model with which the surrogate sampled its measurements in these surveys.
-    """
+    """Returns the error model that reproduces the statistics of rendered surveys, sampled with the `compared` model."""
     start = np.log(np.maximum(compared._replace(match_half_px=_START_HALF_PX), 1e-6))
     highest = np.minimum(start + np.log(_REACH), [np.log(_LARGEST.get(name, np.inf)) for name in ErrorModel._fields])
     start = np.minimum(start, highest - 1e-3)
@@ -85,9 +81,7 @@ def misfit(surveys: Sequence[SurveyStatistics], model: ErrorModel, compared: Err
 
 def comparisons(s: SurveyStatistics, model: ErrorModel, compared: ErrorModel) -> Iterator[Comparison]:
     """Yields the measured values of a survey with those that an error model predicts."""
-    yield from _of_frames(s, model)
-    yield from _of_links(s, model, compared)
-    yield from _of_map(s, model)
+    return chain(_of_frames(s, model), _of_links(s, model, compared), _of_map(s, model))
 
 
 def _logs(kind: str, measured: Array | float, predicted: Array | float) -> Comparison:
@@ -100,7 +94,6 @@ def _fractions(kind: str, measured: Array | float, predicted: Array | float) -> 
 
 
 def _of_frames(s: SurveyStatistics, model: ErrorModel) -> Iterator[Comparison]:
-    """Yields the comparisons of stereo points, frame-to-frame motions and registrations with the mosaic."""
     bound_px, flow_px = s.median("bound_px"), float(model.difference_sigma_px(s.median("bound_px")))
     match_px = model.match_sigma_px(bound_px, s.median("stereo_parallax_px"))
     yield _logs("match_reported_px", s.median("match_reported_px"), match_px)
@@ -121,7 +114,7 @@ def _of_links(s: SurveyStatistics, model: ErrorModel, compared: ErrorModel) -> I
     which grow with the distance. The bias of a keyframe, which ends one link and starts the next, makes consecutive
     errors cancel partly, relief makes them equal: the scalar products of the errors of consecutive links separate them.
     """
-    conditions = s.median("bound_px"), s.median("stereo_parallax_px")
+    bound_px, conditions = s.median("bound_px"), (s.median("bound_px"), s.median("stereo_parallax_px"))
     match = model.match_sigma_px(*conditions) / compared.match_sigma_px(*conditions)
     lamps = float(model.lamp_factor(s.median("lamp_share")))
     relief = (model.relief_gain / RELIEF_GAIN * lamps) ** 2
@@ -138,7 +131,6 @@ def _of_links(s: SurveyStatistics, model: ErrorModel, compared: ErrorModel) -> I
     )
     growth, before = (1 + (one.distance_growth * distance) ** 2 / 2 for one in (model, compared))
     yield _logs("link_reported", reported, match * np.sqrt(growth / before))
-    bound_px = s.median("bound_px")
     matched = model.point_fraction(bound_px) * model.rematched(bound_px) / compared.matched_share
     yield _fractions("link_matched", s.median("link_matched"), matched)
     products = [np.mean(s.samples[f"consecutive_product_{name}"]) for name in ("images", "patches", "relief")]
@@ -154,7 +146,6 @@ def _trimmed_mean(squares: Array) -> float:
 
 
 def _of_map(s: SurveyStatistics, model: ErrorModel) -> Iterator[Comparison]:
-    """Yields the comparisons of map cells."""
     for kind, n_values in (("level", 3), ("edge", 1), ("known", 1)):
         if not s.classes.get(kind):
             continue
@@ -170,7 +161,7 @@ def _of_map(s: SurveyStatistics, model: ErrorModel) -> Iterator[Comparison]:
 
 
 def _survey_scatter(surveys: Sequence[SurveyStatistics], model: ErrorModel, compared: ErrorModel) -> float:
-    """Returns the standard deviation over surveys of the logarithm of error / reported noise of level cells."""
+    """Returns `ErrorModel.survey_scatter`, of error / reported noise of level cells."""
     ratios = []
     for s in surveys:
         found = {row.kind: np.median(row.measured - row.predicted) for row in comparisons(s, model, compared)}

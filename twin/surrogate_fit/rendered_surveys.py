@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
@@ -21,8 +22,8 @@ from twin.surrogate.coverage import QUANTITIES, Range, survey_conditions
 from twin.surrogate.error_model import ErrorModel
 from twin.surrogate.error_model_file import FittedErrorModel
 from twin.surrogate.matchability import Matchability
-from twin.surrogate.surrogate_world import surrogate_vision
-from twin.surrogate_fit.comparison import ComparisonVision
+from twin.surrogate.vision import SurrogateVision
+from twin.surrogate_fit.comparison_vision import ComparisonVision
 from twin.surrogate_fit.fit import SurveyStatistics, fit_error_model, misfit
 from twin.world.mission import prepare
 from twin.world.rendered_world import RenderedWorld
@@ -35,23 +36,14 @@ _MAX_BOUND_PX = 0.5
 _NEVER_PX = 1e3  # Cramér-Rao bound that no survey has
 _BOUND = "bound_px"
 _CONDITION = "condition_"  # prefix of the names of the conditions in the statistics
-_NEEDED = (
-    "consecutive_product_images",
-    "mosaic_error_px",
-    "f2f_interval_px",
-    "match_reported_px",
-)  # of a complete survey
+#: Statistics of a complete survey.
+_NEEDED = ("consecutive_product_images", "mosaic_error_px", "f2f_interval_px", "match_reported_px")
 
 
 def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) -> FittedErrorModel:
-    """Returns the error model fitted to rendered surveys.
+    """Returns the error model fitted to the complete ones of rendered surveys; raises TwinError if fewer than two are.
 
-    Args:
-        surveys: statistics of each survey. The model is fitted to the complete ones (`_is_complete`). Lost surveys
-            (`_is_lost`) may remove the upper limit of the range of the Cramér-Rao bound.
-
-    Raises:
-        TwinError: fewer than two surveys have complete statistics.
+    Lost surveys may remove the upper limit of the range of the Cramér-Rao bound.
     """
     complete = [s for s in surveys if _is_complete(s)]
     if len(complete) < _MIN_SURVEYS:
@@ -63,15 +55,11 @@ def fit_to_surveys(surveys: Sequence[SurveyStatistics], compared: ErrorModel) ->
 
 
 def comparison_model(model: ErrorModel) -> ErrorModel:
-    """Returns an error model whose fractions of matched points do not decrease with the Cramér-Rao bound.
-
-    Image measurements in turbid water can then be compared with sampled measurements.
-    """
+    """Returns an error model that matches every point, to compare images in turbid water with the surrogate."""
     return model._replace(match_half_px=_NEVER_PX)
 
 
 def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveyStatistics]) -> dict[str, Range]:
-    """Returns the smallest and the largest value of each condition in the complete surveys, by name of `QUANTITIES`."""
     values = {name: [x for s in complete for x in s.samples.get(_CONDITION + name, ())] for name in QUANTITIES}
     ranges = {name: (min(found), max(found)) for name, found in values.items() if found}
     lost_px = [x for s in lost for x in s.samples.get(_CONDITION + _BOUND, ())]
@@ -81,10 +69,7 @@ def _fitted_range(complete: Sequence[SurveyStatistics], lost: Sequence[SurveySta
 
 
 def _is_complete(statistics: SurveyStatistics) -> bool:
-    """Returns whether a survey has links and a map, is not lost, and has the same binning as the surrogate.
-
-    The statistics of images and surrogate are in pixels of binned images.
-    """
+    """Returns whether a survey has links and a map, is not lost, and has the same pixels as the surrogate."""
     if not all(name in statistics.samples for name in _NEEDED) or "known" not in statistics.classes:
         return False
     images, surrogate = statistics.samples["binning"]
@@ -100,7 +85,7 @@ def _is_lost(statistics: SurveyStatistics) -> bool:
 def all_statistics(
     surveys: Sequence[tuple[Scenario, Path]], compared: ErrorModel, jobs: int = 1
 ) -> Iterator[SurveyStatistics]:
-    """Yields the statistics of rendered surveys, in the order of the surveys; see `survey_statistics`."""
+    """Yields the `survey_statistics` of scenarios with their folders, in `jobs` processes."""
     scenarios, folders = [scenario for scenario, _ in surveys], [folder for _, folder in surveys]
     one = partial(survey_statistics, compared=compared)
     if jobs == 1:
@@ -113,27 +98,22 @@ def all_statistics(
 def survey_statistics(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
     """Returns the statistics of a rendered survey's comparison with the surrogate.
 
-    Reads them from the folder if they were saved there for the same scenario and error model, else flies the survey. A
-    survey whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown, and has no statistics.
-
-    Raises:
-        ScenarioError: the survey cannot be flown.
+    They are those saved in the folder for the same scenario and error model, or else the survey is flown. A survey
+    whose Cramér-Rao bound exceeds `_MAX_BOUND_PX` is not flown, and has no statistics. Raises ScenarioError if the
+    survey cannot be flown.
     """
-    return _load(scenario, folder, compared) or _fly(scenario, folder, compared)
-
-
-def _load(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics | None:
-    """Returns the statistics saved in a folder; None if there are none for this scenario and error model."""
-    try:
+    identity = {"scenario_hash": scenario.fingerprint(), "model": repr(compared)}
+    with suppress(TwinError):
         saved = read_json(folder / _FILE)
-    except TwinError:
-        return None
-    same = saved["scenario_hash"] == scenario.fingerprint() and saved["model"] == repr(compared)
-    return SurveyStatistics(*saved["statistics"]) if same else None
+        if saved | identity == saved:
+            return SurveyStatistics(*saved["statistics"])
+    statistics = _flown(scenario, folder, compared)
+    if statistics.samples:
+        (folder / _FILE).write_text(json.dumps(identity | {"statistics": statistics}), encoding="utf-8")
+    return statistics
 
 
-def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
-    """Flies a rendered survey, and saves and returns its statistics; they are incomplete if the survey was aborted."""
+def _flown(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatistics:
     mission, stopwatch = prepare(scenario), Stopwatch()
     matchability = Matchability(scenario, mission.illumination, mission.terrain, mission.plan.area.at_fractions)
     conditions = survey_conditions(mission, matchability)
@@ -145,17 +125,11 @@ def _fly(scenario: Scenario, folder: Path, compared: ErrorModel) -> SurveyStatis
         def true_pose():
             return world.world_from_camera
 
-        surrogate = surrogate_vision(mission, compared, true_pose, Stopwatch())
+        surrogate = SurrogateVision(mission, compared, true_pose, Stopwatch())
         vision = ComparisonVision(image_vision(mission, folder, stopwatch), surrogate, true_pose)
         with navigator_with(mission, vision, stopwatch) as navigator:
-            try:
+            with suppress(SurveyAborted):
                 survey.fly(mission, world, navigator, lambda *_: None)
-                result = navigator.finish()
-                navigator.build_map(result, mission.grid, lambda _: None)
-            except SurveyAborted:
-                pass
+                navigator.build_map(navigator.finish(), mission.grid, lambda _: None)
     samples = vision.statistics | {_CONDITION + name: list(values) for name, values in conditions.items()}
-    statistics = SurveyStatistics(samples, vision.classes)
-    saved = {"scenario_hash": scenario.fingerprint(), "model": repr(compared), "statistics": statistics}
-    (folder / _FILE).write_text(json.dumps(saved), encoding="utf-8")
-    return statistics
+    return SurveyStatistics(samples, vision.classes)

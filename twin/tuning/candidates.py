@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from twin.errors import ScenarioError, TwinError
 from twin.judge.map_error import INFINITE_WITH_HOLES, with_completeness
-from twin.judge.require import meets_limit, more_is_better
+from twin.judge.verdict import meets_limit, more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies.analysis import count_similar
@@ -57,8 +57,6 @@ class SurveyScore(NamedTuple):
 
 
 class Candidate(NamedTuple):
-    """An evaluated plan."""
-
     number: int  #: of the trial
     values: Values
     objectives: tuple[float, ...]
@@ -88,11 +86,10 @@ def required_probability(study: Study) -> float:
 def confirmation_of(study: Study) -> Study:
     """Returns the study that confirms a plan: `tune.confirm` times as many surveys as in the search, with new seeds.
 
-    Sampled keys have `tune.confirm` times as many design points, which are new, each with its own seeds: with
-    shared seeds, samples of a key with few values would repeat surveys, and all samples would be on the same few
-    floors. The designs "sobol" and "saltelli" need a power of 2 as number of samples; for another number, the
-    samples are those of "lhs". Without sampled keys, or with the design "grid", the samples stay the same, with
-    `tune.confirm` times as many seeds.
+    Sampled keys have as many more design points, which are new, each with its own seeds: with shared seeds, samples of
+    a key with few values would repeat surveys, and all samples would be on the same few floors. Designs that need a
+    power of 2 as number of samples are replaced by "lhs" for another number. Without sampled keys, or with the design
+    "grid", the samples stay the same, with more seeds.
     """
     sampling, n_axes = study.sampling, len(study.axes(listed=False))
     count = "samples" if n_axes else "seeds"
@@ -106,8 +103,7 @@ def confirmation_of(study: Study) -> Study:
 def rendered_of(study: Study) -> Study:
     """Returns the study of the rendered surveys of a plan: `tune.verify` new design points, each with its own seed.
 
-    Each design point is combined with every cell of the grids. Without a number of samples in the study, i.e. with
-    the design "grid" or without sampled keys, each cell has `tune.verify` seeds instead.
+    Without a number of samples in the study, each cell of the grids has `tune.verify` seeds instead.
     """
     sampling, config = study.sampling, tuning_config(study)
     update: dict[str, Any] = {"seed": sampling.seed + _RENDER_SEEDS, "paired": False, "seeds": 1}
@@ -126,12 +122,8 @@ def rendered_of(study: Study) -> Study:
 class CandidateSurveys:
     """Surveys of the candidates, with the results obtained so far.
 
-    All candidates are flown with the samples and seeds of the study. Samples that are invalid with the original plan of
-    the study's scenario are left out. The run folders are created in the subfolder `runs` of the results folder.
-
-    Raises:
-        TwinError: the study has no section [tune].
-        ScenarioError: no sample is valid.
+    Samples that are invalid with the original plan of the study's scenario are left out. Raises TwinError without a
+    section [tune], ScenarioError if no sample is valid.
     """
 
     def __init__(self, study: Study, folder: Path, rows: Iterable[Row]):
@@ -149,21 +141,14 @@ class CandidateSurveys:
 
     @property
     def original(self) -> Scenario:
-        """Returns the scenario of the first valid sample with the original plan."""
         return scenario_of_sample(self.study, self.base, self.conditions[0])
 
     def scenario(self, values: Values) -> Scenario:
-        """Returns the scenario of the study with a plan, if it is valid; varied keys keep their original values."""
+        """Returns the scenario of the study with a plan; varied keys keep their original values."""
         return scenario_of_sample(self.study, self.base, Sample(0, 0, values))
 
     def check_bounds(self) -> None:
-        """Validates the scenario at both bounds, or at all listed values, of each searched key.
-
-        The other searched keys keep their original values, and the varied keys have those of the first valid sample.
-
-        Raises:
-            ScenarioError: a scenario is not valid; lists the errors, each key once.
-        """
+        """Raises ScenarioError unless the first valid sample is valid at both bounds, or all values, of each key."""
         condition, errors = self.conditions[0], []
         for key, value in ((key, value) for key, law in self.config.search.items() for value in law.values):
             try:
@@ -174,7 +159,6 @@ class CandidateSurveys:
             raise ScenarioError(merge_errors(errors))
 
     def add(self, row: Row) -> None:
-        """Adds the result of a survey, which replaces an earlier result with the same sample and seed."""
         self._scores[key_of(row)] = SurveyScore(
             row["status"],
             has_passed(row),
@@ -186,16 +170,14 @@ class CandidateSurveys:
         )
 
     def _samples(self, number: int, values: Values) -> Iterator[Sample]:
-        """Yields the samples of a candidate: the searched values combined with each valid sample of the study."""
         for condition in self.conditions:
             yield Sample(number * self._n_samples + condition.number, condition.point, values | condition.values)
 
     def keys(self, number: int, values: Values) -> list[tuple[int, int]]:
-        """Returns the list of (sample, seed) of every survey of a candidate."""
         return [(s.number, seed) for s in self._samples(number, values) for seed in seeds_of_sample(self.study, s)]
 
     def surveys(self, number: int, values: Values) -> Iterator[Survey | Row]:
-        """Yields the surveys of a candidate; for a survey whose scenario is not valid, the row of a refused survey."""
+        """Yields the surveys of a candidate; a refused row for a survey whose scenario is not valid."""
         for sample in self._samples(number, values):
             try:
                 scenario = scenario_of_sample(self.study, self.base, sample)
@@ -206,10 +188,7 @@ class CandidateSurveys:
             yield from surveys_of_sample(self.study, self.folder, sample, scenario)
 
     def missing(self, candidates: Mapping[int, Values]) -> Iterator[Survey]:
-        """Yields the surveys of the candidates that have not been flown with the present scenario or have failed.
-
-        A survey whose scenario is not valid is not yielded, but recorded as refused.
-        """
+        """Yields the surveys of candidates that have no result with the present scenario; records the refused ones."""
         for survey in (survey for plan in candidates.items() for survey in self.surveys(*plan)):
             if not isinstance(survey, Survey):
                 self.add(survey)
@@ -222,15 +201,11 @@ class CandidateSurveys:
         return None if score is None or score.status == "failed" else score
 
     def scores(self, number: int, values: Values) -> list[SurveyScore]:
-        """Returns the results of a candidate's surveys that were flown or refused, without those that failed.
-
-        Surveys of the same scenario with the same seed are identical and count once.
-        """
+        """Returns the results of a candidate's surveys; those of the same scenario with the same seed count once."""
         known = [(key, score) for key in self.keys(number, values) if (score := self._result(key)) is not None]
         return list({(score.scenario_hash or key, key[1]): score for key, score in known}.values())
 
     def n_failed(self, number: int, values: Values) -> int:
-        """Returns the number of surveys of a candidate without a result: they failed or were not flown."""
         return sum(self._result(key) is None for key in self.keys(number, values))
 
     def warnings(self, plans: Iterable[Candidate]) -> dict[str, int]:
@@ -247,8 +222,8 @@ class CandidateSurveys:
     def evaluate(self, number: int, values: Values, correction: PlanCorrection = NO_CORRECTION) -> Candidate:
         """Returns a candidate with its objectives and pass probability, corrected to those of rendered surveys.
 
-        A refused survey counts as one that does not pass; if only the surrogate refuses it, the upper bound of the pass
-        probability counts it as one that passes. A failed survey is not counted.
+        A refused survey counts as one that does not pass; if only the surrogate refuses it, as one that passes at the
+        upper bound of the pass probability.
         """
         scores = self.scores(number, values)
         n_passed = sum(self._passes(score, correction) for score in scores)
@@ -265,7 +240,6 @@ class CandidateSurveys:
         return Candidate(number, values, objectives, passing, shortfall, completeness)
 
     def _passes(self, score: SurveyScore, correction: PlanCorrection) -> bool:
-        """Returns whether a survey passes after the correction of its metrics."""
         if correction is NO_CORRECTION:
             return score.passed
         met = (meets_limit(n, correction.apply(n, score.metrics[n]), limit) for n, limit in self.limits.items())
@@ -273,16 +247,15 @@ class CandidateSurveys:
 
 
 def _finite(objective: str, value: float | None) -> float:
-    """Returns the value of an objective, or the penalty in its place."""
     if value is not None and np.isfinite(value):
         return value
     return -_PENALTY if more_is_better(objective) else _PENALTY
 
 
 def median_of(scores: list[SurveyScore], name: str) -> float | None:
-    """Returns the median of a metric over the surveys with status "complete"; None if none has a value.
+    """Returns the median of a metric over the complete surveys; None if none has a value.
 
-    A missing LE90 over the asked area counts as infinite, because the map then has too many holes.
+    A missing value counts as infinite for a metric of `INFINITE_WITH_HOLES`.
     """
     complete = [score.metrics[name] for score in scores if score.status == "complete"]
     known = [np.inf if value is None and name in INFINITE_WITH_HOLES else value for value in complete]
@@ -311,7 +284,7 @@ def pareto_front(candidates: list[Candidate], config: TuningConfig) -> list[Cand
 
 
 def non_dominated(candidates: list[Candidate], config: TuningConfig) -> list[Candidate]:
-    """Returns the candidates that no other candidate dominates, i.e. is better in some objective and worse in none."""
+    """Returns the candidates to which no other is better in some objective and worse in none."""
     costs = costs_of(candidates, config)
     dominated = [((costs <= own).all(axis=1) & (costs < own).any(axis=1)).any() for own in costs]
     return [candidate for candidate, is_worse in zip(candidates, dominated, strict=True) if not is_worse]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-from twin.judge.require import more_is_better
+from twin.judge.verdict import more_is_better
 from twin.studies.distribution import Distribution
 
 _WIDTH = 0.15  # standard deviation of the kernel, as a fraction of the searched range
@@ -24,13 +24,12 @@ class PlanRatio(NamedTuple):
 
 
 class PlanCorrection(NamedTuple):
-    """Expected ratios rendered / surrogate for one plan: of each metric (`factors`) and of the pass probability."""
+    """Expected ratios rendered / surrogate for one plan: of each metric and of the pass probability."""
 
     factors: dict[str, float]
     pass_factor: float
 
     def apply(self, metric: str, value: float | None) -> float | None:
-        """Returns the corrected value of a metric; None stays None."""
         return None if value is None else value * self.factors.get(metric, 1.0)
 
 
@@ -38,10 +37,9 @@ NO_CORRECTION = PlanCorrection({}, 1.0)
 
 
 def metric_ratio(metric: str, rendered: float | None, surrogate: float | None) -> float:
-    """Returns the ratio rendered / surrogate of a metric, clipped to the range from 1/100 to 100.
+    """Returns the ratio rendered / surrogate of a metric, from 1/100 to 100; 1 unless both are finite and positive.
 
-    If the surrogate's value is None, not finite or not positive, the ratio is 1. Otherwise it is 10 without a finite
-    rendered value, or 1/10 if larger values of the metric are better, and 1 if the rendered value is not positive.
+    Without a finite rendered value alone, it is 10, or 1/10 if larger values of the metric are better.
     """
     if surrogate is None or surrogate <= 0 or not math.isfinite(surrogate):
         return 1.0
@@ -55,11 +53,10 @@ def correction_at(
 ) -> PlanCorrection:
     """Returns the correction of a plan, by kernel regression over the plans that were verified by rendered surveys.
 
-    For each metric, the logarithm of the correction factor is the kernel-weighted mean (Nadaraya 1964, Watson 1964) of
-    the logarithms of the flown plans' ratios and of a prior value of 0, so that the factor tends to 1 far from all
-    flown plans. The pass factor is the same mean of the fractions of completed surveys, with a prior value of 1.
-    The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d and the kernel width w = 0.15; the prior has the
-    weight of a plan at the distance 2 w. Without a flown plan, the correction is `NO_CORRECTION`.
+    For each metric, the logarithm of the factor is the kernel-weighted mean (Nadaraya 1964, Watson 1964) of the
+    logarithms of the flown plans' ratios and of a prior value of 0. The pass factor is the same mean of the fractions
+    of completed surveys, with a prior value of 1. The weights are exp(-d^2 / (2 w^2)), with the `plan_distance` d and
+    the kernel width w; the prior has the weight of a plan at the distance 2 w.
     """
     if not flown:
         return NO_CORRECTION
@@ -74,7 +71,7 @@ def correction_at(
 
 
 def plan_distance(search: dict[str, Distribution], one: dict[str, Any], other: dict[str, Any]) -> float:
-    """Returns the RMS difference of two plans over the searched keys, 0 to 1; see `_difference`."""
+    """Returns the RMS over the searched keys of `_difference`, 0 to 1."""
     squares = [_difference(distribution, one[key], other[key]) ** 2 for key, distribution in search.items()]
     return math.sqrt(sum(squares) / len(squares))
 

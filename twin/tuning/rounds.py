@@ -29,8 +29,6 @@ from twin.tuning.verification import Verification, duration, expected_time, veri
 
 
 class TuningResult(NamedTuple):
-    """Result of a search."""
-
     study: Study
     #: all plans evaluated in the search; the surrogate's results are corrected by the rendered surveys, if any were
     #: flown
@@ -50,7 +48,6 @@ class TuningResult(NamedTuple):
 
     @property
     def recommended_verification(self) -> Verification | None:
-        """Returns the verification of the recommended plan; None if it was not verified or there is no plan."""
         chosen = self.recommended
         return next((v for v in self.verifications if chosen and v.surrogate.number == chosen.number), None)
 
@@ -58,15 +55,10 @@ class TuningResult(NamedTuple):
 def tune(study: Study, folder: Path, resume: bool, fleet: Fleet) -> TuningResult:
     """Searches for the best plan as specified in `[tune]`, and writes results.parquet. Ctrl-C ends the search early.
 
-    Args:
-        resume: continue the search whose results are in the folder; surveys with a result are not flown again.
-
-    Raises:
-        TwinError: the study has no section [tune]; the folder is not empty and `resume` is not set, is written by
-            another process, cannot be written, or belongs to another search or scenario; or the engine lost its
-            connection.
-        ScenarioError: the scenario is invalid at a bound of the search, or in all samples; nothing was flown.
-        OSError: the results cannot be written.
+    Raises TwinError if there is no section [tune], the folder is not empty and `resume` is not set, is written by
+    another process, cannot be written, or belongs to another search or scenario, or the engine lost its connection;
+    ScenarioError, before any flight, if the scenario is invalid at a bound or in all samples; OSError if results cannot
+    be written.
     """
     CandidateSurveys(study, folder, ()).check_bounds()
     with open_folder(folder, resume, search=True) as log:
@@ -100,7 +92,7 @@ class Tuning:
 
         Each round evaluates candidates, confirms the cheapest plans with new seeds, and flies their rendered surveys.
         The first round is the only one if no plan was verified in it. After a plan has passed, cheaper plans that the
-        surrogate rejects are verified. Ctrl-C raises KeyboardInterrupt; the results until then are logged.
+        surrogate rejects are verified.
         """
         search_round = 0
         for search_round in range(1 + self.config.rounds):
@@ -119,7 +111,7 @@ class Tuning:
         return next(iter(pareto_front(passed, self.config)), None)
 
     def result(self, interrupted: bool) -> TuningResult:
-        """Returns the result of the search; an interrupted search recommends no plan."""
+        """Returns the result; an interrupted search recommends no plan."""
         recommended = None if interrupted else self.recommended
         return TuningResult(
             self.study,
@@ -135,7 +127,6 @@ class Tuning:
         )
 
     def _fly(self, surveys: CandidateSurveys, plans: dict[int, Values]) -> None:
-        """Flies those surveys of the given plans that have no result yet."""
 
         def add_row(row: Row) -> None:
             self.log.add(row)
@@ -147,7 +138,6 @@ class Tuning:
             raise KeyboardInterrupt
 
     def _search(self, search_round: int) -> None:
-        """Evaluates the candidates of a round; the sampler starts from the corrected results of the earlier rounds."""
         search = Search(self.study, self.config, self.folder, self.trials.original.fingerprint(), search_round)
         if search_round:
             search.add_earlier_candidates((c.values, c.objectives, c.shortfall) for c in self._candidates())
@@ -198,7 +188,7 @@ class Tuning:
         return min(untried, key=lambda plan: (plan.shortfall, -cost(plan)), default=None)
 
     def _verify(self, plan: Candidate, most_plans: int, search_round: int) -> None:
-        """Announces and flies the rendered surveys of a plan, and compares them with its surrogate surveys."""
+        """Announces and flies the rendered surveys of a plan, and keeps its verification."""
         progress, values = self.fleet.progress, {plan.number: plan.values}
         if n_missing := sum(1 for _ in self.rendered.missing(values)):
             survey_s, source = expected_time(self.trials, self.rendered, plan, self.log.rows())
@@ -214,10 +204,7 @@ class Tuning:
         progress.print_line(found.notice())
 
     def _cheapest_confirmed(self) -> Candidate | None:
-        """Returns the cheapest plan of the Pareto front that reaches the required pass probability with new seeds.
-
-        Bisects the front, because a more expensive plan usually has a higher pass probability. None if none is found.
-        """
+        """Returns the cheapest confirmed plan of the front, if any; bisects it, as costlier plans usually pass more."""
         front, found = pareto_front(self._candidates(), self.config), None
         first, end = 0, len(front)
         while first < end:
@@ -230,18 +217,17 @@ class Tuning:
         return found
 
     def _confirm(self, plan: Candidate) -> Candidate:
-        """Flies a plan with new samples and seeds, adds it to the finalists, and returns its corrected evaluation."""
+        """Flies a plan with new samples and seeds as a finalist, and returns its corrected evaluation."""
         number, values = plan.number, plan.values
         self._fly(self.confirmation, {number: values})
         self.finalists[number] = self.confirmation.evaluate(number, values)
         return self._evaluate(self.confirmation, number, values)
 
     def _candidates(self) -> list[Candidate]:
-        """Returns all candidates evaluated so far, corrected by the rendered surveys."""
         return [self._evaluate(self.trials, number, values) for number, values in self.plans.items()]
 
     def _evaluate(self, surveys: CandidateSurveys, number: int, values: Values) -> Candidate:
-        """Returns a plan's evaluation, with the surrogate's results corrected by the rendered surveys of all plans."""
+        """Returns a plan's evaluation, corrected by the rendered surveys of all plans."""
         correction = correction_at(self.config.search, [v.ratio for v in self.verifications.values()], values)
         candidate = surveys.evaluate(number, values, correction)
         if (verification := self.verifications.get(number)) is None:

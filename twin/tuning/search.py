@@ -15,8 +15,7 @@ from optuna.storages.journal import JournalFileBackend
 from optuna.trial import FrozenTrial, Trial, TrialState, create_trial
 
 from twin.errors import TwinError
-from twin.judge.require import more_is_better
-from twin.studies.distribution import Distribution
+from twin.judge.verdict import more_is_better
 from twin.studies.results_log import JOURNAL_FILE
 from twin.studies.study_file import Study, TuningConfig
 
@@ -29,16 +28,9 @@ _EXTENDABLE = {"trials", "confirm", "verify", "plans", "rounds", "keep", "timeou
 class Search:
     """Search for the best plans; stores its trials in `optuna.journal`, which other programs can read while it runs.
 
-    A search that is stored in the folder is continued.
-
-    Args:
-        config: section [tune] of the study.
-        fingerprint: hash of the scenario with the original plan.
-        search_round: round of the search, from 0; a further round begins with the candidates given to
-            `add_earlier_candidates`.
-
-    Raises:
-        TwinError: the journal in the folder belongs to another search, or the scenario file was changed.
+    A search that is stored in the folder is continued. `fingerprint` is the hash of the scenario with the original
+    plan. A further round, from 1, begins with the candidates given to `add_earlier_candidates`. Raises TwinError if the
+    journal belongs to another search, or the scenario file was changed.
     """
 
     def __init__(self, study: Study, config: TuningConfig, folder: Path, fingerprint: str, search_round: int = 0):
@@ -46,7 +38,12 @@ class Search:
         self.config, self.seed, self.first_number = config, study.sampling.seed, search_round * ROUND_NUMBERS
         further = max(min(config.batch, config.trials), config.trials // 4)  # candidates of a further round
         self.n_trials = further if search_round else config.trials
-        self.space = {key: _optuna_distribution(distribution) for key, distribution in config.search.items()}
+        self.space: dict[str, BaseDistribution] = {
+            key: CategoricalDistribution(law.values)
+            if law.kind == "choice"
+            else FloatDistribution(*law.values, log=law.kind == "log_uniform")
+            for key, law in config.search.items()
+        }
         self.optuna_study = optuna.create_study(
             storage=JournalStorage(JournalFileBackend(str(folder / JOURNAL_FILE))),
             study_name=f"{NAME}-round-{search_round}" if search_round else NAME,
@@ -64,14 +61,10 @@ class Search:
         self.optuna_study.set_user_attr("scenario", fingerprint)
 
     def add_earlier_candidates(self, candidates: Iterable[tuple[dict[str, Any], Sequence[float], float]]) -> None:
-        """Adds the candidates of earlier rounds, whose results the sampler uses from the first batch of this round.
+        """Adds (values of the searched keys, objectives, shortfall) of the candidates of earlier rounds.
 
         Does nothing once this round has candidates of its own. If an interrupted search added some of the candidates,
-        adds the others.
-
-        Args:
-            candidates: (values of the searched keys, objectives, shortfall) of each candidate, in the same order at
-                every call.
+        which have the same order at every call, adds the others.
         """
         known = self._trials()
         if any(_EARLIER not in trial.user_attrs for trial in known):
@@ -89,8 +82,8 @@ class Search:
     def next_batch(self) -> dict[int, Trial]:
         """Returns the candidates to evaluate next, by number; none after the last trial of this round.
 
-        If an interrupted search left unfinished candidates, returns these, otherwise a new batch. A batch depends only
-        on the earlier trials and the seed of the study, not on the number of workers or on interruptions.
+        They are those that an interrupted search left unfinished, or a new batch, which depends only on the earlier
+        trials and the seed of the study.
         """
         known = self._trials()
         batch = [Trial(self.optuna_study, trial._trial_id) for trial in known if trial.state == TrialState.RUNNING]
@@ -112,9 +105,3 @@ class Search:
 
     def _trials(self) -> list[FrozenTrial]:
         return self.optuna_study.get_trials(deepcopy=False)
-
-
-def _optuna_distribution(distribution: Distribution) -> BaseDistribution:
-    if distribution.kind == "choice":
-        return CategoricalDistribution(distribution.values)
-    return FloatDistribution(*distribution.values, log=distribution.kind == "log_uniform")

@@ -14,13 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from twin.core.user_files import read_text
-from twin.report.figures import log_axis, to_data_uri
 from twin.report.html import render_page
+from twin.report.number_formats import percent, plain
+from twin.report.plotting import log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
-from twin.report.wording import percent, plain
 from twin.scenario.file import dump_toml
-from twin.studies import wording
-from twin.studies.figures import axis_label, make_panels, metric_axis, value_axis
+from twin.studies import sentences
+from twin.studies.sentences import metric_name, metric_value
+from twin.studies.study_figures import axis_label, make_panels, metric_axis, value_axis
 from twin.tuning.candidates import Candidate, pareto_front, required_probability, tuning_config
 from twin.tuning.rounds import TuningResult
 from twin.tuning.verification import Verification
@@ -49,7 +50,7 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
         "config": result.study.tune,
         "result": result,
         "front": front,
-        "wording": wording,
+        "sentences": sentences,
         "headline": headline(result),
         "warnings": warnings(result),
         "figures": figures,
@@ -70,27 +71,24 @@ def headline(result: TuningResult) -> str:
     if (chosen := result.recommended) is None:
         return f"No plan is recommended: {_missing_plan(result, count)}"
     plan = "Recommended plan: " + ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
-    passing = f"pass probability with new seeds {wording.confidence(chosen.pass_probability)}"
+    passing = f"pass probability with new seeds {sentences.confidence(chosen.pass_probability)}"
     if (verification := result.recommended_verification) is None:
         named = (*zip(tuning_config(result.study).objectives, chosen.objectives, strict=True), *chosen.completeness)
-        objectives = ", ".join(
-            f"{wording.metric_name(n)} {wording.metric_value(n, v)}" for n, v in named if n != "risk"
-        )
+        objectives = ", ".join(f"{metric_name(n)} {metric_value(n, v)}" for n, v in named if n != "risk")
         unverified = f" {NOT_VERIFIED}" if result.needs_rendering else ""
         return f"{plan}. Medians: {objectives}; {passing}. {count}.{unverified}"
     medians = ", ".join(
-        f"{wording.metric_name(name)} {wording.metric_value(name, rendered)} ({wording.metric_value(name, surrogate)})"
+        f"{metric_name(name)} {metric_value(name, rendered)} ({metric_value(name, surrogate)})"
         for name, (surrogate, rendered) in verification.medians.items()
     )
     return (
         f"{plan}. {verification.n_passed} of {verification.surveys} rendered surveys were completed and met every "
-        f"requirement ({wording.confidence(verification.rendered.pass_probability)}). Medians "
+        f"requirement ({sentences.confidence(verification.rendered.pass_probability)}). Medians "
         f"rendered (surrogate): {medians}; by the surrogate, {passing}. {count}."
     )
 
 
 def _missing_plan(result: TuningResult, count: str) -> str:
-    """Returns the reason why no plan is recommended, as text that follows a colon."""
     if result.interrupted:
         return f"{count}, and the search was interrupted before a plan was confirmed."
     if not result.verifications:
@@ -106,7 +104,7 @@ def _missing_plan(result: TuningResult, count: str) -> str:
 
 
 def warnings(result: TuningResult) -> list[str]:
-    """Returns warnings on a plan that was not verified, on errors of the surrogate, refused plans, and of surveys."""
+    """Returns warnings on a plan that was not verified, errors of the surrogate, refused plans, and of surveys."""
     chosen = result.recommended_verification
     texts = [NOT_VERIFIED] if result.recommended and result.needs_rendering and chosen is None else []
     for verification in [chosen] if chosen else result.verifications:
@@ -123,15 +121,14 @@ def _surrogate_errors(verification: Verification) -> Iterator[str]:
     """Yields a sentence for each metric whose medians differ much between surrogate and rendered surveys."""
     for name, ratio in verification.ratio.ratios.items():
         if not 1 / _LARGE_RATIO <= ratio <= _LARGE_RATIO:
-            surrogate, rendered = (wording.metric_value(name, value) for value in verification.medians[name])
+            surrogate, rendered = (metric_value(name, value) for value in verification.medians[name])
             yield (
-                f"Plan {verification.surrogate.number}: the surrogate is wrong about the {wording.metric_name(name)}: "
+                f"Plan {verification.surrogate.number}: the surrogate is wrong about the {metric_name(name)}: "
                 f"{surrogate} expected, {rendered} in rendered surveys."
             )
 
 
 def summary(result: TuningResult) -> dict[str, Any]:
-    """Returns the summary that `--json` prints: candidates, the recommended plan, verifications and warnings."""
     chosen, verification, names = result.recommended, result.recommended_verification, tuning_config(result.study)
     recommended = chosen and {
         "values": chosen.values,
@@ -152,7 +149,6 @@ def summary(result: TuningResult) -> dict[str, Any]:
 
 
 def _rendered(verification: Verification) -> dict[str, Any]:
-    """Returns a verification as JSON values: verdict, numbers of rendered surveys, plan, and medians with ratios."""
     return {
         "plan": verification.surrogate.number,
         "round": verification.search_round,
@@ -167,10 +163,7 @@ def _rendered(verification: Verification) -> dict[str, Any]:
 
 
 def recommended_toml(result: TuningResult) -> str:
-    """Returns the recommended plan as the text of a scenario file with rendered images; "" if there is none.
-
-    Comments at the start contain the headline and the warnings.
-    """
+    """Returns the recommended plan, if any, as a scenario file with headline and warnings in comments at the start."""
     if result.scenario is None:
         return ""
     imaging = result.scenario.imaging.model_copy(update={"fidelity": "rendered"})
@@ -181,7 +174,6 @@ def recommended_toml(result: TuningResult) -> str:
 
 
 def _groups(shown: list[Candidate], front: list[Candidate], result: TuningResult) -> Groups:
-    """Returns each group of candidates with its plot style: infeasible, feasible, Pareto-optimal, recommended."""
     chosen = result.recommended
     star = {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": "recommended"}
     return [
@@ -218,7 +210,6 @@ def _trade_off_figure(groups: Groups, result: TuningResult) -> Figure:
 
 
 def _searched_keys_figure(groups: Groups, result: TuningResult) -> Figure:
-    """Returns a scatter plot of each objective against each searched key."""
     config = tuning_config(result.study)
     cells = [(k, key) for k in range(len(config.objectives)) for key in config.search]
     figure, panels = make_panels(len(cells), columns=min(len(config.search), 4))
@@ -233,7 +224,6 @@ def _searched_keys_figure(groups: Groups, result: TuningResult) -> Figure:
 
 
 def _format_axis(axis: Any, objective: str) -> None:
-    """Labels an axis with an objective and formats its tick labels in the unit of the objective."""
     metric_axis(axis, objective)
     if axis.get_scale() == "linear":
         axis.set_major_locator(MaxNLocator(4))  # few ticks, as their labels are long

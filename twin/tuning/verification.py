@@ -16,8 +16,6 @@ _MEGAPIXEL_S = 0.2  # part per megapixel of one camera's image [s]
 
 
 class Verification(NamedTuple):
-    """Comparison of a plan's rendered surveys with its surrogate surveys."""
-
     surrogate: Candidate  #: the plan, evaluated by surrogate surveys with new seeds
     rendered: Candidate  #: the plan, evaluated by its rendered surveys
     surveys: int  #: number of rendered surveys required
@@ -32,11 +30,9 @@ class Verification(NamedTuple):
 
     @property
     def passed(self) -> bool:
-        """Returns whether all rendered surveys were completed and met every requirement."""
         return self.n_passed == self.surveys
 
     def notice(self) -> str:
-        """Returns the result in one line."""
         failed = f", {self.n_failed} failed because of the computer or the program" if self.n_failed else ""
         return f"Plan {self.surrogate.number}: {self.n_passed} of {self.surveys} rendered surveys passed{failed}"
 
@@ -44,7 +40,6 @@ class Verification(NamedTuple):
 def verification_of(
     rendered: CandidateSurveys, confirmation: CandidateSurveys, surrogate: Candidate, search_round: int
 ) -> Verification:
-    """Returns the verification of a plan whose rendered surveys have been flown."""
     number, values = surrogate.number, surrogate.values
     scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
     medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
@@ -68,9 +63,8 @@ def expected_time(
 ) -> tuple[float, str]:
     """Returns the expected run time of a rendered survey of a plan on one CPU core [s], and how it was found.
 
-    It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second. The
-    run time per simulated second is measured in the rendered surveys flown so far; before the first one, it is
-    estimated from the frame rate and the image size.
+    It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second in
+    the rendered surveys flown so far, or before the first one as estimated from frame rate and image size.
     """
     run_s = simulated_s = longest_s = 0.0
     own = set(trials.keys(plan.number, plan.values))
@@ -88,7 +82,6 @@ def expected_time(
 
 
 def duration(time_s: float) -> str:
-    """Returns a duration as text in s, min or h."""
     if time_s < 90:
         return f"{time_s:.0f} s"
     return f"{time_s / 60:.0f} min" if time_s < 5400 else f"{time_s / 3600:.1f} h"

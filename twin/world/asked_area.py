@@ -27,9 +27,8 @@ _LONGITUDE_LATITUDE = "OGC:CRS84"
 def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
     """Returns the area of a survey in the scene.
 
-    Raises:
-        TwinError: keys of the plan contradict each other, the polygon is invalid, or the terrain lacks the coordinates
-            that the plan needs or does not contain the polygon or the centre.
+    Raises TwinError if keys of the plan contradict each other, the polygon is invalid, or the terrain lacks the
+    coordinates that the plan needs or does not contain the polygon or the centre.
     """
     heading = math.radians(plan.heading_deg)
     if plan.polygon is None:
@@ -70,28 +69,19 @@ def _georeference(field: str, terrain: Terrain) -> Georeference:
 
 
 def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
-    """Raises TwinError if one of the points (n, 2) lies outside the terrain."""
     outside = np.isnan(terrain.height_at(*points.T))
     if outside.any():
         x, y = points[outside][0]
-        raise TwinError(field, f"({x:.2f}, {y:.2f}) lies outside the terrain", extent_of(terrain))
-
-
-def extent_of(terrain: Terrain) -> str:
-    """Returns the extent of a terrain as text, for errors."""
-    return f"x {terrain.west_m:.2f} to {terrain.east_m:.2f}, y {terrain.south_m:.2f} to {terrain.north_m:.2f} m"
+        raise TwinError(field, f"({x:.2f}, {y:.2f}) lies outside the terrain", terrain.extent)
 
 
 def read_geojson(file: Path, terrain: Terrain) -> Array:
     """Returns the corners (n, 2) of the polygon in a GeoJSON file, in the scene [m], in the order of the file.
 
-    The coordinates are in the CRS that the member "crs" names. In a file without this member they are longitude and
-    latitude (RFC 7946) if the DEM names its CRS, all of them lie within +-180 and +-90 degrees and, read in the CRS of
-    the DEM, no corner lies on the DEM; otherwise they are in the CRS of the DEM.
-
-    Raises:
-        TwinError: the file does not contain exactly one polygon without holes, its coordinates cannot be transformed,
-            or the terrain has no coordinates.
+    The coordinates are in the CRS of the member "crs". Without it they are longitude and latitude (RFC 7946) if the DEM
+    names its CRS, all lie within +-180 and +-90 degrees and, read in the CRS of the DEM, none lies on the DEM;
+    otherwise they are in the CRS of the DEM. Raises TwinError unless the file contains exactly one polygon without
+    holes, whose coordinates can be transformed, and the terrain has coordinates.
     """
     tree = read_json(file, "plan.polygon", _ONE_POLYGON, _MAX_GEOJSON_BYTES)
     corners = shapely.get_coordinates(_polygon(tree, file).exterior)
@@ -107,7 +97,6 @@ def read_geojson(file: Path, terrain: Terrain) -> Array:
 
 
 def _polygon(tree: Any, file: Path) -> shapely.Polygon:
-    """Returns the only polygon of a GeoJSON object: geometry, feature or feature collection."""
     try:
         parts = shapely.get_parts(shapely.get_parts(shapely.from_geojson(json.dumps(tree))))
     except shapely.errors.ShapelyError:
@@ -120,7 +109,6 @@ def _polygon(tree: Any, file: Path) -> shapely.Polygon:
 
 
 def _named_crs(tree: Any) -> str | None:
-    """Returns the name of the CRS in the member "crs" of a GeoJSON object (GeoJSON 2008); None if there is none."""
     try:
         return str(tree["crs"]["properties"]["name"])
     except (KeyError, TypeError):
@@ -128,14 +116,12 @@ def _named_crs(tree: Any) -> str | None:
 
 
 def _is_longitude_latitude(corners: Array, terrain: Terrain, origin: Georeference) -> bool:
-    """Returns whether corners (n, 2) are taken as longitude and latitude, see `read_geojson`."""
     within = (np.abs(corners) <= [180.0, 90.0]).all()
     x, y = origin.to_scene(*corners.T)
     return bool(within and origin.crs_wkt is not None and np.isnan(terrain.height_at(x, y)).all())
 
 
 def _projected(corners: Array, crs: str, origin: Georeference) -> Array:
-    """Returns corners (n, 2) transformed from the named CRS to that of the DEM."""
     from rasterio.crs import CRS  # imported here: it takes 20 MB, and few plans need it
     from rasterio.errors import RasterioError
     from rasterio.warp import transform

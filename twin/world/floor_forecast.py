@@ -9,14 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, cast_pixels, ray_grid
-from twin.core.image_overlap import RAY_COLUMNS, image_overlap
+from twin.core.height_field import RAY_COLUMNS, HeightField, cast_pixels, image_overlap, ray_grid
 from twin.core.records import MapGrid
-from twin.judge.overlap import KeyframePoses
+from twin.judge.swaths import KeyframePoses, image_pairs
 from twin.terrains import Terrain
 from twin.world.mission import Mission
 from twin.world.observed_cells import Coverage
-from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned
+from twin.world.planning import floor_of, planned_keyframes, thinned
 from twin.world.top_surface import with_objects
 
 #: Approximate number of columns of the binned depth images from which the coverage is computed, and largest number of
@@ -25,7 +24,7 @@ _COVERAGE_COLUMNS, _COVERAGE_CELLS = 80, 1000
 
 
 class Spread(NamedTuple):
-    """Minimum, 5th percentile, median and maximum of a quantity; all are None if it has no finite value."""
+    """Percentiles of a quantity; all are None if it has no finite value."""
 
     minimum: float | None
     p05: float | None
@@ -35,11 +34,7 @@ class Spread(NamedTuple):
 
 @dataclass(frozen=True)
 class FloorForecast:
-    """Forecast for the n planned keyframes over the floor with its objects; NaN where an image shows no floor.
-
-    There are k pairs of consecutive keyframes along the swaths, and j pairs across neighbouring swaths.
-
-    """
+    """Forecast for n planned keyframes, k pairs along and j across swaths; NaN where an image shows no floor."""
 
     surface: Terrain  #: `planned_surface`; "floor" below refers to this surface
     keyframes: KeyframePoses
@@ -58,8 +53,6 @@ class FloorForecast:
 
 
 class PlannedOverlap(NamedTuple):
-    """Median overlap and sidelap of the planned keyframes; None if there is no pair whose first image shows floor."""
-
     along: float | None
     across: float | None
 
@@ -72,17 +65,16 @@ def planned_surface(mission: Mission) -> Terrain:
 
 
 def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedOverlap:
-    """Returns the median overlaps forecast for the planned path, from at most `most_pairs` along and across swaths."""
+    """Returns the median overlaps forecast from at most `most_pairs` along and across swaths; None without one."""
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
-    pairs, field = (thinned(p, most_pairs) for p in planned_pairs(keyframes)), floor_of(planned_surface(mission))
-    return PlannedOverlap(*(spread(overlaps(field, p, mission.rig)).median for p in pairs))
+    pairs, field = (thinned(p, most_pairs) for p in image_pairs(keyframes)), floor_of(planned_surface(mission))
+    return PlannedOverlap(*(spread(image_overlap(field, *p, mission.rig)).median for p in pairs))
 
 
 def forecast_over_floor(mission: Mission) -> FloorForecast:
-    """Returns the forecast of a mission, computed by casting rays from the planned keyframes to floor and objects.
+    """Returns the forecast of a mission, from rays cast from the planned keyframes to floor and objects.
 
-    The cameras look straight down from the planned positions. Lens distortion, the port, calibration errors and the
-    space below overhangs are neglected.
+    Cameras look straight down; distortion, port, calibration errors and space below overhangs are neglected.
     """
     rig, surface = mission.rig, planned_surface(mission)
     field = floor_of(surface)
@@ -92,7 +84,7 @@ def forecast_over_floor(mission: Mission) -> FloorForecast:
     depth[np.isinf(depth)] = np.nan
     median, nearest = _row_statistic(np.nanmedian, depth), _row_statistic(np.nanmin, depth)
     x, y, z = keyframes.position_m.T
-    along, across = planned_pairs(keyframes)
+    along, across = image_pairs(keyframes)
     return FloorForecast(
         surface=surface,
         keyframes=keyframes,
@@ -104,14 +96,13 @@ def forecast_over_floor(mission: Mission) -> FloorForecast:
         stereo_share=image_overlap(field, poses, poses @ rig.left_from_right, rig),
         along_position_m=(along.first[:, :2, 3] + along.second[:, :2, 3]) / 2,
         across_position_m=(across.first[:, :2, 3] + across.second[:, :2, 3]) / 2,
-        overlap_along=overlaps(field, along, rig),
-        overlap_across=overlaps(field, across, rig),
+        overlap_along=image_overlap(field, *along, rig),
+        overlap_across=image_overlap(field, *across, rig),
         coverage=_coverage(mission, field, poses),
     )
 
 
 def spread(values: Array) -> Spread:
-    """Returns minimum, 5th percentile, median and maximum of the finite values."""
     known = values[np.isfinite(values)]
     if len(known) == 0:
         return Spread(None, None, None, None)
@@ -119,7 +110,6 @@ def spread(values: Array) -> Spread:
 
 
 def _row_statistic(statistic, values: Array) -> Array:
-    """Returns a NaN-ignoring statistic of each row of values (n, m); NaN for a row without a finite value."""
     result = np.full(len(values), np.nan)
     known = np.isfinite(values).any(axis=1)
     result[known] = statistic(values[known], axis=1)
@@ -127,7 +117,6 @@ def _row_statistic(statistic, values: Array) -> Array:
 
 
 def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
-    """Returns the share of the asked area on the terrain that both cameras see; 0 without asked cells."""
     small, grid = mission.rig.binned(max(1, mission.rig.width_px // _COVERAGE_COLUMNS)), _grid_of_terrain(mission)
     coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
     shape = small.height_px, small.width_px

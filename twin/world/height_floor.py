@@ -9,12 +9,9 @@ from twin.terrains.ground_cover import DEFAULT_COVERS
 
 
 def load_terrain(scenario: Scenario) -> terrains.Terrain:
-    """Returns the floor of a scenario whose floor is no mesh.
+    """Returns the floor of a scenario whose floor is no mesh; without images, its texture is coarse and not tiled.
 
-    Without images, its texture is coarse and not tiled.
-
-    Raises:
-        TwinError: the floor cannot be generated or read.
+    Raises TwinError if the floor cannot be generated or read.
     """
     t, rendered = scenario.terrain, scenario.imaging.fidelity == "rendered"
     if t.kind == "file":

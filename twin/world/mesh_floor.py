@@ -1,9 +1,8 @@
 """Sea floor that is a mesh, e.g. a photogrammetric model: its tiles, and its surface as seen from above.
 
-The mesh is rendered in tiles. Plan, clearance, placed objects and the surrogate use a height grid of its highest
-surface. The truth of the map is the highest surface at each cell, by a parallel projection of all triangles. Below the
-mesh lies a height grid of its lowest surface that faces up, lowered so that it is seen only through holes of the mesh;
-holes have the height and the colour of the nearest node of the mesh.
+Plan, clearance, placed objects and the surrogate use a height grid of its highest surface; the truth of the map is the
+highest surface at each cell. Below the rendered tiles lies a height grid of the lowest surface that faces up, lowered
+so that it is seen only through holes of the mesh; holes have the height and the colour of the nearest node of the mesh.
 """
 
 from __future__ import annotations
@@ -47,19 +46,13 @@ MARGIN_M = 0.005  #: distance by which the height grid below the mesh is lowered
 
 
 class MeshFloor(NamedTuple):
-    """Sea floor that is a mesh."""
-
     terrain: terrains.Terrain  #: height grid of the highest surface, with its colours as texture
     under: terrains.Terrain  #: height grid below the mesh; it is rendered together with the mesh
     tiles: FloorTiles  #: the mesh, divided into tiles
 
 
 def load_mesh_floor(scenario: Scenario) -> MeshFloor:
-    """Returns the mesh floor of a scenario: reads its mesh and computes the height grids.
-
-    Raises:
-        TwinError: the mesh cannot be read or used as a floor.
-    """
+    """Reads the mesh floor of a scenario and computes its height grids; raises TwinError if it is unusable."""
     t = scenario.terrain
     assert t.mesh_file is not None  # `scenario_checks.floor_contradictions`
     file = Path(t.mesh_file)
@@ -97,7 +90,6 @@ def floor_surface(floor: MeshFloor, grid: MapGrid) -> TopSurface:
 
 
 def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
-    """Returns the mesh with its long edges divided."""
     if not np.isfinite(extent(whole.mesh)).all():
         raise TwinError(FIELD, f"{file.name!r} is too large", _COVERING)
     try:
@@ -109,8 +101,7 @@ def _divided(whole: TexturedMesh, file: Path) -> TexturedMesh:
 def _node_grid(mesh: Mesh, coarsest_m: float, file: Path) -> MapGrid:
     """Returns the grid whose cell centres are the nodes of the height grid, centred at the origin as the mesh is.
 
-    The spacing is the median length of an edge, but at least FINEST_GRID_M and at most `coarsest_m`, or as large as
-    MOST_NODES requires.
+    The spacing is the median edge length, at least FINEST_GRID_M, at most `coarsest_m`, or as MOST_NODES requires.
     """
     low, high = extent(mesh)
     size = (high - low)[:2]
@@ -142,7 +133,6 @@ def _lowest(upward: Mesh, grid: MapGrid) -> Layer:
 
 
 def _nearest(covered: NDArray[np.bool_]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Returns for each node (rows, cols) the row and the column of the nearest covered node."""
     rows, cols = distance_transform_edt(~covered, return_distances=False, return_indices=True)  # pyright: ignore
     return rows, cols
 
@@ -180,7 +170,6 @@ def _texture(drawn: Objects, grid: MapGrid, colours: Image, scenario: Scenario) 
 
 
 def _terrain(height_m: Layer, grid: MapGrid, texture: Image, covered: NDArray[np.bool_]) -> terrains.Terrain:
-    """Returns the terrain with the heights (rows, cols) of the nodes, of which the mesh covers those in `covered`."""
     west_m, south_m = grid.west_m + grid.cell_m / 2, grid.north_m - (grid.rows - 0.5) * grid.cell_m
     heights = np.ascontiguousarray(height_m[::-1], np.float32)
     texel_m = (grid.cols - 1) * grid.cell_m / texture.shape[1]

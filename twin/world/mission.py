@@ -25,26 +25,21 @@ from twin.plugin.guard import check_loadable
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, Source
 from twin.simulate.hull import physics_timestep_s
-from twin.simulate.inertial_sensor import imu_rate_hz
+from twin.simulate.sensors import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
-from twin.world.asked_area import extent_of
 from twin.world.height_floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
 from twin.world.pace import SAME_TIME_S, Pace
-from twin.world.path_checks import check_floor_below, check_lamp, check_objects
-from twin.world.planned_images import planned_references
+from twin.world.path_checks import check_floor_below, check_lamp, check_objects, check_speed, check_thrust
 from twin.world.planning import check_map_size, plan_survey
 from twin.world.scenario_checks import contradictions, floor_contradictions
-from twin.world.thrust_authority import check_speed, check_thrust
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 class Step(NamedTuple):
-    """One planned frame."""
-
     reference: segments.Reference  #: planned position, velocity, yaw and acceleration of the left camera
     keyframe: bool  #: whether the frame is a keyframe
     holding: bool  #: whether the vehicle keeps station
@@ -65,7 +60,6 @@ class FrameSequence:
         return len(self.keyframe)
 
     def first(self, n: int) -> FrameSequence:
-        """Returns the first n frames."""
         reference = segments.Reference(*(np.asarray(part)[:n] for part in self.reference))
         return replace(self, reference=reference, keyframe=self.keyframe[:n], path_times_s=self.path_times_s[:n])
 
@@ -89,11 +83,9 @@ class Mission:
 
     @property
     def rendered_terrain(self) -> terrains.Terrain:
-        """Returns the height grid that is rendered: the sea floor, or the height grid below a mesh floor."""
         return self.terrain if self.mesh_floor is None else self.mesh_floor.under
 
     def rendered_objects(self) -> Objects | None:
-        """Returns the objects and the tiles of a mesh floor that are rendered; None if there are none."""
         if not self.objects and self.mesh_floor is None:
             return None
         tiles = None if self.mesh_floor is None else self.mesh_floor.tiles
@@ -107,7 +99,6 @@ class Mission:
 
     @property
     def start_of_body(self) -> Array:
-        """Returns world_from_body (4, 4) at the start of the survey."""
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
     def asked(self, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
@@ -116,11 +107,9 @@ class Mission:
 
     @property
     def tracks(self) -> range:
-        """Returns the numbers of the tracks, from 1."""
         return range(1, self.plan.n_tracks + 1)
 
     def planned_frames(self, track: int) -> FrameSequence:
-        """Returns the planned frames of a track, without the station keeping after it."""
         times_s, keyframes = self.plan.frames_of_track(track)
         return FrameSequence(self.plan.references(track, times_s), keyframes, False, times_s, track)
 
@@ -136,30 +125,26 @@ class Mission:
         Every planned keyframe is flown, at the first frame at or after its path time.
         """
         planned_s, planned_keyframes = self.plan.frames_of_track(track)
-        times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.frame_rate_hz)
+        times_s = pace.path_times(path_time_s, float(planned_s[-1]), 1 / self.plan.request.frame_rate_hz)
         reference = pace.scaled(self.plan.references(track, times_s))
         passed = np.searchsorted(planned_s[planned_keyframes], np.append(path_time_s, times_s) + SAME_TIME_S, "right")
         return FrameSequence(reference, (np.diff(passed) > 0) | pace.keyframe, False, times_s, track, pace.rate)
 
     @property
     def _n_holding(self) -> int:
-        """Returns the number of frames of half the station keeping after a track."""
-        return max(1, round(self.scenario.control.hold_s / 2 * self.plan.frame_rate_hz))
+        return max(1, round(self.scenario.control.hold_s / 2 * self.plan.request.frame_rate_hz))
 
     @property
     def n_frames(self) -> int:
-        """Returns the number of frames of the whole survey at the planned speed, including station keeping."""
+        """Returns the number of frames at the planned speed, including station keeping."""
         return sum(len(self.plan.frames_of_track(t)[0]) + 2 * self._n_holding for t in self.tracks)
 
 
 class _Errors:
-    """Errors of a scenario, each with the place that caused it."""
-
     def __init__(self, source: Source):
         self.source, self.lines = source, list[str]()
 
     def attempt(self, build: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T | None:
-        """Returns the result of `build`; None if it raises TwinError, which is added."""
         try:
             return build(*args, **kwargs)
         except TwinError as error:
@@ -168,11 +153,7 @@ class _Errors:
 
 
 def prepare(scenario: Scenario) -> Mission:
-    """Returns the mission of a scenario: loads its floor and objects, plans the survey, and checks all of them.
-
-    Raises:
-        ScenarioError: the survey cannot be flown; the error lists every reason.
-    """
+    """Returns the mission of a scenario, planned and checked; raises ScenarioError, with every reason, if invalid."""
     errors = _Errors(scenario.source)
     faults = list(floor_contradictions(scenario.terrain))
     terrain, mesh_floor = (None if faults else errors.attempt(_load_floor, scenario)) or (None, None)
@@ -196,7 +177,6 @@ def prepare(scenario: Scenario) -> Mission:
 
 
 def _load_floor(scenario: Scenario) -> tuple[terrains.Terrain, MeshFloor | None]:
-    """Returns the floor of a scenario as a height grid, and the mesh if the floor is one."""
     if scenario.terrain.kind != "mesh":
         return load_terrain(scenario), None
     mesh_floor = load_mesh_floor(scenario)
@@ -204,7 +184,7 @@ def _load_floor(scenario: Scenario) -> tuple[terrains.Terrain, MeshFloor | None]
 
 
 def _check_equipment(scenario: Scenario, errors: _Errors) -> tuple[TrueCameras | None, Illumination | None]:
-    """Returns the cameras and the light of a scenario, and adds the errors of these, of plug-ins and of limits."""
+    """Returns the cameras and the light of a scenario, and adds their errors and those of plug-ins and limits."""
     errors.attempt(check_loadable, "control.plugin", CONTROLLERS, scenario.control.plugin)
     errors.attempt(check_loadable, "estimate.plugin", ESTIMATORS, scenario.estimate.plugin)
     if scenario.imu is not None:
@@ -227,11 +207,10 @@ def motion_rate_hz(scenario: Scenario) -> float:
 
 
 def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:
-    """Raises TwinError if a beacon lies outside the terrain or below the floor."""
     x, y, z = beacon.position_m
     field, floor_m = f"beacons.{number}.position_m", float(terrain.height_at(x, y))
     if np.isnan(floor_m):
-        raise TwinError(field, f"({x:g}, {y:g}) lies outside the terrain", extent_of(terrain))
+        raise TwinError(field, f"({x:g}, {y:g}) lies outside the terrain", terrain.extent)
     if z < floor_m:
         raise TwinError(field, f"z {z:g} is below the floor", f"above {floor_m:.3f} m")
 
@@ -239,7 +218,6 @@ def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) 
 def _check_path(
     scenario: Scenario, terrain: terrains.Terrain, plan: SurveyPlan, objects: tuple[PlacedObject, ...], errors: _Errors
 ) -> None:
-    """Adds the errors of the planned path over the floor."""
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
     errors.attempt(check_thrust, scenario.vehicle, scenario.current.velocity_mps, plan)
@@ -250,8 +228,8 @@ def _check_path(
 
 def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
     """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
-    highest_m = plan.altitude_m if plan.surface is None else planned_references(plan).position[:, 2].max()
-    widest = max(1.0, float(highest_m - terrain.lowest_m) / plan.altitude_m)
+    highest_m = plan.request.altitude_m if plan.request.surface is None else plan.all_references().position[:, 2].max()
+    widest = max(1.0, float(highest_m - terrain.lowest_m) / plan.request.altitude_m)
     corners, margin = plan.outline()[:, :2], np.array(_half_extent_m(plan)) * widest + 0.5
     west, south = np.floor((corners.min(axis=0) - margin) / cell_m) * cell_m
     east, north = np.ceil((corners.max(axis=0) + margin) / cell_m) * cell_m
@@ -262,7 +240,7 @@ def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid
 
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
     """Returns half the greatest extent of a footprint on the reference plane along x and y [m]."""
-    across_m, along_m = plan.footprint_m
+    across_m, along_m = plan.request.footprint_m
     if plan.turns_on_the_spot:
         diagonal_m = float(np.hypot(along_m, across_m))
         return diagonal_m / 2, diagonal_m / 2

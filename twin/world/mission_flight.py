@@ -16,7 +16,6 @@ class Flight:
     """Flight of a mission through its world: all tracks, with station keeping after each of them.
 
     Args:
-        world: simulates the vehicle and returns the frames; nothing has been flown in it before.
         fast_forward: simulates frames between keyframes quickly (`World.fast_forward`); None: every frame is returned.
 
     Attributes:
@@ -32,21 +31,17 @@ class Flight:
 
     @property
     def track(self) -> int:
-        """Returns the number of the track of the current frame, from 1."""
         return self._sequence.track
 
     @property
     def reference(self) -> Reference:
-        """Returns the plan of the left camera at the current frame."""
         return self._step.reference
 
     @property
     def holding(self) -> bool:
-        """Returns whether the vehicle keeps station at the current frame."""
         return self._step.holding
 
     def start(self) -> Frame:
-        """Returns the first frame."""
         self._enter(*next(self._parts))
         return self._observe()
 

@@ -28,8 +28,7 @@ Attempt = Callable[[Callable[[], object]], object]
 def load_objects(scenario: Scenario, terrain: terrains.Terrain, attempt: Attempt) -> tuple[PlacedObject, ...]:
     """Returns the objects of a scenario; objects with equal shapes share one model.
 
-    Args:
-        attempt: calls a function and collects its TwinError, see `mission.prepare`; entries with errors are left out.
+    `attempt` calls a function and collects its TwinError, see `mission.prepare`; entries with errors are left out.
     """
     models: dict[str, tuple[ObjectModel, ...]] = {}
     found: list[PlacedObject] = []
@@ -44,7 +43,7 @@ def _entry(
     number: int, config: ObjectConfig, models: dict[str, tuple[ObjectModel, ...]], found: list[PlacedObject],
     world: tuple[terrains.Terrain, int],
 ) -> list[PlacedObject]:  # fmt: skip
-    """Returns the objects of one entry of `[[objects]]` and adds its models to `models` if they are not there yet."""
+    """Returns the objects of one entry of `[[objects]]` and adds its models to `models`."""
     _check_keys(f"objects.{number}", config)
     terrain, seed = world
     variant = None if config.position_m is None or config.shape == "mesh" else number % SHAPES[config.shape].variants
@@ -80,12 +79,10 @@ def _models(number: int, config: ObjectConfig, seed: int, variant: int | None) -
 
 
 def _pipe_width(config: ObjectConfig) -> float:
-    """Returns the width of a pipe as a fraction of its length; 0 if it is not given."""
     return (config.width_m or 0.0) / (config.size_m or SHAPE_SIZE_M)
 
 
 def _check_keys(path: str, config: ObjectConfig) -> None:
-    """Raises TwinError for keys that are missing or have no effect on the object, and for a pipe wider than long."""
     if config.shape == "mesh" and config.mesh_file is None:
         raise TwinError(f"{path}.mesh_file", "missing", 'a mesh, as shape is "mesh"')
     if (config.position_m is None) == (config.per_m2 is None):

@@ -19,12 +19,9 @@ class Coverage:
     """Observed cells of a grid.
 
     A cell is observed if its centre lies within the quad between the floor points of four neighbouring pixels of the
-    left image, both cameras see these points, and there is no depth edge between them. With `top_m`, the quad must not
-    lie more than the side of a cell below that surface, as the map has the height of overhangs.
-
-    Args:
-        rig: calibration of the cameras of the depth images.
-        top_m: (rows, cols) true height of the surface seen from above [m]; None: the floor has no overhangs.
+    left image, both cameras see these points, and there is no depth edge between them. With `top_m` (rows, cols), the
+    true height of the surface seen from above [m], the quad must not lie more than the side of a cell below it;
+    without, there are no overhangs.
 
     Attributes:
         seen: (rows, cols) bool, whether each cell was observed; modified in place by `add`.
@@ -35,12 +32,7 @@ class Coverage:
         self.seen = np.zeros((grid.rows, grid.cols), dtype=np.bool_)
 
     def add(self, world_from_left: Array, depth_left: NDArray[np.float32], depth_right: NDArray[np.float32]) -> None:
-        """Marks the cells that are observed in a keyframe.
-
-        Args:
-            world_from_left: (4, 4) true pose of the left camera.
-            depth_left, depth_right: (height, width) true depth along the optical axis [m].
-        """
+        """Marks the cells that are observed in a keyframe, from true depths (h, w) along the optical axis [m]."""
         grid, rig = self.grid, self.rig
         camera = (rig.focal_px, rig.cx_px, rig.cy_px, rig.baseline_m)
         raster = (grid.west_m, grid.north_m, grid.cell_m)
@@ -51,10 +43,7 @@ class Coverage:
 
 @kernel
 def _mark_seen(seen, raster, pose, camera, left, right, top):
-    """Compiled kernel of `Coverage.add`: projects the floor points of two neighbouring image rows at a time.
-
-    The compiler removes the code of a surface `top` if it is None.
-    """
+    """Projects the floor points of two neighbouring image rows at a time; `top` None removes its code."""
     height, width = left.shape
     col, row, up = np.zeros((2, width)), np.zeros((2, width)), np.zeros((2, width))
     visible = np.zeros((2, width), dtype=np.bool_)
@@ -103,7 +92,6 @@ def _floor_point(u, v, z, pose, camera, raster):
 
 @kernel
 def _is_surface(left, u, v):
-    """Returns whether the four pixels from (u, v) to (u + 1, v + 1) show one surface, without an occluding edge."""
     a, b, c, d = left[v, u], left[v, u + 1], left[v + 1, u], left[v + 1, u + 1]
     low, high = min(min(a, b), min(c, d)), max(max(a, b), max(c, d))
     return high - low <= EDGE_SHARE * low
@@ -113,7 +101,7 @@ def _is_surface(left, u, v):
 def _mark_triangle(seen, top, slack, a, b, c):
     """Marks the cells whose centre lies inside or on the edge of a triangle with corners (column, row, height).
 
-    With `top`, only where the triangle is at most `slack` [m] below it; a triangle without area then marks no cell.
+    With `top`, only where it is at most `slack` [m] below it; a triangle without area then marks no cell.
     """
     row0, col0 = max(0, int(np.ceil(min(a[1], b[1], c[1])))), max(0, int(np.ceil(min(a[0], b[0], c[0]))))
     row1 = min(seen.shape[0] - 1, int(np.floor(max(a[1], b[1], c[1]))))

@@ -12,7 +12,6 @@ from twin.world.mission import Mission
 
 
 def floor_of(mission: Mission) -> FloorField:
-    """Returns the floor of a mission; of a mesh floor, its highest surface."""
     floor = mission.terrain
     return floor_field(floor.height_m, floor.spacing_m, floor.west_m, floor.south_m)
 
@@ -40,7 +39,6 @@ class Obstacles:
         return ""
 
     def _near(self, world_from_body: Array) -> NDArray[np.intp]:
-        """Returns the numbers of the objects whose bounding sphere meets that of the hull."""
         centre_m = geometry.transform(world_from_body, CENTRE_M[None])[0]
         reach_m = self._radii_m + np.linalg.norm(HALF_M)
         return np.flatnonzero(((self._centres_m - centre_m) ** 2).sum(axis=1) < reach_m**2)

@@ -20,13 +20,9 @@ class Pace(NamedTuple):
     keyframe: bool = False  #: whether the next frame is a keyframe in addition to the planned ones
 
     def path_times(self, last_s: float, end_s: float, interval_s: float) -> Array:
-        """Returns the path times (n,) of the next frames [s]: one or, at full pace, all to the end of the track.
+        """Returns the path times (n,) of the next frames [s]: one or, at full pace, all to the last, `end_s`.
 
-        There are none if the last frame of the track has been flown.
-
-        Args:
-            last_s: path time of the last frame flown.
-            end_s: path time of the last frame of the track, which is always flown.
+        Empty if the frame at `last_s`, the last one flown, is the last of the track.
         """
         n_full = int(np.ceil((end_s - last_s - SAME_TIME_S) / interval_s))
         n = min(n_full, 1) if self != FULL else n_full
@@ -40,5 +36,4 @@ class Pace(NamedTuple):
         )
 
 
-#: The planned speed.
 FULL = Pace()

@@ -1,28 +1,33 @@
-"""Checks of the planned path: it stays over the floor, and cameras and lamps stay above the floor and the objects."""
+"""Checks of the planned path: over the floor, clear of floor and objects, within the thrust of the vehicle."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter
+from scipy.optimize import root_scalar
 
 from twin.controllers.forecast import Clearance, least_clearance
 from twin.controllers.survey_plan import SurveyPlan
 from twin.controllers.tracking import rotate_lever_arm
 from twin.core.geometry import Array
 from twin.errors import TwinError
-from twin.scenario.model import PlanConfig
+from twin.scenario.model import PlanConfig, VehicleConfig
+from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.objects.scattering import disc_of
-from twin.world.planned_images import planned_references
 
 VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest point of the vehicle, rounded up
 #: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
 #: number of these points; on longer paths they are farther apart.
 LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
+#: Share of the greatest vertical speed at which a path over the floor may climb; the rest is for the controller.
+_CLIMB_SHARE = 0.5
+#: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.
+_MAX_SLOPE = 0.6
 
 
 def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> None:
@@ -50,18 +55,15 @@ def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> 
 
 
 def _clearance(plan: SurveyPlan, terrain: Terrain) -> Clearance:
-    """Returns the least clearance of the planned path: height of the camera above the highest floor in its footprint.
-
-    For a path that follows the floor, the position in the result is that of the camera.
-    """
-    if plan.surface is None:
+    """Returns the least clearance of the planned path; if it follows the floor, the position is that of the camera."""
+    if plan.request.surface is None:
         return least_clearance(plan, terrain.height_at)
-    across_m, along_m = plan.footprint_m
+    across_m, along_m = plan.request.footprint_m
     turned = plan.area.heading != 0 or plan.turns_on_the_spot
     footprint_m = (np.hypot(across_m, along_m),) * 2 if turned else (across_m, along_m)  # along y and x
     sides = [2 * round(side / 2 / terrain.spacing_m) + 1 for side in footprint_m]
     nearby = np.asarray(maximum_filter(terrain.height_m, sides, mode="nearest"))
-    x, y, z = planned_references(plan).position.T
+    x, y, z = plan.all_references().position.T
     inside = bool(np.isfinite(terrain.height_at(x, y)).all())
     rows, cols = _nodes(terrain, x, y)
     gap = z - nearby[np.clip(rows, 0, nearby.shape[0] - 1), np.clip(cols, 0, nearby.shape[1] - 1)]
@@ -76,16 +78,13 @@ def _nodes(terrain: Terrain, x: Array, y: Array) -> tuple[NDArray[np.intp], NDAr
 
 
 def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if the path leads over floor without a height, farther from the next height than an image shows.
-
-    There is nothing to plan a height or a clearance from. Smaller holes are flown over, but not judged.
-    """
+    """Raises TwinError if the path is over a hole, farther from the next height than an image shows."""
     if terrain.known is None:
         return
-    x, y, _ = planned_references(plan).position.T
+    x, y, _ = plan.all_references().position.T
     away_m = np.asarray(distance_transform_edt(~terrain.known)) * terrain.spacing_m
     away_m = away_m[_nodes(terrain, x, y)]
-    k, limit_m = int(away_m.argmax()), min(plan.footprint_m) / 2
+    k, limit_m = int(away_m.argmax()), min(plan.request.footprint_m) / 2
     if away_m[k] > limit_m:
         raise TwinError(
             field, f"the path leads over floor without a height, up to {away_m[k]:.2f} m from the next height"
@@ -97,10 +96,10 @@ def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
 def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
     """Raises TwinError if the vehicle comes too close to an object on its planned path.
 
-    The highest corner of the bounding box of an object must be at least `clearance_m` below the cameras wherever their
-    horizontal distance to the circle around this box is less than VEHICLE_REACH_M.
+    The highest corner of its bounding box must be at least `clearance_m` below the cameras where their horizontal
+    distance to the circle around this box is less than VEHICLE_REACH_M.
     """
-    path = planned_references(plan).position if objects else np.empty((0, 3))
+    path = plan.all_references().position if objects else np.empty((0, 3))
     for item in objects:
         disc, top_m = disc_of(item), item.corners_m()[:, 2].max()
         away = np.hypot(path[:, 0] - disc.x_m, path[:, 1] - disc.y_m) - disc.radius_m - VEHICLE_REACH_M
@@ -116,11 +115,7 @@ def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m
 
 
 def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if a lamp is below the floor at a point of the path, with any heading of the bow on the legs.
-
-    Args:
-        position_m, camera_m: (3,) positions of the lamp and of the left camera in the body.
-    """
+    """Raises TwinError if a lamp, at a position (3,) in the body, is below the floor on the path at any heading."""
     corners = plan.outline()
     lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
     along = np.append(np.arange(0.0, lengths[-1], max(LAMP_STEP_M, lengths[-1] / LAMP_POINTS)), lengths[-1])
@@ -135,3 +130,74 @@ def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain
             f"lamps.{number}.position_m", f"is {-least:.2f} m below the floor at x {x[above.argmin()]:.1f},"
             f" y {y[above.argmin()]:.1f}", f"{position_m[2] - least:.2f} or more for z (up)",
         )  # fmt: skip
+
+
+def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> None:
+    """Raises TwinError if a cruise speed exceeds the top speed, for loops in the slowest direction."""
+    if vehicle.dynamics == "kinematic":
+        return
+    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if asked.pattern == "loops" else np.zeros(1)
+    directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
+    reach = min(top_speed_mps(vehicle, direction) for direction in directions)
+    if speed_mps > reach:
+        raise TwinError("plan.speed_mps", f"{asked.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}")
+
+
+def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float], plan: SurveyPlan) -> None:
+    """Raises TwinError if a thruster saturates: to hold station in the current, or at the planned velocities in it.
+
+    A kinematic vehicle, and a path at constant height without current, are not checked.
+    """
+    current = np.array(current_mps)
+    if vehicle.dynamics == "kinematic" or not (current.any() or plan.request.surface is not None):
+        return
+    planned = plan.all_references()
+    rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity]), 3)
+    distinct = np.unique(rounded, axis=0)
+    yaw, velocity = distinct[:, 0], distinct[:, 1:]
+    hold, speed_mps = _body_velocities(yaw, -np.tile(current, (len(yaw), 1))), float(np.linalg.norm(current))
+    if (factor := _saturating_factor(vehicle, lambda k: k * hold)) is not None:
+        raise TwinError(
+            "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
+            f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
+        )  # fmt: skip
+    factor = _saturating_factor(vehicle, lambda k: _body_velocities(yaw, k * velocity - current))
+    if factor is not None:
+        against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " up the slopes"
+        raise TwinError(
+            "plan.speed_mps", f"{plan.speed_mps:g}: too fast for the thrusters{against}",
+            f"up to {np.floor(1000 * factor * plan.speed_mps) / 1000:.3f}",
+        )  # fmt: skip
+
+
+def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
+    """Returns the greatest slope of a path: a share of that which saturates a thruster, at most _MAX_SLOPE."""
+    ahead = np.array([speed_mps, 0.0, 0.0])
+    excess = lambda climb: _load(vehicle, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
+    if excess(0.0) >= 0:
+        return _MAX_SLOPE  # `prepare` reports that the speed is too high
+    high = _MAX_SLOPE / _CLIMB_SHARE * speed_mps
+    climb = high if excess(high) <= 0 else _root(excess, high)
+    return _CLIMB_SHARE * climb / speed_mps
+
+
+def _saturating_factor(vehicle: VehicleConfig, velocities: Callable[[float], Array]) -> float | None:
+    """Returns the factor below 1 at which velocities(factor) (n, 3) saturate a thruster; None if there is none."""
+    if _load(vehicle, velocities(1.0)) <= 1:
+        return None
+    return _root(lambda factor: _load(vehicle, velocities(factor)) - 1, 1.0)
+
+
+def _root(function: Callable[[float], float], high: float) -> float:
+    return float(root_scalar(function, bracket=(0.0, high), method="brentq", xtol=1e-4).root)
+
+
+def _load(vehicle: VehicleConfig, velocities: Array) -> float:
+    return float(thrust_loads(vehicle, velocities).max(initial=0.0))
+
+
+def _body_velocities(yaw: Array, velocity: Array) -> Array:
+    """Returns velocities (n, 3) converted from world axes to the body axes of a level vehicle at yaws (n,) [rad]."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = velocity.T
+    return np.column_stack([c * x + s * y, c * y - s * x, z])

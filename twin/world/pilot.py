@@ -37,8 +37,8 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     """Returns the estimate; position and velocity are those of the reference if they were predicted, not measured.
 
     If the pilot corrected a predicted deviation, the true vehicle would move by it, and no measurement would reveal
-    this motion. The attitude is always kept; height and vertical velocity are kept if there is a reading of the
-    pressure sensor. The estimate is returned unchanged if its motion was measured or a DVL reading is available.
+    this motion. The attitude is kept, and with a reading of the pressure sensor height and vertical velocity. Unchanged
+    if the motion was measured or a DVL reading is available.
     """
     if estimate.status == "ok" or readings.dvl_mps is not None:
         return estimate
@@ -51,12 +51,9 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
 
 
 def _plugin_pilot(mission: Mission, name: str) -> PilotOfEstimates:
-    """Returns the pilot that gives the checked commands of the plug-in `control.plugin`.
-
-    A call raises PluginFailed if the plug-in fails or its command is unusable.
-    """
+    """Returns the pilot that gives the commands of the plug-in; a call raises PluginFailed if they are unusable."""
     scenario, rig = mission.scenario, mission.rig
-    nominal = nominal_controller(scenario.control.natural_frequency_radps, rig.frame_rate_hz).state
+    nominal = nominal_controller(scenario.control.natural_frequency_radps, rig.frame_rate_hz)
     n = 8 if scenario.vehicle.dynamics == "rigid" else 3
     setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
     plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
@@ -68,7 +65,6 @@ def _plugin_pilot(mission: Mission, name: str) -> PilotOfEstimates:
 
 
 def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot of a kinematic vehicle; a command is a velocity (3,) in the world [m/s]."""
     frequency = mission.scenario.control.natural_frequency_radps
 
     def command(estimate: Estimate, reference: Reference) -> Array:
@@ -99,7 +95,7 @@ class RovPilot:
             lever_arm_m=rig.body_from_camera[:3, 3].copy(),
             smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz),
             twist=np.zeros(6),
-            controller=nominal_controller(mission.scenario.control.natural_frequency_radps, rig.frame_rate_hz).state,
+            controller=nominal_controller(mission.scenario.control.natural_frequency_radps, rig.frame_rate_hz),
         )
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
@@ -111,12 +107,7 @@ class RovPilot:
 
 @kernel
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
-    """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`.
-
-    Args:
-        world_from_camera, camera_velocity: estimated pose and twist, as in `Estimate`.
-        position, velocity, acceleration, yaw: the `Reference` of the left camera.
-    """
+    """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`."""
     change = state.body_from_camera_twist @ camera_velocity - state.twist
     geometry.copy_into(state.twist, state.twist + state.smoothing * change)
     body = geometry.compose(world_from_camera, state.camera_from_body)

@@ -9,18 +9,18 @@ import numpy as np
 from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
+from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, height_field
+from twin.core.height_field import HeightField, height_field, image_overlap
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
+from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, is_turning, leg_numbers, travel_direction
 from twin.scenario.model import Scenario
 from twin.terrains import Terrain
 from twin.world.asked_area import survey_area
-from twin.world.planned_images import floor_of, overlaps, planned_keyframes, planned_pairs, thinned
-from twin.world.thrust_authority import climb_slope
+from twin.world.path_checks import climb_slope
 
-#: Percentage of the pairs of keyframes that may have less overlap over the floor than required. If it were 0, a
-#: single step or boulder would determine the spacing of the whole survey.
+#: Percentage of pairs with less overlap than required; with 0, a single step or boulder would set the spacing.
 SHORT_PERCENT = 5.0
 #: Largest number of pairs of keyframes, along and across each, whose overlap is computed to choose the spacing.
 _PAIRS = 250
@@ -40,10 +40,8 @@ _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """Returns the plan of a survey, with height and spacing adapted to the floor if the scenario requests it.
 
-    They are not adapted without a terrain or if the path leaves it, nor the spacing if the path meets the floor.
-
-    Raises:
-        TwinError: no plan satisfies the scenario, or the plan exceeds the limits of `check_plan_size`.
+    They are not adapted without a terrain or if the path leaves it, nor the spacing if the path meets the floor. Raises
+    TwinError if no plan satisfies the scenario, or it exceeds the limits of `check_plan_size`.
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
     plan = _PATTERNS[pattern](request)
@@ -63,10 +61,10 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
 def check_plan_size(plan: SurveyPlan, hold_s: float) -> None:
     """Raises TwinError if a plan has more than `MAX_FRAMES` frames or `MAX_KEYFRAMES` keyframes."""
     duration_s = sum(plan.track_duration_s(track) for track in range(1, plan.n_tracks + 1))
-    n_frames = (duration_s + hold_s * plan.n_tracks) * plan.frame_rate_hz
+    n_frames = (duration_s + hold_s * plan.n_tracks) * plan.request.frame_rate_hz
     remedy = "fewer plan.tracks, a smaller area, less overlap, more speed"
     _check_number("plan.area_m", n_frames, MAX_FRAMES, "frames", remedy)
-    n_keyframes = duration_s * plan.frame_rate_hz / plan.n_frames_per_keyframe
+    n_keyframes = duration_s * plan.request.frame_rate_hz / plan.n_frames_per_keyframe
     _check_number("plan.overlap_along", n_keyframes, MAX_KEYFRAMES, "keyframes", "less overlap, or fewer plan.tracks")
 
 
@@ -85,8 +83,7 @@ def _check_number(field: str, number: float, limit: int, items: str, remedy: str
 def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest:
     """Returns the requirements of a survey; without a terrain, its area lies at the origin.
 
-    Raises:
-        TwinError: the area cannot be placed, or the vehicle cannot turn on the spot.
+    Raises TwinError if the area cannot be placed, or the vehicle cannot turn on the spot.
     """
     p, rig = scenario.plan, scenario.believed_rig()
     if p.turns != "reverse" and scenario.vehicle.dynamics == "kinematic":
@@ -99,18 +96,15 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
 
 
 def _lies_over(plan: SurveyPlan, terrain: Terrain) -> bool:
-    """Returns whether all waypoints of the path lie over the terrain, at any height."""
     return bool(np.isfinite(terrain.height_at(*plan.outline()[:, :2].T)).all())
 
 
 def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
-    """Returns whether all waypoints of the path lie above the floor."""
     x, y, z = plan.outline().T
     return bool((terrain.height_at(x, y) < z).all())
 
 
 def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> CameraSurface:
-    """Returns the surface that the camera follows, at `plan.altitude_m` above the smoothed floor."""
     if scenario.vehicle.dynamics == "kinematic":
         raise TwinError("plan.height", "'floor': a kinematic vehicle moves in a horizontal plane", '"plane"')
     if min(terrain.height_m.shape) < 4:
@@ -127,12 +121,11 @@ def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> Ca
 def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig: StereoRig) -> SurveyRequest:
     """Returns the request with `along_scale` and `across_scale` reduced until the overlap over the floor suffices.
 
-    The overlap suffices if all but SHORT_PERCENT of the pairs of keyframes, both along and across the swaths, have at
-    least the smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT of the pairs have over
-    the reference plane in the plan with scales of 1 at constant height. The scales start at 1 and are repeatedly
-    multiplied by allowed / found of 1 - overlap (0.3 to 0.99). The numbers of frames per keyframe and of tracks are
-    integers, so a small step may leave them unchanged: the least step of 1 % is doubled after each step without effect.
-    On a floor at the reference plane the scales stay 1.
+    It suffices if all but SHORT_PERCENT of the pairs of keyframes, along and across the swaths, have at least the
+    smaller of two overlaps: the required one, and the one that all but SHORT_PERCENT have over the reference plane with
+    scales of 1. The scales start at 1 and are multiplied by allowed / found of 1 - overlap (0.3 to 0.99). Frames per
+    keyframe and tracks are integers, so a small step may leave them unchanged: the least step of 1 % is doubled after
+    each step without effect.
     """
     make = _PATTERNS[pattern]
     rough_tracks = max(request.area_m) / make(request._replace(tracks=1)).swath_spacing_m
@@ -168,16 +161,36 @@ def _level_floor(request: SurveyRequest) -> HeightField:
 
 
 def _spacing(plan: SurveyPlan) -> tuple[int, float]:
-    """Returns the spacing of the keyframes along the swaths [frames] and that of the swaths [m]."""
     return plan.n_frames_per_keyframe, plan.swath_spacing_m
 
 
 def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> Array:
-    """Returns the percentiles (100 - SHORT_PERCENT) of 1 - overlap of a plan over a floor, (2,): along and across.
-
-    From at most _PAIRS pairs along and _PAIRS across the swaths; 0 without pairs whose first image shows floor.
-    """
-    pairs = planned_pairs(planned_keyframes(plan, pattern))
-    missed = [1 - overlaps(field, thinned(p, _PAIRS), rig) for p in pairs]
+    """Returns the percentiles (2,), along and across, of 1 - overlap of a plan over a floor; 0 without pairs."""
+    pairs = image_pairs(planned_keyframes(plan, pattern))
+    missed = [1 - image_overlap(field, *thinned(p, _PAIRS), rig) for p in pairs]
     known = [m[np.isfinite(m)] for m in missed]
     return np.array([np.percentile(m, 100 - SHORT_PERCENT) if len(m) else 0.0 for m in known])
+
+
+def planned_keyframes(plan: SurveyPlan, pattern: str) -> KeyframePoses:
+    """Returns the planned keyframes of all tracks, with the camera looking straight down."""
+    are_keyframes = [plan.frames_of_track(track)[1] for track in range(1, plan.n_tracks + 1)]
+    position, _, yaw, _ = plan.all_references()
+    keyframe, yaw = np.concatenate(are_keyframes), np.asarray(yaw)
+    track = np.repeat(np.arange(plan.n_tracks), [len(part) for part in are_keyframes])
+    swath = track if pattern == "loops" else np.where(is_turning(yaw), -1, leg_numbers(position))
+    poses = np.tile(np.eye(4), (int(keyframe.sum()), 1, 1))
+    poses[:, :3, :3] = geometry.rotations_of_down_camera(yaw[keyframe])
+    poses[:, :3, 3] = position[keyframe]
+    return KeyframePoses(poses, travel_direction(position)[keyframe], swath[keyframe])
+
+
+def thinned(pairs: ImagePairs, most: int) -> ImagePairs:
+    kept = np.unique(np.linspace(0, len(pairs.first) - 1, min(most, len(pairs.first))).astype(int))
+    return ImagePairs(pairs.first[kept], pairs.second[kept])
+
+
+def floor_of(terrain: Terrain) -> HeightField:
+    """Returns the height field of a terrain, for ray casting; there is no floor at its unknown nodes."""
+    height = terrain.height_m if terrain.known is None else np.where(terrain.known, terrain.height_m, np.nan)
+    return height_field(height, terrain.spacing_m, terrain.west_m, terrain.south_m)

@@ -14,10 +14,9 @@ from twin.imaging.scene.renderer import Renderer
 from twin.imaging.stereo_camera import StereoCamera
 from twin.scenes.builder import build
 from twin.simulate.hull import physics_timestep_s
-from twin.simulate.inertial_sensor import InertialSensor
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
-from twin.simulate.sensors import NavigationSensors
+from twin.simulate.sensors import InertialSensor, NavigationSensors
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, Step, motion_rate_hz
 from twin.world.observed_cells import Coverage
@@ -27,10 +26,7 @@ from twin.world.world import CameraImages, World, streams
 
 
 class RenderedWorld(World):
-    """World with images: MuJoCo renders albedo and depth, `twin.imaging` adds light and water.
-
-    It holds an OpenGL context, which `close` releases.
-    """
+    """World with images: MuJoCo renders albedo and depth, `twin.imaging` adds light and water; `close` frees OpenGL."""
 
     def __init__(self, mission: Mission, stopwatch: StageTimer):
         scenario, cameras = mission.scenario, mission.true_cameras
@@ -79,7 +75,6 @@ class RenderedWorld(World):
 
 
 def _overhanging_surface(mission: Mission) -> TopSurface | None:
-    """Returns the true surface of the map with objects or a mesh floor; None for a height grid without objects."""
     grid, whole = mission.grid, mission.mesh_floor
     if whole is None and not mission.objects:
         return None

@@ -60,12 +60,7 @@ def floor_contradictions(t: TerrainConfig) -> Iterator[TwinError]:
 def keys_without_effect(
     path: str, section: BaseModel, keys: Iterable[str], problem: str, allowed: str
 ) -> Iterator[TwinError]:
-    """Yields an error for each of the keys of a section that is set to another value than its default.
-
-    Args:
-        path: dotted path of the section.
-        problem, allowed: as in `TwinError`.
-    """
+    """Yields an error for each of the keys of a section (at the dotted path) that is not set to its default."""
     for key in keys:
         if getattr(section, key) != type(section).model_fields[key].default:
             yield TwinError(f"{path}.{key}", problem, allowed)

@@ -1,7 +1,6 @@
-"""Surface as seen from above: the highest of floor and objects on the vertical line through each cell of a grid.
+"""Surface as seen from above: the highest of floor and objects at the cells of a grid, and the albedo of the floor.
 
-Meshes are drawn in a parallel projection. Below an overhang, the map has the height of the object, not that of the
-floor. Plants are upright, as in still water.
+Below an overhang, the map has the height of the object. Plants are upright, as in still water.
 """
 
 from __future__ import annotations
@@ -11,11 +10,13 @@ from dataclasses import replace
 from math import ceil
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import Array, MapGrid
+from twin.core.records import Array, Image, MapGrid
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.imaging.scene.triplanar import paint_walls_from_above, wall_surface
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.terrain import MAX_NODES
@@ -28,6 +29,7 @@ OVERHANG_M = 0.01  #: least gap between the floor and an object that overhangs i
 FINE_M = 0.01  #: largest spacing of the nodes of `with_objects`, unless MAX_NODES requires a larger one
 _ROWS_PER_BLOCK = 256  # images of a block, which are not kept, take up to 33 bytes per cell
 _HEIGHTS_PER_BLOCK = 64  # the coordinates of heights take several times the memory of the grid
+_BLOCK = 1024  # largest number of rows, and of columns, of samples that are computed at once, to limit memory
 
 
 class TopSurface(NamedTuple):
@@ -40,11 +42,7 @@ class TopSurface(NamedTuple):
 
 
 def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> Layer:
-    """Returns the height of the floor at the cell centres (rows, cols) [m].
-
-    Args:
-        height_at: returns the heights [m] at arrays x and y [m] of equal shape.
-    """
+    """Returns the height of the floor at the cell centres (rows, cols) [m], by a function of arrays x and y [m]."""
     x, y = grid.centres()
     height = np.empty((grid.rows, grid.cols), np.float32)
     for rows in row_blocks(grid, _HEIGHTS_PER_BLOCK):
@@ -53,13 +51,11 @@ def true_heights(grid: MapGrid, height_at: Callable[[Array, Array], Array]) -> L
 
 
 def row_blocks(grid: MapGrid, size: int | None = None) -> Iterator[slice]:
-    """Yields the rows of a grid in blocks, to limit memory."""
     size = size or _ROWS_PER_BLOCK
     return (slice(first, min(first + size, grid.rows)) for first in range(0, grid.rows, size))
 
 
 def view_from_above(grid: MapGrid, first: int = 0) -> Projection:
-    """Returns the parallel projection whose pixels are the cells of a grid from row `first` on."""
     column, row = -grid.west_m / grid.cell_m - 0.5, grid.north_m / grid.cell_m - 0.5 - first
     return Projection(1 / grid.cell_m, column, row, -np.inf, False)
 
@@ -101,9 +97,8 @@ def _add_objects(
 def with_objects(floor: Terrain, objects: Sequence[PlacedObject]) -> Terrain:
     """Returns the terrain whose heights are those of the highest of floor and objects.
 
-    Each cell of the floor is divided into n x n small cells. The diagonal of a cell consists of diagonals of small
-    cells, so the surface away from the objects is that of the floor. The side of an object is a slope between two
-    nodes, and there is no space below overhangs.
+    Each cell of the floor is divided into n x n small cells, whose diagonals keep the surface away from the objects as
+    it is. The side of an object is a slope between two nodes, and there is no space below overhangs.
     """
     wanted = ceil(floor.spacing_m / FINE_M - 1e-6)
     divisions = max(1, min(wanted, int(np.sqrt(MAX_NODES / floor.height_m.size))))
@@ -117,3 +112,56 @@ def with_objects(floor: Terrain, objects: Sequence[PlacedObject]) -> Terrain:
     heights = top_surface(nodes, TopSurface(true_heights(nodes, height_at)), objects).height_m
     known = None if floor.known is None else ~floor.in_hole(*np.meshgrid(*nodes.centres()))[::-1]
     return replace(floor, height_m=np.ascontiguousarray(heights[::-1]), spacing_m=spacing_m, known=known)
+
+
+def true_albedo(terrain: Terrain, grid: MapGrid) -> NDArray[np.float32]:
+    """Returns the mean albedo (rows, cols, 3) of the floor in the cells of a grid, 255 = white.
+
+    Over at least one sample per texel along x and y, interpolated bilinearly as in a rendered image; walls have their
+    own texture (`imaging.triplanar`). NaN in cells whose middle sample lies outside the terrain.
+    """
+    rows, cols, _ = terrain.texture.shape
+    texel_m = np.array(terrain.size_m) / [cols, rows]
+    n = max(1, int(np.ceil(grid.cell_m / texel_m.min() - 1e-6)))
+    step_m = grid.cell_m / n
+    x = grid.west_m + (np.arange(grid.cols * n) + 0.5) * step_m
+    y = grid.north_m - (np.arange(grid.rows * n) + 0.5) * step_m
+    col = ((x - terrain.west_m) / texel_m[0] - 0.5).astype(np.float32)
+    row = ((terrain.north_m - y) / texel_m[1] - 0.5).astype(np.float32)
+    out = np.empty((grid.rows, grid.cols, 3), np.float32)
+    side, walls = max(1, _BLOCK // n), wall_surface(terrain)
+    for top in range(0, grid.rows, side):
+        for left in range(0, grid.cols, side):
+            part = out[top : top + side, left : left + side]
+            of_cols, of_rows = slice(left * n, (left + side) * n), slice(top * n, (top + side) * n)
+            fine = _samples(terrain.texture, *np.meshgrid(col[of_cols], row[of_rows]))
+            if walls is not None:
+                paint_walls_from_above(walls, fine, x[of_cols], y[of_rows], step_m)
+            part[:] = fine.reshape(len(part), n, -1, n, 3).mean(axis=(1, 3), dtype=np.float32)
+    inside_x = (x[n // 2 :: n] >= terrain.west_m) & (x[n // 2 :: n] <= terrain.east_m)
+    inside_y = (y[n // 2 :: n] >= terrain.south_m) & (y[n // 2 :: n] <= terrain.north_m)
+    out[~(inside_y[:, None] & inside_x)] = np.nan
+    return out
+
+
+def _samples(texture: Image, across: Layer, down: Layer) -> Image:
+    resampled = cv2.remap(*_cropped(texture, across, down), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(resampled, np.uint8)
+
+
+def without_objects(albedo: Layer, grid: MapGrid, objects: NDArray[np.uint16] | None, map_grid: MapGrid) -> Layer:
+    """Returns the albedo (rows, cols, 3) on `grid` with NaN where `objects`, on `map_grid`, has an object."""
+    if objects is None:
+        return albedo
+    x, y = grid.centres()
+    cols = np.clip(np.floor((x - map_grid.west_m) / map_grid.cell_m).astype(int), 0, map_grid.cols - 1)
+    rows = np.clip(np.floor((map_grid.north_m - y) / map_grid.cell_m).astype(int), 0, map_grid.rows - 1)
+    return np.where(objects[np.ix_(rows, cols)][..., None] > 0, np.float32(np.nan), albedo)
+
+
+def _cropped(texture: Image, across: Layer, down: Layer) -> tuple[Image, Layer, Layer]:
+    """Returns the part of a texture around columns and rows, and these relative to it: OpenCV takes 32767 px."""
+    rows, cols, _ = texture.shape
+    top, left = (int(np.clip(place.min() - 1, 0, n - 1)) for place, n in ((down, rows), (across, cols)))
+    end, right = (int(np.clip(place.max() + 3, 1, n)) for place, n in ((down, rows), (across, cols)))
+    return texture[top:end, left:right], across - np.float32(left), down - np.float32(top)

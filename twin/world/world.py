@@ -20,20 +20,17 @@ from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.mission import FrameSequence, Mission, Step
 from twin.world.pilot import PilotOfEstimates
-from twin.world.top_surface import TopSurface, true_heights
-from twin.world.true_albedo import true_albedo, without_objects
+from twin.world.top_surface import TopSurface, true_albedo, true_heights, without_objects
 
 if TYPE_CHECKING:
     from twin.simulate.mujoco_vehicle import MujocoVehicle
 
     AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
-#: Names of the random streams, in the order in which their seeds are spawned. Add a new stream at the end, to keep the
-#: random numbers of the others.
+#: Random streams in the order of their seeds; a new one at the end leaves the numbers of the others unchanged.
 _STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu")
 
-#: Simulates the frames of a sequence from index k, at most up to the next keyframe; returns the index of the first
-#: frame that it did not simulate.
+#: Simulates frames from index k, at most up to the next keyframe; returns the index of the first one not simulated.
 FastForward = Callable[[FrameSequence, int], int]
 
 
@@ -47,14 +44,7 @@ class CameraImages(NamedTuple):
 
 
 class World(ABC):
-    """Simulated world of a mission. Use as a context manager.
-
-    Args:
-        vehicle: simulated vehicle at the start of the survey.
-
-    Attributes:
-        warnings: sentences on the limitations of this simulated world, for the log and the report of the survey.
-    """
+    """Simulated world of a mission, a context manager; `warnings` states its limitations, for log and report."""
 
     warnings: tuple[str, ...] = ()
 
@@ -87,7 +77,6 @@ class World(ABC):
 
     @property
     def world_from_camera(self) -> Array:
-        """Returns the true pose (4, 4) of the left camera."""
         return left_camera(self.vehicle, self.mission.rig)
 
     def start_sequence(self, sequence: FrameSequence) -> None:
@@ -95,7 +84,6 @@ class World(ABC):
         self._sequences.append(sequence)
 
     def end_sequence(self, n: int) -> None:
-        """Ends the current sequence after its first n frames."""
         self._sequences[-1] = self._sequences[-1].first(n)
 
     def observe(self, step: Step) -> Frame:
@@ -108,12 +96,10 @@ class World(ABC):
         return Frame(index, time_s, images.left, images.right, readings, step.keyframe, images.exposure)
 
     def act(self, command: Array) -> None:
-        """Simulates the physics of one frame interval under a pilot's command."""
         with self.stopwatch("physics"):
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def __len__(self) -> int:
-        """Returns the number of frames recorded so far."""
         return len(self._true_poses)
 
     def record(self, poses: Array) -> None:
@@ -125,7 +111,6 @@ class World(ABC):
         return lambda sequence, k: k
 
     def truth(self) -> Truth:
-        """Returns the ground truth of the survey so far."""
         n, surface = len(self), self.true_surface()
         cells, in_hole = np.meshgrid(*self.mission.grid.centres()), self.mission.terrain.in_hole
         unknown = in_hole(*cells)
@@ -153,7 +138,6 @@ class World(ABC):
         )
 
     def true_surface(self) -> TopSurface:
-        """Returns the true surface of the map; in this base class, the floor without objects."""
         return TopSurface(true_heights(self.mission.grid, self.mission.terrain.height_at))
 
 
@@ -163,6 +147,5 @@ def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:
 
 
 def streams(seed: int) -> dict[str, np.random.Generator]:
-    """Returns the random generators of a survey with this seed, by the names of their streams."""
     seeds = np.random.SeedSequence(seed).spawn(len(_STREAMS))
     return {name: np.random.default_rng(seed) for name, seed in zip(_STREAMS, seeds, strict=True)}

@@ -35,21 +35,14 @@ class BagMessage(NamedTuple):
 
 
 def is_bag(path: Path) -> bool:
-    """Returns whether a path is a file with the suffix .mcap or .db3 (SQLite), or a folder with metadata.yaml."""
     return (path.suffix in _SUFFIXES and is_file(path)) or is_file(path / "metadata.yaml")
 
 
 class Bag:
     """An open ROS 2 bag; every method raises TwinError if the bag is damaged.
 
-    Attributes:
-        path: file or folder of the bag.
-        topics: type of the messages of each topic, for example "sensor_msgs/msg/Image".
-
-    Raises:
-        TwinError: the bag is damaged, truncated or too large, it is compressed by file or by message, one of its files
-            is missing, or rosbags is not installed.
-        OSError: an MCAP file cannot be read.
+    `topics` has the type of the messages of each topic, for example "sensor_msgs/msg/Image". Raises TwinError if the
+    bag is damaged, too large, compressed by file or by message, or lacks a file, or rosbags is not installed.
     """
 
     def __init__(self, path: Path):
@@ -66,7 +59,6 @@ class Bag:
             self._check_sizes()
 
     def first(self, topic: str) -> Any:
-        """Returns the first message of a topic, decoded; None if the topic has no message."""
         return next((message for _, message in self.messages(topic)), None)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
@@ -76,10 +68,7 @@ class Bag:
                 yield logged_ns, _typestore().deserialize_cdr(data, self.topics[topic])
 
     def index(self, topics: Sequence[str]) -> dict[str, list[BagMessage]]:
-        """Returns the positions of the messages of each topic in order of recording, without decoding them.
-
-        The types of the messages must begin with a header.
-        """
+        """Returns the positions of the messages of each topic, which begin with a header, in order of recording."""
         found: dict[str, list[BagMessage]] = {topic: [] for topic in topics}
         with self._damage():
             for connection, logged_ns, data in self._reader.messages(self._connections(topics)):
@@ -101,11 +90,9 @@ class Bag:
         raise ValueError("missing")
 
     def _connections(self, topics: Sequence[str]) -> list[Any]:
-        """Returns the connections (rosbags' term for the channels) of topics."""
         return [one for one in self._reader.connections if one.topic in topics]
 
     def _check_sizes(self) -> None:
-        """Raises ValueError if there are too many messages, a chunk is too large, or the index of chunks is missing."""
         if self._reader.message_count > _MOST_MESSAGES:
             raise ValueError(f"{self._reader.message_count} messages; at most {_MOST_MESSAGES}")
         for storage in getattr(self._reader.storage, "storages", [self._reader.storage]):
@@ -116,7 +103,6 @@ class Bag:
 
     @contextmanager
     def _damage(self) -> Iterator[None]:
-        """Converts every `Exception` in this context, except a TwinError, to a TwinError that names the bag."""
         try:
             yield
         except (TwinError, GeneratorExit):
@@ -127,12 +113,7 @@ class Bag:
 
 
 def _files(path: Path) -> list[Path]:
-    """Returns the files of a bag: the path itself, or those that metadata.yaml lists in the folder of the bag.
-
-    Raises:
-        TwinError: metadata.yaml is damaged, the bag is compressed, or a file is missing or is a link that leads out of
-            the folder.
-    """
+    """Returns the files of a bag: the path itself, or those in metadata.yaml; a link out of the folder is refused."""
     if not path.is_dir():
         return [path]
     source = path / "metadata.yaml"
@@ -150,7 +131,6 @@ def _files(path: Path) -> list[Path]:
 
 
 def _check_end(file: Path) -> None:
-    """Raises TwinError if a file with the suffix .mcap does not begin and end with the magic bytes of the format."""
     if file.suffix != ".mcap":
         return
     with file.open("rb") as opened:
@@ -163,7 +143,6 @@ def _check_end(file: Path) -> None:
 
 
 def _check_chunk(size: int) -> None:
-    """Raises ValueError if the stated size of a decompressed chunk is too large [bytes]."""
     if size > _MOST_CHUNK_BYTES:
         raise ValueError(f"a chunk is larger than {_MOST_CHUNK_BYTES / 2**20:g} MiB")
 
@@ -178,17 +157,13 @@ def _stamp_ns(data: bytes | memoryview) -> int:
 
 @cache
 def _typestore() -> Any:
-    """Returns the message definitions of ROS 2 Humble."""
     typesys = optional("rosbags.typesys", "exchange", _PURPOSE)
     return typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
 
 @cache
 def _bound_decompression() -> None:
-    """Makes rosbags stop the decompression of a chunk one byte after the size that the chunk states.
-
-    rosbags decompresses a chunk before it compares the size, so a small chunk could fill the memory.
-    """
+    """Makes rosbags stop decompressing a chunk beyond the size that it states, which it compares only afterwards."""
     storage = optional("rosbags.rosbag2.storage_mcap", "exchange", _PURPOSE)
     lz4 = optional("lz4.frame", "exchange", _PURPOSE)
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.datasets.image_files import UnreadableImage, decoded, encoded_size
+from twin.datasets.image_files import UnreadableImage, decoded, image_header
 from twin.datasets.ros2.bag import Bag, BagMessage
 from twin.errors import TwinError
 
@@ -26,12 +26,9 @@ _RECTIFIED = re.compile(r"[/_]rect(_|$|/|ified)", re.IGNORECASE)
 #: Encodings by the names of sensor_msgs/image_encodings.hpp: bytes per value, channels, and OpenCV's code of the
 #: conversion to BGR (None for grey and BGR). In a Bayer name, the letters are the first two rows.
 _ENCODINGS: dict[str, tuple[int, int, int | None]] = {
-    "mono8": (1, 1, None),
-    "8UC1": (1, 1, None),
-    "mono16": (2, 1, None),
-    "16UC1": (2, 1, None),
-    "bgr8": (1, 3, None),
-    "8UC3": (1, 3, None),
+    **dict.fromkeys(("mono8", "8UC1"), (1, 1, None)),
+    **dict.fromkeys(("mono16", "16UC1"), (2, 1, None)),
+    **dict.fromkeys(("bgr8", "8UC3"), (1, 3, None)),
     "rgb8": (1, 3, cv2.COLOR_RGB2BGR),
     "bgra8": (1, 4, cv2.COLOR_BGRA2BGR),
     "rgba8": (1, 4, cv2.COLOR_RGBA2BGR),
@@ -53,19 +50,16 @@ class BagImage:
 
     @property
     def name(self) -> str:
-        """Returns the topic and the time [s] of the image, for messages."""
         return f"{self._position.topic} at {self._position.stamp_ns * 1e-9:.3f} s"
 
     def size_px(self) -> tuple[int, int]:
-        """Returns (width, height); raises UnreadableImage if the message is damaged or of an unknown encoding."""
         message = self._message()
         if hasattr(message, "format"):
-            return encoded_size(message.data.tobytes())
+            return image_header(message.data.tobytes())[:2]
         _encoding(message.encoding)
         return int(message.width), int(message.height)
 
     def pixels(self, size_px: tuple[int, int]) -> NDArray[Any]:
-        """Returns the values of the image (`StoredImage.pixels`)."""
         message = self._message()
         if hasattr(message, "format"):
             return decoded(message.data.tobytes(), size_px)
@@ -79,11 +73,7 @@ class BagImage:
 
 
 def raw_pixels(message: Any, size_px: tuple[int, int]) -> NDArray[Any]:
-    """Returns the values of a message sensor_msgs/Image, (H, W) or (H, W, 3) in the order BGR, uint8 or uint16.
-
-    Raises:
-        UnreadableImage: the encoding is unknown, or the image has too few bytes or another size than `size_px`.
-    """
+    """Returns the values of a sensor_msgs/Image, (H, W) or BGR (H, W, 3), uint8, uint16; may raise UnreadableImage."""
     value_bytes, channels, code = _encoding(message.encoding)
     width, height, step = int(message.width), int(message.height), int(message.step)
     if (width, height) != size_px:
@@ -120,11 +110,7 @@ class StereoTopics(NamedTuple):
 
 
 def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
-    """Returns the image topics of a bag, each with the topic of its calibration, or None if this was not recorded.
-
-    The topic of the calibration of an image topic NAMESPACE/NAME or NAMESPACE/NAME/compressed is NAMESPACE/camera_info.
-    `topics` has the type of the messages of each topic of the bag.
-    """
+    """Returns the image topics among topics and their types, with NAMESPACE/camera_info, or None if not recorded."""
     found = {}
     for topic, kind in topics.items():
         if kind in (IMAGE, COMPRESSED_IMAGE) and not topic.endswith("/compressedDepth"):
@@ -137,15 +123,13 @@ def image_topics(topics: Mapping[str, str]) -> dict[str, str | None]:
 def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any], path: Path) -> StereoTopics:
     """Returns the only stereo pair among the image topics (`image_topics`) that have a calibration.
 
-    A topic of uncompressed images takes precedence over the topic of the same images in compressed form. Left and
-    right are recognised by words in the topics, such as "left" or "cam0". If these do not decide and there are two
-    topics, the right camera is the one whose projection matrix P has a baseline (P[0, 3] < 0); `first` returns the
-    first message of a topic, or None.
-
-    Raises:
-        TwinError: the bag `path` has no pair with calibrations, or several.
+    A topic of uncompressed images takes precedence over that of the same images in compressed form. Left and right are
+    recognised by words such as "left" or "cam0". If these do not decide and there are two topics, the right camera is
+    the one whose projection matrix has a baseline (P[0, 3] < 0); `first` returns the first message of a topic, or None.
+    Raises TwinError if the bag `path` has no pair with calibrations, or several.
     """
-    calibrated = {topic: info for topic, info in images.items() if info and not _has_uncompressed(topic, images)}
+    compressed = {f"{topic}/compressed" for topic in images}  # of topics that are also recorded uncompressed
+    calibrated = {topic: info for topic, info in images.items() if info and topic not in compressed}
     sides = [[topic for topic in calibrated if word.search(topic)] for word in _SIDES]
     if [len(side) for side in sides] != [1, 1] and len(calibrated) == 2:
         infos = {topic: first(info) for topic, info in calibrated.items()}
@@ -158,8 +142,3 @@ def stereo_topics(images: Mapping[str, str | None], first: Callable[[str], Any],
     problem = "which two image topics are a stereo pair is ambiguous" if calibrated else "has no stereo pair"
     allowed = f"--topics LEFT,RIGHT of: {found}" if found else "a bag with sensor_msgs/Image or CompressedImage"
     raise TwinError(str(path), problem, allowed)
-
-
-def _has_uncompressed(topic: str, images: Mapping[str, str | None]) -> bool:
-    """Returns whether the images of a compressed topic are also recorded uncompressed."""
-    return topic.endswith("/compressed") and topic.removesuffix("/compressed") in images

@@ -30,14 +30,11 @@ _POSES = {
 class BagTopics(NamedTuple):
     """Topics of a bag that the user names."""
 
-    left: str | None = None  #: left, right: topics of the images; if one is None, the reader chooses both
-    right: str | None = None
+    images: tuple[str, str] | None = None  #: topics of the left and the right images; None: the only stereo pair
     truth: str | None = None  #: topic of the true poses; None: no truth
 
 
 class BagReader:
-    """Reads ROS 2 bags: MCAP or SQLite files, or folders with metadata.yaml."""
-
     name = "ros2"
     layout = "ROS 2 bag (FILE.mcap or a folder with metadata.yaml) with two image topics and their camera_info"
 
@@ -45,15 +42,13 @@ class BagReader:
         self._topics = topics or BagTopics()
 
     def recognises(self, folder: Path) -> bool:
-        """Returns whether a path is an MCAP or SQLite file by its suffix, or the folder of a ROS 2 bag (`is_bag`)."""
         return is_bag(folder)
 
     def read(self, folder: Path) -> Dataset:
         """Returns the data set in a bag; images are decoded only when they are used.
 
-        Raises:
-            TwinError: the bag, its transforms or its true poses are damaged, the stereo pair is missing or ambiguous,
-                a topic that the user names is missing or of another type, or rosbags is not installed.
+        Raises TwinError if the bag, its transforms or its true poses are damaged, the stereo pair is missing or
+        ambiguous, a topic that the user names is missing or of another type, or rosbags is not installed.
         """
         bag = Bag(folder)
         topics = self._stereo_topics(bag)
@@ -78,11 +73,10 @@ class BagReader:
         )
 
     def _stereo_topics(self, bag: Bag) -> StereoTopics:
-        """Returns the image topics of both cameras: those that the user names, or the only pair in the bag."""
-        left, right, _ = self._topics
         images = image_topics(bag.topics)
-        if left is None or right is None:
+        if self._topics.images is None:
             return stereo_topics(images, bag.first, bag.path)
+        left, right = self._topics.images
         for topic in (left, right):
             if topic not in images:
                 allowed = ", ".join(images) or "none in this bag"
@@ -91,7 +85,6 @@ class BagReader:
 
 
 def _image_times(bag: Bag, positions: list[BagMessage]) -> list[ImageTime]:
-    """Returns the times [s] of the images at the positions, in their order."""
     return [ImageTime(one.stamp_ns * 1e-9, BagImage(bag, one)) for one in positions]
 
 
@@ -102,7 +95,6 @@ def _frame(bag: Bag, topic: str) -> str:
 
 
 def _calibration(bag: Bag, topics: StereoTopics, transforms: Transforms) -> StereoCalibration | None:
-    """Returns the calibration in the first messages CameraInfo of both cameras; None if one of the cameras has none."""
     if topics.left_info is None or topics.right_info is None:
         return None
     left, right = bag.first(topics.left_info), bag.first(topics.right_info)
@@ -116,12 +108,9 @@ def _calibration(bag: Bag, topics: StereoTopics, transforms: Transforms) -> Ster
 def _truth(bag: Bag, topic: str, camera: str, transforms: Transforms, notes: list[str]) -> Trajectory:
     """Returns the true poses of the left camera, whose frame is `camera` ("": not named), in the order of time.
 
-    If the messages name no body or the images no frame, the recorded poses are taken as those of the left camera, and
-    a note says so.
-
-    Raises:
-        TwinError: the bag is damaged, the topic does not exist or has no poses, a pose is damaged, or the transforms do
-            not join body and camera.
+    If the messages name no body or the images no frame, the recorded poses are taken as those of the left camera, and a
+    note says so. Raises TwinError if the topic does not exist or has no poses, a pose is damaged, or the transforms do
+    not join body and camera.
     """
     kind = bag.topics.get(topic)
     if kind not in _POSES:

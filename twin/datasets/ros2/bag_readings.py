@@ -14,7 +14,7 @@ from twin.core.geometry import Array
 from twin.core.records import PASCAL_PER_METRE
 from twin.datasets import readings
 from twin.datasets.dataset import are_rotations
-from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries, UncheckedReadings
+from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries
 from twin.datasets.ros2.bag import Bag
 from twin.datasets.ros2.frame_transforms import Transforms, relative_pose
 from twin.errors import TwinError
@@ -30,8 +30,6 @@ _SAME_PLACE_M = 0.01  # largest distance between the origins of two frames that 
 
 
 class _Recorded(NamedTuple):
-    """A topic, the coordinate frame that its messages name, and its readings."""
-
     topic: str
     frame: str
     series: SensorSeries
@@ -45,12 +43,10 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     is that of the only topic of type Imu whose messages state an orientation; without one, the only topic with angular
     rates and specific forces gives the vertical. A sensor is also not used if there are several topics of its type, if
     a finite reading of it has no covariance, or if it is not where it must be: the pressure sensor within 1 cm of the
-    left camera, the DVL within 1 cm of the origin of the body. Readings with a value or a covariance that is not finite
-    are left out. If all headers of a topic have the time 0, the times of its readings are those of recording. The notes
-    of the result state which readings are not used and which times are those of recording.
+    left camera, the DVL within 1 cm of the origin of the body. If all headers of a topic have the time 0, the times of
+    recording are taken. Notes state which readings are not used and which times are those of recording.
 
-    Raises:
-        TwinError: the bag is damaged, or a reading is impossible.
+    Raises TwinError if the bag is damaged, or a reading is impossible.
     """
     notes: list[str] = []
     topics = {kind: [name for name, one in bag.topics.items() if one == kind] for kind in (_PRESSURE, _IMU, _DVL)}
@@ -87,15 +83,11 @@ def _unused(recorded: _Recorded, reason: str) -> str:
 
 
 def _same_place(pose: Array | None) -> bool:
-    """Returns whether a relative pose (4, 4) is known and its translation is at most 1 cm."""
     return pose is not None and float(np.linalg.norm(pose[:3, 3])) <= _SAME_PLACE_M
 
 
 def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[str]) -> _Recorded | None:
-    """Returns the velocities in body axes; None, with a note, if the DVL is not at the body's origin.
-
-    Each axis gets the largest of the three standard deviations.
-    """
+    """Returns the velocities in body axes, with the largest sigma; None, with a note, if the DVL is elsewhere."""
     if body_from_sensor is None or not _same_place(body_from_sensor):
         notes.append(_unused(velocity, "the DVL is not at the origin of the attitude's frame"))
         return None
@@ -105,7 +97,6 @@ def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[st
 
 
 def _vertical(inertial: _Recorded, body_from_sensor: Array | None, notes: list[str]) -> SensorSeries | None:
-    """Returns the direction of the vertical in the body; None, with a note, if the pose of the IMU is not known."""
     if body_from_sensor is None:
         notes.append(_unused(inertial, "/tf_static does not join its frame and the body"))
         return None
@@ -117,12 +108,10 @@ def _vertical(inertial: _Recorded, body_from_sensor: Array | None, notes: list[s
 
 
 def _first(bag: Bag, topic: str) -> Iterable[Any]:
-    """Returns the messages of a topic that are searched for an orientation or a motion."""
     return (message for _, message in islice(bag.messages(topic), _N_FIRST))
 
 
 def _with_motion(bag: Bag, topics: list[str]) -> list[str]:
-    """Returns those of the topics of type Imu whose messages have angular rates and specific forces."""
     return [name for name in topics if any(_states_motion(message) for message in _first(bag, name))]
 
 
@@ -134,11 +123,9 @@ def _states_motion(message: Any) -> bool:
 
 
 def _with_orientation(bag: Bag, topics: list[str], notes: list[str]) -> list[str]:
-    """Returns those of the topics of type Imu that state an orientation.
+    """Returns those of the topics of type Imu that state an orientation, only those with a covariance if there are any.
 
-    If some of these topics have a covariance of the orientation, the topics without one are left out. If no topic
-    states an orientation, the result depends on the messages: if all of them mark their orientation as not measured, it
-    is empty, and a note says so; otherwise it has all topics of type Imu.
+    If none does, it returns all of them or, if all messages mark their orientation as not measured, none, with a note.
     """
     first = {name: list(_first(bag, name)) for name in topics}
     stated = [name for name in topics if any(_states_orientation(message) for message in first[name])]
@@ -160,17 +147,16 @@ def _quaternion(message: Any) -> Array:
 
 
 def _listed(topics: list[str]) -> str:
-    """Returns the names of topics for a note, at most 200 characters."""
     return ", ".join(sorted(topics))[:200]
 
 
 def _read(
     bag: Bag, topics: list[str], quantity: SensorQuantity, convert: _Converter, notes: list[str]
 ) -> _Recorded | None:
-    """Returns the readings of the only one of some topics; all values of a message that is not finite are left out.
+    """Returns the readings of the only one of some topics, with the largest standard deviations of the finite readings.
 
     The result is None if there is no topic; also, with a note, if there are several, if a finite reading has no
-    covariance, or if no reading is finite. The standard deviations are the largest ones of the finite readings.
+    covariance, or if no reading is finite.
     """
     if len(topics) > 1:
         notes.append(f"The {quantity.name} is not used: several topics have it ({_listed(topics)}).")
@@ -193,8 +179,8 @@ def _read(
     stamped = any(stamps_ns)
     times_s = np.array(stamps_ns if stamped else logged_ns, np.float64) * 1e-9
     table = np.array(values, np.float64).reshape(-1, quantity.n)
-    recorded = UncheckedReadings(topic, times_s, table, lambda k: _place(bag, topic, k))
-    series = readings.checked_series(quantity, recorded, np.sqrt(largest), notes)
+    recorded = SensorSeries(times_s, table, np.sqrt(largest))
+    series = readings.checked_series(quantity, recorded, topic, lambda k: _place(bag, topic, k), notes)
     if series is None:
         return None
     if not stamped:
@@ -203,7 +189,6 @@ def _read(
 
 
 def _place(bag: Bag, topic: str, k: int) -> str:
-    """Returns a text that names the bag, the topic and message number `k`, from 0, for use in error messages."""
     return f"{bag.path}:{topic}: message {k + 1}"
 
 
@@ -216,8 +201,8 @@ def _height(message: Any, _: str) -> tuple[Array, Array]:
 def _attitude(message: Any, place: str) -> tuple[Array, Array]:
     """Returns roll, pitch, yaw (3,) [rad] and their variances (3,) [rad2] of a message Imu.
 
-    Both are zero if the message marks its orientation as not measured or states no variance. The angles are NaN if the
-    orientation is not finite; TwinError is raised if it is no rotation.
+    Both are zero if the orientation is marked as not measured or has no variance. The angles are NaN if it is not
+    finite; TwinError is raised if it is no rotation.
     """
     variances = np.array(message.orientation_covariance).reshape(3, 3).diagonal()
     if variances[0] < 0 or not variances.any():

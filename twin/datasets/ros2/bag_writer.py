@@ -28,15 +28,10 @@ Messages = Iterator[tuple[int, str, Any]]  #: time [ns], topic and message
 def export(contents: RunContents, folder: Path) -> list[Path]:
     """Writes the bag `folder`/ros2_bag (MCAP and metadata.yaml); returns its path, as a list of one.
 
-    All messages are in the order of time. Topics: /left/image_rect/compressed, /left/camera_info and the same for
+    Topics, all in the order of time (`timestamp_ns`): /left/image_rect/compressed, /left/camera_info and the same for
     right; /tf_static; /odometry and /tf of the final trajectory; /ground_truth/odometry if the truth is known; and, if
-    recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure and /dvl. All times are those
-    that `timestamp_ns` returns.
-
-    Raises:
-        TwinError: the package rosbags is not installed, the bag exists already, or an image is truncated or not a PNG
-            image.
-        OSError: the folder cannot be written.
+    recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure and /dvl. Raises TwinError if
+    rosbags is not installed, the bag exists already, or an image is damaged.
     """
     rosbag2 = optional("rosbags.rosbag2", "exchange", "--to mcap")
     path, factory = folder / BAG, MessageFactory()
@@ -65,8 +60,10 @@ def pressure_pa(height_m: float, surface_m: float) -> float:
 
 
 def _messages(contents: RunContents, factory: MessageFactory) -> Messages:
-    """Returns an iterator over all messages of a run in the order of time; images are read one by one."""
-    streams = [_static(contents, factory), _images(contents, factory), _readings(contents, factory)]
+    rig, start_ns = contents.rig, timestamp_ns(0.0)
+    poses = {(BODY, LEFT): rig.body_from_camera, (BODY, RIGHT): rig.body_from_camera @ rig.left_from_right}
+    static: Messages = iter([(start_ns, "/tf_static", factory.transforms(start_ns, poses))])
+    streams = [static, _images(contents, factory), _readings(contents, factory)]
     if contents.imu is not None:
         streams.append(_inertial(contents.imu, factory))
     for topic, name in (("/odometry", "final"), ("/ground_truth/odometry", "truth")):
@@ -75,16 +72,7 @@ def _messages(contents: RunContents, factory: MessageFactory) -> Messages:
     return heapq.merge(*streams, key=itemgetter(0))
 
 
-def _static(contents: RunContents, factory: MessageFactory) -> Messages:
-    """Yields one message with the static poses of the two cameras in the body."""
-    rig = contents.rig
-    poses = {(BODY, LEFT): rig.body_from_camera, (BODY, RIGHT): rig.body_from_camera @ rig.left_from_right}
-    time_ns = timestamp_ns(0.0)
-    yield time_ns, "/tf_static", factory.transforms(time_ns, poses)
-
-
 def _images(contents: RunContents, factory: MessageFactory) -> Messages:
-    """Yields the images of the recorded frames, each with its CameraInfo."""
     left, right = contents.believed.left, contents.believed.right
     for k, frame in enumerate(contents.frames):
         time_ns = timestamp_ns(frame.time_s)
@@ -125,7 +113,6 @@ def body_twists(times_s: Array, poses: Array) -> Array:
 
 
 def _readings(contents: RunContents, factory: MessageFactory) -> Messages:
-    """Yields the readings of AHRS, pressure sensor and DVL at the recorded frames, with the stated covariances."""
     surface_m = float(contents.scenario.get("sun", {}).get("depth_m", 0.0))
     level_rad, heading_rad, height_m, sigma_mps = contents.sigmas(
         "attitude_sigma_deg", "heading_sigma_deg", "pressure_sigma_m", "dvl_sigma_mps"

@@ -29,21 +29,13 @@ _NUMBERS = {  # fields of a message, their keys in a file and their numbers of v
 def stereo_calibration(
     left: Any, right: Any, rectified: bool, right_from_left: Array | None, file: Path
 ) -> StereoCalibration:
-    """Returns the calibration in two messages CameraInfo.
+    """Returns the calibration in two messages CameraInfo; raises TwinError if they have no baseline or a wrong value.
 
     The projection matrices P of a pair refer to rectified axes, x_rectified = R x, and P_right[0, 3] = -fx baseline. A
     point x of the left camera is therefore at R_right^T (R_left x + (t, 0, 0)) in the right one, with t = P[0, 3] /
-    P[0, 0] of the right camera minus that of the left one (definition of sensor_msgs/CameraInfo).
-
-    Args:
-        left, right: messages of the two cameras.
-        rectified: whether the images are rectified, so that P instead of K and D is their calibration.
-        right_from_left: (4, 4) pose of the left camera in the axes of the right one, from /tf_static; used only if the
-            projection matrices have no baseline. None: not recorded.
-        file: bag and topic, for messages.
-
-    Raises:
-        TwinError: the messages have no baseline, or a value is impossible or not supported.
+    P[0, 0] of the right camera minus that of the left one (definition of sensor_msgs/CameraInfo). P, not K and D, is
+    the calibration of images that are `rectified`. Without a baseline in P, `right_from_left` (4, 4) of /tf_static is
+    used.
     """
     cameras = [_camera(info, rectified, file) for info in (left, right)]
     turns = [np.eye(3) if rectified else _rotation(info, file) for info in (left, right)]
@@ -57,7 +49,6 @@ def stereo_calibration(
 
 
 def _camera(info: Any, rectified: bool, file: Path) -> RecordedCamera:
-    """Returns the camera of a message; raises TwinError if its lens or a part of the image is not supported."""
     size = (int(info.width), int(info.height)) if info.width and info.height else None
     if rectified:
         return RecordedCamera(size, np.array(info.p, float).reshape(3, 4)[:, :3], np.zeros(0))
@@ -92,11 +83,7 @@ def _offset_m(info: Any, file: Path) -> float:
 
 
 def read_pair(_: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of two files camera_info (camera_calibration_parsers), given either of them.
-
-    Raises:
-        TwinError: the other file is missing, or a key or a value is not valid.
-    """
+    """Returns the calibration of two files camera_info, given either; raises TwinError if one is missing or wrong."""
     names = [re.sub("left|right", side, file.name, count=1, flags=re.IGNORECASE) for side in ("left", "right")]
     if names[0] == names[1]:
         raise TwinError(str(file), "is one camera of ROS, without the other one", "files called left and right")
@@ -105,7 +92,6 @@ def read_pair(_: Mapping[str, Any], file: Path) -> StereoCalibration:
 
 
 def _read_message(file: Path) -> SimpleNamespace:
-    """Returns the contents of a file camera_info with the names of the message."""
     tree = read_yaml(file)
     known = {*_SIZE_KEYS, "camera_name", "distortion_model", *(key for key, _ in _NUMBERS.values())}
     refuse_unknown((key for key in tree if key not in known), file)

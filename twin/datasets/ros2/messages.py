@@ -23,25 +23,20 @@ _UNKNOWN = np.array([_NOT_MEASURED, *[0.0] * 8])  # such a covariance
 
 
 class MessageFactory:
-    """Makes and serialises messages of ROS 2 Humble, given the time [ns] of a reading and the values in it.
-
-    Raises:
-        TwinError: the package rosbags is not installed.
-    """
+    """Makes and serialises messages of ROS 2 Humble, given the time [ns] of a reading and the values in it."""
 
     def __init__(self) -> None:
         typesys = optional("rosbags.typesys", "exchange", _PURPOSE)
         self.typestore: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
 
     def serialised(self, message: Any) -> Any:
-        """Returns a message serialised in CDR (Common Data Representation of the OMG)."""
         return self.typestore.serialize_cdr(message, message.__msgtype__)
 
     def compressed_image(self, time_ns: int, frame: str, kind: str, data: bytes) -> Any:
         """Returns sensor_msgs/CompressedImage with the bytes of an image file; `kind` is "png" or "jpeg".
 
-        The field `format` follows compressed_image_transport, for example "rgb8; png compressed bgr8": decoding of the
-        file gives bgr8, which is converted to rgb8 for the subscribers.
+        As in compressed_image_transport, "rgb8; png compressed bgr8" is a file of bgr8 that becomes rgb8 for
+        subscribers.
         """
         values = np.frombuffer(data, np.uint8)
         header = self._header(time_ns, frame)
@@ -74,25 +69,20 @@ class MessageFactory:
         return self._make("tf2_msgs/TFMessage", found)
 
     def attitude(self, time_ns: int, rpy_rad: Array, sigmas_rad: Array) -> Any:
-        """Returns sensor_msgs/Imu with the attitude of the body (3,) in the world, and the standard deviations (3,).
-
-        Angular rates and accelerations are marked as not measured.
-        """
+        """Returns sensor_msgs/Imu with the attitude of the body (3,) in the world, without rates and accelerations."""
         attitude = geometry.rotation_from_rpy(*(float(angle) for angle in rpy_rad))
         cov, zero = np.diag(np.square(sigmas_rad)).ravel(), np.zeros(3)
         return self._imu(time_ns, (attitude, cov), (zero, _UNKNOWN), (zero, _UNKNOWN))
 
     def inertial(self, time_ns: int, rates_radps: Array, forces_mps2: Array, sigmas: tuple[float, float]) -> Any:
-        """Returns sensor_msgs/Imu with angular rates (3,) and specific forces (3,) of the body in its own axes.
+        """Returns sensor_msgs/Imu with angular rates (3,) and specific forces (3,) in body axes, without orientation.
 
-        `sigmas` are the standard deviations of their white noise [rad/s, m/s2]. The orientation is marked as not
-        measured.
+        `sigmas` are the standard deviations of their white noise [rad/s, m/s2].
         """
         rate_cov, force_cov = (np.diag([sigma**2] * 3).ravel() for sigma in sigmas)
         return self._imu(time_ns, (np.eye(3), _UNKNOWN), (rates_radps, rate_cov), (forces_mps2, force_cov))
 
     def _imu(self, time_ns: int, attitude: tuple[Array, Array], *vectors: tuple[Array, Array]) -> Any:
-        """Returns sensor_msgs/Imu of a rotation (3, 3) and of vectors (3,), each with its covariance (9,)."""
         fields = [self._quaternion(attitude[0]), attitude[1].copy()]
         for vector, cov in vectors:
             fields += [self._vector(vector), cov.copy()]
@@ -112,7 +102,6 @@ class MessageFactory:
         return self._make("geometry_msgs/TwistWithCovarianceStamped", self._header(time_ns, BODY), twist)
 
     def _make(self, kind: str, *fields: Any) -> Any:
-        """Returns a message of a type (package/name) with the given values of its fields, in their order."""
         return self.typestore.types[kind.replace("/", "/msg/")](*fields)
 
     def _header(self, time_ns: int, frame: str) -> Any:
@@ -126,7 +115,6 @@ class MessageFactory:
         return self._vector(geometry.quaternion_xyzw(rotation), "geometry_msgs/Quaternion")
 
     def _place(self, pose: Array, kind: str) -> tuple[Any, Any]:
-        """Returns the position, as a message of a type, and the orientation of a pose (4, 4)."""
         return self._vector(pose[:3, 3], kind), self._quaternion(pose[:3, :3])
 
     def _twist(self, twist_body: Array, covariance: Array) -> Any:

@@ -26,13 +26,10 @@ _MIN_RELATIVE_PIVOT = 1e-13  # relative to the original diagonal entry; a smalle
 
 
 class CholeskyFactor(NamedTuple):
-    """Cholesky factor of a symmetric block matrix."""
-
     symbolic: SymbolicFactor  #: sparsity pattern and memory layout
     panels: Array  #: values of all panels in one long array; a panel holds L1^-1 above L2
 
     def solve(self, right: Array) -> Array:
-        """Returns the solution (n, 6) of the linear system of the factorised matrix with a right-hand side (n, 6)."""
         s = self.symbolic
         x = np.empty_like(right)
         x[s.permutation] = right
@@ -81,11 +78,9 @@ class BlockMatrix(NamedTuple):
 
     @classmethod
     def allocate(cls, symbolic: SymbolicFactor) -> BlockMatrix:
-        """Returns a matrix with this sparsity pattern and uninitialised values."""
         return cls(symbolic, np.empty(symbolic.offset[-1]))
 
     def clear(self) -> None:
-        """Sets all blocks to zero."""
         self.panels[:] = 0.0
 
     def add(self, first: int, blocks: Array) -> None:
@@ -93,11 +88,7 @@ class BlockMatrix(NamedTuple):
         _add(self.symbolic, first, blocks, self.panels)
 
     def factorise(self, diagonal: Array) -> CholeskyFactor:
-        """Returns the Cholesky factor of the matrix with these diagonal blocks (n, 6, 6); it overwrites the matrix.
-
-        Before the matrix is used again, it has to be cleared and filled, and the factor is then lost. Raises
-        LinAlgError if the matrix is not numerically positive definite.
-        """
+        """Returns the Cholesky factor with diagonal blocks (n, 6, 6), in place of the matrix. Raises LinAlgError."""
         s, original = self.symbolic, np.empty((len(diagonal), _D))
         original[s.permutation] = np.diagonal(diagonal, axis1=1, axis2=2)
         _set_diagonal(s, diagonal, self.panels)
@@ -156,10 +147,7 @@ def _factorise(s, original, panels):
 
 @kernel
 def _invert_root(matrix, original, inverse):
-    """Fills `inverse` (n, n) with that of the lower Cholesky factor of a dense matrix; False if not positive definite.
-
-    A pivot that is tiny relative to `original` (n,) counts as zero.
-    """
+    """Fills `inverse` with that of the Cholesky factor; False where a pivot is tiny relative to `original` (n,)."""
     root = np.zeros_like(matrix)
     for i in range(len(matrix)):
         for k in range(i):
@@ -184,10 +172,7 @@ def _invert_root(matrix, original, inverse):
 
 @kernel
 def _next_ancestor(s, positions, start):
-    """Finds the panel p that holds positions[start]: returns `end`, p and block rows.
-
-    positions[start:end] are its own positions, positions[end:] below it; the block rows are those of positions[start:].
-    """
+    """Finds the panel p that holds positions[start:end]: returns `end`, p and block rows of positions[start:] in p."""
     p, end = s.panel_of[positions[start]], start
     while end < len(positions) and positions[end] < s.panel_start[p + 1]:
         end += 1

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.linalg import splu
 
+from twin.core.records import Mask
 from twin.kernels import kernel
 
 Indices = NDArray[np.int64]
@@ -23,10 +24,7 @@ _MAX_EXTRA_BLOCKS = 8  # explicit zero blocks that merging a node into a panel m
 
 
 class SymbolicFactor(NamedTuple):
-    """Sparsity pattern and memory layout of a Cholesky factor.
-
-    The position of a node is its index in the elimination order, from 0.
-    """
+    """Sparsity pattern and memory layout of a Cholesky factor; a position is an index in the elimination order."""
 
     permutation: Indices  #: (n,) position of each node
     panel_start: Indices  #: (s + 1,) panel p of s panels holds the positions panel_start[p] to panel_start[p + 1] - 1
@@ -39,28 +37,19 @@ class SymbolicFactor(NamedTuple):
     offset: Indices
     panel_of: Indices  #: (n,) number of the panel that holds each position
     off_diagonal: Indices  #: (m, 2) row and column position of each off-diagonal block, row > column
-    #: (m,) true where the off-diagonal block (i, j) given to `analyse` has to be transposed, because node i is
-    #: eliminated before node j.
-    transposed: NDArray[np.bool_]
+    transposed: Mask  #: (m,) true where a block (i, j) has to be transposed, as node i is eliminated before node j
 
     def rows_below(self, panel: int) -> Indices:
-        """Returns the positions of the nonzero block rows below a panel, ascending."""
         return self.rows[self.row_start[panel] : self.row_start[panel + 1]]
 
     def parent(self, panel: int) -> int | None:
-        """Returns the parent of a panel in the elimination tree, None for a root.
-
-        It holds the first position below this panel; all other positions below are in the parent or below it.
-        """
+        """Returns the panel of the first position below this one, its parent in the elimination tree, or None."""
         below = self.rows_below(panel)
         return int(self.panel_of[below[0]]) if len(below) else None
 
 
 def analyse(n: int, i: Indices, j: Indices) -> SymbolicFactor:
-    """Returns the symbolic factor of a matrix of n x n blocks with the off-diagonal blocks (i, j), i not equal to j.
-
-    A pair of the nodes i, j (m,) may occur more than once.
-    """
+    """Returns the symbolic factor of n x n blocks with off-diagonal blocks (i, j), i not j; pairs may occur again."""
     permutation = _minimum_degree(n, i, j)
     panels = _supernodes(n, np.minimum(permutation[i], permutation[j]), np.maximum(permutation[i], permutation[j]))
     renumbered = np.empty(n, np.int64)  # makes the nodes of a panel consecutive
@@ -117,10 +106,7 @@ def _supernodes(n: int, early: Indices, late: Indices) -> list[tuple[list[int], 
 
 @kernel
 def _fill_in(n, start, later):
-    """Returns the rows below the diagonal of each column k: below[at[k] : at[k + 1]] (Davis 2006, chapter 4).
-
-    They are the later neighbours later[start[k] : start[k + 1]] of node k, and the rows of its children in the tree.
-    """
+    """Returns the rows below the diagonal of each column k: below[at[k] : at[k + 1]] (Davis 2006, chapter 4)."""
     at, below, marked_by = np.zeros(n + 1, np.int64), np.empty(4 * len(later) + n, np.int64), np.full(n, -1)
     last_child, previous_sibling = np.full(n, -1), np.full(n, -1)  # children of each node as linked lists
     for node in range(n):

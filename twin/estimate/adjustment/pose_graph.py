@@ -58,10 +58,7 @@ class BinaryFactors(NamedTuple):
 
 
 class FactorGraph(NamedTuple):
-    """Factor graph of poses and, optionally, one parameter shared by binary factors."""
-
     n_poses: int  #: number of poses
-    #: unary, binary: the factors, grouped by kind.
     unary: Sequence[UnaryFactors]
     binary: Sequence[BinaryFactors]
     #: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
@@ -76,8 +73,6 @@ class GraphState(NamedTuple):
 
 
 class _Evaluation(NamedTuple):
-    """A factor graph evaluated at a state."""
-
     state: GraphState  #: state at which the graph is evaluated
     cost: float  #: value of F
     unary: list[Array]  #: residuals (m, d) of each kind of unary factors
@@ -105,23 +100,18 @@ class Solution(NamedTuple):
     converged: bool  #: false if the iterations ended before the minimum was reached
     #: factor of the normal matrix of the poses, undamped, at the last linearisation.
     cholesky: block_cholesky.CholeskyFactor
-    #: derivatives (n, 6) of the optimal poses with respect to the shared parameter, and the marginal information of
-    #: this parameter; None if there is no shared parameter.
+    #: derivatives (n, 6) of the optimal poses by the shared parameter, if any, and its marginal information.
     border: tuple[Array, float] | None
 
     def marginals_in_place(self) -> Array:
-        """Returns the marginal covariances (n, 6, 6) of all poses, [rotation, translation] (rad, m) in camera axes.
-
-        Overwrites the Cholesky factor: no marginal can be computed afterwards.
-        """
+        """Returns the covariances (n, 6, 6) of all poses (rad, m), in camera axes; overwrites the Cholesky factor."""
         return self._add_shared(self.cholesky.invert_in_place(), slice(None))
 
     def marginal(self, k: int) -> Array:
-        """Returns the marginal covariance (6, 6) of pose k."""
         return self._add_shared(self.cholesky.inverse_block(k)[None], slice(k, k + 1))[0]
 
     def sample(self, rng: np.random.Generator) -> Array:
-        """Returns errors (n, 6) of all poses, drawn from their joint covariance; units and axes as of `marginal`."""
+        """Returns errors (n, 6) of all poses, drawn from their joint covariance; units and axes as of the marginals."""
         errors = self.cholesky.sample(rng.standard_normal((len(self.state.poses), 6)))
         if self.border is None:
             return errors
@@ -165,8 +155,6 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
 
 
 class _Step(NamedTuple):
-    """Solution of the damped normal equations."""
-
     damping: float  #: the diagonal of the pose block was multiplied by 1 + damping
     poses: Array  #: (n, 6) increments of the poses
     shared: float  #: increment of the shared parameter
@@ -209,7 +197,7 @@ def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
 
 
 def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
-    """Returns losses rho (m,) and robust weights (m,) of squared whitened norms; `huber` None: least squares."""
+    """Returns losses rho (m,) and robust weights (m,) of squared whitened norms."""
     if huber is None:
         return chi2 / 2, np.ones(len(chi2))
     length = np.sqrt(chi2)
@@ -252,16 +240,9 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
 
 @kernel
 def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient):
-    """Adds the contributions of binary factors to the diagonal blocks and gradients of both poses.
+    """Adds m binary factors to the diagonal blocks (n, 6, 6) and gradients (n, 6); fills the blocks (i, j) (m, 6, 6).
 
     The Jacobian with respect to the increment of pose i is J_i = -J_j Ad(j_from_i).
-
-    Args:
-        first, second, i_from_j: (m,), (m,), (m, 4, 4) indices i and j of the poses, and camera j in camera i.
-        by_j: (m, d, 6) Jacobians with respect to the increment of pose j.
-        information, weights, residuals: (m, d, d) information matrices, (m,) robust weights and (m, d) residuals.
-        diagonal, gradient: (n, 6, 6), (n, 6) changed in place.
-        off_diagonal: (m, 6, 6), filled with the blocks (i, j).
     """
     n = residuals.shape[1]
     half, matrix, slope, to_i = np.empty((6, n)), np.empty((6, 6)), np.empty(6), np.empty((6, 6))
@@ -306,7 +287,6 @@ def _add_border(first, second, by_j, weighted, i_from_j, border):
 
 
 def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float | None = None) -> BinaryFactors:
-    """Returns binary factors of measured motions, with the loss of `BinaryFactors.huber`."""
     columns = Links.from_sequence(links)
     measured, information = (np.ascontiguousarray(column) for column in (columns.i_from_j, columns.information))
     i, j = (np.array([index_of[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
@@ -368,7 +348,6 @@ def _matvec(matrices: Array, vectors: Array) -> Array:
 
 
 def _squared_norms(residuals: Array, information: Array) -> Array:
-    """Returns the squared Mahalanobis norms (m,) of residuals (m, d), given information matrices (m, d, d)."""
     return np.sum(residuals * _matvec(information, residuals), axis=1)
 
 

@@ -1,55 +1,34 @@
-"""Kalman depth filter along the path: depth (H, W) [m] and variance [m^2] of each pixel of the newest keyframe.
-
-The depths of pixels that are not propagated to the next keyframe are fused into the map (`elevation`), so that each
-depth enters the map exactly once.
-"""
+"""Kalman depth filter along the path; depths that are not propagated to the next keyframe enter the map, each once."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import StereoRig
+from twin.core.geometry import Array
+from twin.core.records import Map, Mask, StereoRig
 from twin.estimate.vision import epipolar
 from twin.estimate.vision.disparity import Disparity
 from twin.kernels import kernel
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-
 #: A measured depth z of variance R is accepted at a pixel where the filter has depth h of variance P if its innovation
 #: z - h satisfies (z - h)^2 < GATE (P + R). The value is the 99.9 % quantile of chi-square, one degree of freedom.
 GATE = 10.83
-#: Neighbouring pixels whose disparities differ by more than this [px] are taken to lie on different surfaces; depth is
-#: not interpolated between them.
+#: Depth is not interpolated between neighbours whose disparities differ by more: they are on different surfaces [px].
 JUMP_PX = 1.2
 #: Standard deviation of depth from motion due to errors other than image noise and pose [px of stereo disparity].
 MOTION_MIN_SIGMA_PX = 0.03
 
 
 class DepthMap(NamedTuple):
-    """Depth of every pixel of a left image, with its variance."""
-
     depth_m: Map  #: (H, W) float32 depth [m], NaN where unknown
     variance_m2: Map  #: (H, W) float32 variance of the depth [m^2], NaN where unknown
 
 
-class PropagatedDepth(NamedTuple):
-    """Result of `propagate`."""
-
-    fused: DepthMap  #: depth map of the new keyframe
-    inherited: Mask  #: (H, W) bool, true where the depth contains information from the old map
-
-
 def stereo_depth(disparity: Disparity, rig: StereoRig) -> DepthMap:
-    """Returns the depth map of a disparity map: Z = f b / d with the standard deviation Z^2 / (f b) sigma_d.
-
-    Disparities d below 0.5 px are set to 0.5 px.
-    """
+    """Returns the depth Z = f b / d of disparities d, at least 0.5 px, with standard deviation Z^2 / (f b) sigma_d."""
     focal_baseline = np.float32(rig.focal_px * rig.baseline_m)
     depth = focal_baseline / np.maximum(disparity.disparity_px, np.float32(0.5))
     variance = (depth * depth / focal_baseline * disparity.sigma_px) ** 2
@@ -66,16 +45,17 @@ def fuse(prior: DepthMap, measured: DepthMap) -> DepthMap:
     return fused
 
 
-def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig) -> PropagatedDepth:
+def propagate(
+    old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array, rig: StereoRig
+) -> tuple[DepthMap, Mask]:
     """Propagates the old depth map to the new keyframe and fuses it with the new stereo depth (as `fuse` does).
 
     Each new pixel is linearised at its stereo depth (or, without one, at the smallest depth of the old points that
     project there) and projected into the old image, whose map is interpolated except across discontinuities. The
-    difference of depth is converted, with the surface normal, to one along the ray of the new pixel.
+    difference of depth is converted, with the surface normal, to one along the ray of the new pixel. `step_cov` (6, 6)
+    is that of the relative pose [rotation, translation] (rad, m), in the new camera axes.
 
-    Args:
-        new_from_old: (4, 4) pose of the old camera in the new camera.
-        step_cov: (6, 6) covariance of the relative pose [rotation, translation] (rad, m), in the new camera axes.
+    Returns the new depth map, and a mask (H, W) of the pixels whose depth has information from the old map.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     guess = new.depth_m.copy()
@@ -83,7 +63,7 @@ def propagate(old: DepthMap, new: DepthMap, new_from_old: Array, step_cov: Array
     old_from_new, focal_baseline = geometry.inverse(new_from_old), rig.focal_px * rig.baseline_m
     prior = _backward_warp(*old, guess, old_from_new, step_cov, camera, focal_baseline, JUMP_PX)
     fused = DepthMap(new.depth_m.copy(), new.variance_m2.copy())
-    return PropagatedDepth(fused, _fuse(*fused, *prior, GATE))
+    return fused, _fuse(*fused, *prior, GATE)
 
 
 def motion_depth(
@@ -94,25 +74,21 @@ def motion_depth(
     Exact two-view form of eq. 1 of Negahdaripour & Madjidi (2003): the difference between actual and predicted flow
     along the epipolar line, measured with the window of stereo, is linear in the error of the inverse depth. Dense
     two-dimensional flow is not used: its bias of about 0.1 px is common to the whole image and would remain in the map.
-
-    Args:
-        gray, old_gray: (H, W) float32 grey levels of the left images of the new and the old keyframe.
-        step_cov: as in `propagate`.
+    Grey levels (H, W) are those of the left images; `step_cov` as in `propagate`.
     """
     focal_baseline = rig.focal_px * rig.baseline_m
     view = epipolar.two_view(old_from_new, rig.matrix, rig.baseline_m)
     flow = epipolar.refine(gray, old_gray, np.float32(focal_baseline) / current.depth_m, view, iterations=1)
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
-    pose_variance = _pose_variance(
-        flow.disparity_px, np.ascontiguousarray(old_from_new), step_cov, camera, focal_baseline
-    )
+    pose = np.ascontiguousarray(old_from_new)
+    pose_variance = _pose_variance(flow.disparity_px, pose, step_cov, camera, focal_baseline)
     sigma = np.sqrt(flow.measurement_sigma_px**2 + pose_variance + np.float32(MOTION_MIN_SIGMA_PX**2))
     return stereo_depth(Disparity(flow.disparity_px, sigma), rig)
 
 
 @kernel
 def _fuse(depth, variance, measured, measured_variance, gate):
-    """Compiled kernel of `fuse`: updates `depth` and `variance` in place; returns a mask (H, W) of updated pixels."""
+    """Updates `depth` and `variance` in place; returns a mask (H, W) of updated pixels."""
     updated = np.zeros(depth.shape, np.bool_)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -149,12 +125,7 @@ def _forward_project(old, new_from_old, guess, camera):
 
 @kernel(inline="always")
 def _transform_pixel(u, v, depth, pose, camera):
-    """Returns x, y, z [m] in the other camera of the point at pixel (u, v) and depth [m] in the first.
-
-    Args:
-        pose: (4, 4) pose of the first camera in the other.
-        camera: focal length, column and row of the principal point [px].
-    """
+    """Returns x, y, z [m] in another camera, in which this one has a pose (4, 4), of a pixel (u, v) at a depth [m]."""
     focal, cx, cy = camera
     x, y = (u - cx) / focal * depth, (v - cy) / focal * depth
     return (
@@ -166,10 +137,7 @@ def _transform_pixel(u, v, depth, pose, camera):
 
 @kernel(inline="always")
 def _bilinear(depth, variance, x, y, focal_baseline, jump):
-    """Returns depth and variance at column x and row y, interpolated (inverse depth, linear on planes, and variance).
-
-    NaN if a neighbouring pixel is unknown, on another surface (disparities differ by `jump` [px]) or outside.
-    """
+    """Returns depth and variance at (x, y); NaN next to an unknown pixel, another surface or the border."""
     height, width = depth.shape
     if not (0 <= x <= width - 1 and 0 <= y <= height - 1):
         return np.nan, np.nan
@@ -240,11 +208,7 @@ def _backward_warp(old, old_variance, guess, pose, step_cov, camera, focal_basel
 
 @kernel(inline="always")
 def variance_along(px, py, pz, nx, ny, nz, cov):
-    """Returns the variance of the displacement of a point p [m] along n, due to an error of the pose of its axes.
-
-    Args:
-        cov: (6, 6) covariance of the pose [rotation, translation] (rad, m).
-    """
+    """Returns the variance of the displacement of a point p [m] along n, due to an error of the pose of its axes."""
     row = (py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx, nx, ny, nz)
     total = 0.0
     for i in range(6):
@@ -255,11 +219,7 @@ def variance_along(px, py, pz, nx, ny, nz, cov):
 
 @kernel
 def _pose_variance(disparity, pose, step_cov, camera, focal_baseline):
-    """Returns the variance (H, W) [px^2] of the disparity from motion that is due to the error of the relative pose.
-
-    NaN where depth does not displace the image point (epipole, no translation); 0 without disparity, and everywhere if
-    `step_cov` is zero.
-    """
+    """Returns the variance (H, W) [px^2] of disparity from motion due to that of the pose; NaN at the epipole."""
     height, width = disparity.shape
     focal, cx, cy = camera
     result = np.zeros(disparity.shape, np.float32)

@@ -8,22 +8,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import ElevationMap, Image, MapGrid
-from twin.estimate.mapping.depth_filter import GATE, Mask
+from twin.core.geometry import Array
+from twin.core.records import ElevationMap, Image, Map, MapGrid, Mask
+from twin.estimate.mapping.depth_filter import GATE
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.mapping.visibility import hidden, main_surface
 from twin.kernels import kernel
-
-Map = NDArray[np.float32]
 
 #: The higher of two hypotheses is chosen if the depth variance of the lower one is more than this many times larger.
 _VARIANCE_RATIO = 10.0
 #: Measured probability that the chosen hypothesis of a cell with two hypotheses is wrong.
 _WRONG_CHOICE = 0.16
-#: For a cell at a right-angled corner of a step, number of its eight neighbours on its own side of the step. At a
-#: straight step, it is 5.
+#: For a cell at a right-angled corner of a step, number of neighbours on its own side (at a straight step: 5).
 _NEIGHBOURS_AT_CORNER = 3
-#: Connected groups of known cells with fewer cells than this are removed.
 MIN_CELLS = 12
 #: Row and column of the eight neighbours of a cell in a window of 3 x 3 cells.
 _NEIGHBOURS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2))
@@ -56,20 +53,15 @@ class ElevationMapper:
         self._variance = np.full((2, *shape), np.inf, np.float32)
         self._systematic = np.zeros((2, *shape), np.float32)
         self._camera = np.full((2, *shape), -1, np.int32)  # index in `_cameras_m` of the last measurement
-        self._cameras_m: list[NDArray[np.float64]] = []
+        self._cameras_m: list[Array] = []
         self._colour = np.zeros((*shape, 4), np.float32)
         self._lateral_m: list[float] = [0.0, 0.0]  # sum and number of the lateral errors of the patches
 
     def fuse(self, patch: HeightPatch, successor: HeightPatch | None = None, inherited: Mask | None = None) -> None:
         """Fuses those cells of a patch into the map that were not propagated to the next keyframe.
 
-        A cell was propagated if the successor has a height for it, at a pixel whose depth contains information from
-        this keyframe, and the two heights agree.
-
-        Args:
-            successor: heights of the next keyframe; None for the last one, or if the next one is outside the grid.
-            inherited: (H, W) bool, pixels of the next keyframe whose depth contains information from this keyframe
-                (`depth_filter.PropagatedDepth`).
+        A cell was propagated if the successor, the patch of the next keyframe, has a height for it, at a pixel whose
+        depth contains information from this keyframe (mask `inherited` (H, W)), and the two heights agree.
         """
         self._lateral_m = [self._lateral_m[0] + patch.lateral_m, self._lateral_m[1] + 1]
         height = patch.height_m
@@ -83,15 +75,10 @@ class ElevationMapper:
         _fuse_cells(patch.row, patch.col, height, *patch[3:5], camera, GATE, *layers)
 
     def add_colours(self, patch: HeightPatch, rgb: Image, gain: Map) -> None:
-        """Adds an image to the orthomosaic, a weighted mean of images whose weights decrease from their centres.
-
-        Args:
-            gain: (H, W, 3) factors by which the image is multiplied to make its illumination uniform.
-        """
+        """Adds an image, times its gain (H, W, 3), to the orthomosaic; weights decrease from the image centre."""
         _add_colours(patch.row, patch.col, patch.height_m, patch.pixel, rgb, gain, self._colour)
 
     def _choice(self) -> NDArray[np.int64]:
-        """Returns the index (1, rows, cols), 0 or 1, of the chosen hypothesis of each cell."""
         low, high = np.argsort(self._height, axis=0)[:, None]
         precise = _taken(self._variance, high) * _VARIANCE_RATIO < _taken(self._variance, low)
         chosen = np.where(np.isfinite(_taken(self._height, high)) & precise, high, low)
@@ -113,7 +100,6 @@ class ElevationMapper:
                 np.put_along_axis(layers, which, kept[None], 0)
 
     def result(self) -> ElevationMap:
-        """Returns the map: the chosen height of each cell, its standard deviation and the orthomosaic."""
         self._drop_hidden()
         chosen, gap = self._choice(), self._height.max(axis=0) - self._height.min(axis=0)
         height, variance, systematic = (
@@ -141,8 +127,7 @@ def _taken(layers: NDArray[Any], which: NDArray[np.int64]) -> Any:
 def _isolated(height: Map, other: Map) -> Mask:
     """Returns a mask (rows, cols) of the cells whose neighbours support the other hypothesis, not the chosen one.
 
-    Of at least five known neighbours, fewer than `_NEIGHBOURS_AT_CORNER` are at least as near to `height` as to
-    `other`: usually a mismatch, because a cell next to a real step has more neighbours on its own side.
+    Of at least five known neighbours, fewer than `_NEIGHBOURS_AT_CORNER` are nearer to `height`: usually a mismatch.
     """
     around = np.lib.stride_tricks.sliding_window_view(np.pad(height, 1, constant_values=np.nan), (3, 3))
     known, agreeing = np.zeros(height.shape, np.int8), np.zeros(height.shape, np.int8)
@@ -234,7 +219,6 @@ def _remove_propagated(
 def _fuse_cells(
     row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
 ):  # fmt: skip
-    """Fuses each height of a patch with the hypotheses of its cell (see `ElevationMapper`), in place."""
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]

@@ -31,8 +31,6 @@ _MIN_LEVEL = 4.0  # darkest mean colour that is used [grey levels]
 
 
 class PatchColours(NamedTuple):
-    """Mean colours of n patches of the floor in one image."""
-
     patch: NDArray[np.int64]  #: (n,) number of each patch
     log_colour: Array  #: (n, 3) natural logarithm of the mean colour of each patch [grey levels]
     position: Array  #: (n, 2) normalised image coordinates of the centre of each patch
@@ -48,11 +46,7 @@ def reported_factors(exposures: Sequence[Exposure | None]) -> Array | None:
 
 
 def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Array:
-    """Returns the centres (n, 3) of the patches in the axes of the map [m]: known cells about `_PATCH_PX` pixels apart.
-
-    Args:
-        depth_m: depth of the floor in the images.
-    """
+    """Returns the centres (n, 3) of the patches in map axes [m]: known cells about `_PATCH_PX` pixels apart."""
     step = max(1, round(_PATCH_PX * depth_m / rig.focal_px / elevation.grid.cell_m))
     x, y = elevation.grid.centres()
     height = elevation.height_m[::step, ::step]
@@ -61,11 +55,7 @@ def patch_points(elevation: ElevationMap, rig: StereoRig, depth_m: float) -> Arr
 
 
 def patch_colours(image: Image, world_from_camera: Array, rig: StereoRig, points: Array) -> PatchColours:
-    """Returns the mean colours of the patches at points (n, 3) of the floor in one image, weighted by a Gaussian.
-
-    Patches that are not completely in the image, or are too dark, are left out. Pose and points are in the axes of the
-    map [m].
-    """
+    """Returns the Gaussian mean colours of patches (n, 3) [m] that are completely in an image and not too dark."""
     pixel = np.nan_to_num(rig.project(geometry.transform(geometry.inverse(world_from_camera), points)), nan=-1.0)
     last = np.array([rig.width_px - 1, rig.height_px - 1]) - _PATCH_PX / 2
     patch = np.flatnonzero(((pixel >= _PATCH_PX / 2) & (pixel <= last)).all(axis=1))

@@ -46,10 +46,7 @@ def footprint_grid(result: SurveyResult, rig: StereoRig, most_cells: float = _MO
 def footprint_tiles(
     result: SurveyResult, rig: StereoRig, most_cells: float = _MOST_CELLS, side: int = _TILE_CELLS
 ) -> list[MapTile]:
-    """Returns the tiles of the map with cells of three pixels that images show, if it has more than `most_cells` cells.
-
-    Empty for a smaller map, whose cells `footprint_grid` does not enlarge; `side` is the side of a tile in cells.
-    """
+    """Returns the tiles, of `side` cells of three pixels, that images show; none for up to `most_cells` cells."""
     whole = footprint_grid(result, rig, np.inf)
     if whole.rows * whole.cols <= most_cells * (1 + 1e-3):  # of rounding to whole cells
         return []
@@ -64,17 +61,18 @@ def footprint_tiles(
         for row in range(a[1], b[1] + 1):
             for col in range(a[0], b[0] + 1):
                 shown.setdefault((row, col), []).append(number)
-    return [
-        MapTile(row, col, _tile_grid(whole, row * side, col * side, side), np.array(numbers, np.int64))
-        for (row, col), numbers in sorted(shown.items())
-    ]
+    tiles = []
+    for (row, col), numbers in sorted(shown.items()):
+        rows, cols = min(side, whole.rows - row * side), min(side, whole.cols - col * side)
+        grid = window(whole, row * side, col * side, rows, cols)
+        tiles.append(MapTile(row, col, grid, np.array(numbers, np.int64)))
+    return tiles
 
 
 def steps_between(step_cov: Array, keyframes: NDArray[np.int64]) -> Array:
-    """Returns the covariance (m, 6, 6) of each of the chosen keyframes (m,), m > 0, relative to the chosen one before.
+    """Returns the covariance (m, 6, 6) of each chosen keyframe (m,), m > 0, relative to the chosen one before.
 
-    It is the sum of the covariances `step_cov` (n, 6, 6) of the steps between them, without their lever arms: between
-    keyframes that are far apart, nothing is propagated.
+    It sums `step_cov` (n, 6, 6) without lever arms, as nothing is propagated between keyframes that are far apart.
     """
     first, until = step_cov[keyframes[:1]], step_cov[: keyframes[-1] + 1]
     if len(keyframes) == 1:
@@ -83,7 +81,6 @@ def steps_between(step_cov: Array, keyframes: NDArray[np.int64]) -> Array:
 
 
 def with_margin(grid: MapGrid, cells: int) -> MapGrid:
-    """Returns a grid that is larger by a number of cells on each side."""
     return window(grid, -cells, -cells, grid.rows + 2 * cells, grid.cols + 2 * cells)
 
 
@@ -95,8 +92,3 @@ def _corners(result: SurveyResult, rig: StereoRig) -> Array:
     return np.array(
         [geometry.transform(p, rays * d)[:, :2] for p, d in zip(poses, result.keyframe_depth_m, strict=True)]
     )
-
-
-def _tile_grid(grid: MapGrid, row: int, col: int, side: int) -> MapGrid:
-    """Returns the grid of at most `side` rows and columns from cell (row, col) on."""
-    return window(grid, row, col, min(side, grid.rows - row), min(side, grid.cols - col))

@@ -7,20 +7,16 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import ElevationMap, Image, MapGrid, StereoRig
+from twin.core.geometry import Array
+from twin.core.records import ElevationMap, Image, Map, MapGrid, Mask, StereoRig
 from twin.core.threads import prefetched
 from twin.estimate.mapping import depth_filter, elevation, surface
-from twin.estimate.mapping.depth_filter import DepthMap, Mask
-from twin.estimate.mapping.mean_illumination import MeanIllumination
+from twin.estimate.mapping.depth_filter import DepthMap
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.vision import disparity
-from twin.estimate.vision.light_pattern import LightPattern
-
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
+from twin.estimate.vision.light_pattern import MeanIllumination
 
 #: Largest standard deviation of a stereo disparity that enters the map [px]. Beyond this limit, texture is as weak as
 #: noise, and half of the pixels are mismatches. A limit of 1 px doubles the number of cells with errors above 0.1 m; a
@@ -31,34 +27,18 @@ MAX_STEREO_SIGMA_PX = 0.5
 MAX_RELATIVE_SIGMA = 0.2
 
 
-class KeyframeImages(NamedTuple):
-    """Stereo pair of a keyframe."""
-
-    left: Image
-    right: Image
+ImagePair = tuple[Image, Image]  # left and right image (H, W, 3)
 
 
 class KeyframePath(NamedTuple):
-    """Poses of the n keyframes of a map, with their covariances."""
+    """Poses of n keyframes, and covariances [rotation, translation] (rad, m) in the axes of each left camera."""
 
     world_from_camera: Array  #: (n, 4, 4) poses of the left camera
-    pose_cov: Array  #: (n, 6, 6) covariance of each pose [rotation, translation] (rad, m), in camera axes
-    #: (n, 6, 6) covariance of each pose relative to the previous pose, in the same units and axes (the first is not
-    #: used); None if the relative poses are exact.
-    step_cov: Array | None = None
-
-
-class _StereoDepth(NamedTuple):
-    """Stereo pair with its stereo depth, before the depth is fused by the filter."""
-
-    pair: KeyframeImages  #: colour images
-    gray: Map  #: (H, W) float32 grey levels of the left image, without the light pattern
-    depth: DepthMap  #: depth map of the left image, from this stereo pair alone
+    pose_cov: Array  #: (n, 6, 6) covariance of each pose
+    step_cov: Array  #: (n, 6, 6) covariance of each pose relative to the previous one; the first is not used
 
 
 class _FilterState(NamedTuple):
-    """State of the depth filter at a keyframe."""
-
     depth: DepthMap  #: filtered depth map
     gray: Map  #: (H, W) float32 grey levels of the left image, without the light pattern
     pose: Array  #: (4, 4) world_from_camera
@@ -66,59 +46,52 @@ class _FilterState(NamedTuple):
 
 
 def build_map(
-    keyframes: Iterable[KeyframeImages],
+    pairs: Iterable[ImagePair],
     path: KeyframePath,
     rig: StereoRig,
     grid: MapGrid,
-    progress: Callable[[int], None] | None = None,
-    pattern: LightPattern | None = None,
+    progress: Callable[[int], None] = lambda _: None,
+    pattern: Map | None = None,
 ) -> ElevationMap:
-    """Returns the elevation map with its standard deviation and orthomosaic, built from the keyframes along the path.
-
-    Args:
-        progress: called with the number of keyframes processed so far.
-        pattern: light pattern of the images, which is subtracted before matching.
-    """
+    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far."""
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     search_range = disparity.SearchRange(rig)
-    poses = path.world_from_camera
-    step_cov = np.zeros((len(poses), 6, 6)) if path.step_cov is None else path.step_cov
-    old = None
-    stereo = prefetched(_measure_depth(pair, search_range, rig, pattern) for pair in keyframes)
-    for k, (pair, gray, stereo_depth) in enumerate(stereo):
+    poses, old = path.world_from_camera, None
+    stereo = prefetched(_measure_depth(pair, search_range, rig, pattern) for pair in pairs)
+    for k, (left, gray, stereo_depth) in enumerate(stereo):
         depth, inherited = stereo_depth, None
         if old is not None:
-            depth, inherited = _advance(old, stereo_depth, gray, poses[k], step_cov[k], rig)
+            depth, inherited = _advance(old, stereo_depth, gray, poses[k], path.step_cov[k], rig)
         patch = surface.rasterise(depth, poses[k], path.pose_cov[k], rig, grid)
         if old is not None and old.patch is not None:
             mapper.fuse(old.patch, patch, inherited)
         if patch is not None:
-            illumination.add(pair.left)
-            mapper.add_colours(patch, pair.left, illumination.gain())
+            illumination.add(left)
+            mapper.add_colours(patch, left, illumination.gain())
         old = _FilterState(depth, gray, poses[k], patch)
-        if progress is not None:
-            progress(k + 1)
+        progress(k + 1)
     if old is not None and old.patch is not None:
         mapper.fuse(old.patch)
     return mapper.result()
 
 
-def gray_levels(pair: KeyframeImages) -> tuple[Map, Map]:
+def gray_levels(pair: ImagePair) -> tuple[Map, Map]:
     """Returns the grey levels (H, W) of the left and the right image, not rounded to whole levels."""
     left, right = (np.asarray(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), np.float32) for image in pair)
     return left, right
 
 
 def _measure_depth(
-    pair: KeyframeImages, search_range: disparity.SearchRange, rig: StereoRig, pattern: LightPattern | None
-) -> _StereoDepth:
+    pair: ImagePair, search_range: disparity.SearchRange, rig: StereoRig, pattern: Map | None
+) -> tuple[Image, Map, DepthMap]:
+    """Returns the left image, its grey levels without the light pattern, and its depth from this pair alone."""
     left, right = gray_levels(pair)
     if pattern is not None:
-        left, right = left - pattern.left, right - pattern.right
+        left, right = left - pattern[0], right - pattern[1]
     stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
     stereo = stereo.with_sigma_below(np.minimum(MAX_STEREO_SIGMA_PX, MAX_RELATIVE_SIGMA * stereo.disparity_px))
     search_range.update(stereo.disparity_px)
-    return _StereoDepth(pair, left, depth_filter.stereo_depth(stereo, rig))
+    return pair[0], left, depth_filter.stereo_depth(stereo, rig)
 
 
 def _advance(
@@ -126,6 +99,6 @@ def _advance(
 ) -> tuple[DepthMap, Mask]:
     """Returns the filtered depth of the next keyframe, and a mask (H, W) of the pixels that inherit from `old`."""
     old_from_new = geometry.inverse(old.pose) @ pose
-    propagated = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)
-    motion = depth_filter.motion_depth(gray, old.gray, propagated.fused, old_from_new, step_cov, rig)
-    return depth_filter.fuse(propagated.fused, motion), propagated.inherited
+    fused, inherited = depth_filter.propagate(old.depth, stereo_depth, geometry.inverse(old_from_new), step_cov, rig)
+    motion = depth_filter.motion_depth(gray, old.gray, fused, old_from_new, step_cov, rig)
+    return depth_filter.fuse(fused, motion), inherited

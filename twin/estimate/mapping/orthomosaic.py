@@ -1,8 +1,4 @@
-"""Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture seen from above.
-
-It is made tile by tile (`twin.core.ortho_tiles.tile_side_px`); one tile (24 bytes per pixel) and two images are in
-memory at a time, whatever the size of the survey.
-"""
+"""Orthomosaic: all keyframe images, rectified by the estimated map and poses, in one picture, made tile by tile."""
 
 from __future__ import annotations
 
@@ -14,17 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.ortho_tiles import OrthoTile, finer_grid, tile_side_px, window
-from twin.core.records import Array, ElevationMap, Exposure, Image, MapGrid, StereoRig
+from twin.core.records import Array, ElevationMap, Exposure, Image, Map, MapGrid, Mask, StereoRig
 from twin.core.threads import prefetched
-from twin.estimate.mapping.exposure_balance import (
-    estimated_factors,
-    patch_colours,
-    patch_points,
-    reported_factors,
-)  # fmt: skip
-from twin.estimate.mapping.orthophoto import Colours, OrthoLayers, add_view, empty_layers, footprint
-
-Map = NDArray[np.float32]
+from twin.estimate.mapping.exposure_balance import estimated_factors, patch_colours, patch_points, reported_factors
+from twin.estimate.mapping.orthophoto import OrthoLayers, add_view, empty_layers, footprint
 
 #: Width of the margin around a tile: the floor in it is taken into account as it may hide pixels of the tile [px].
 _MARGIN_PX = 64
@@ -33,8 +22,6 @@ _FILLED_CELLS = 3
 
 
 class Views(NamedTuple):
-    """Images from which an orthomosaic is made."""
-
     world_from_camera: Array  #: (n, 4, 4) poses of the cameras in the axes of the map
     depth_m: Array  #: (n,) median depth of the floor in each image [m]
     exposures: Sequence[Exposure | None]  #: exposure of each image, None where the cameras did not report it
@@ -43,10 +30,7 @@ class Views(NamedTuple):
 
 
 class Restore(Protocol):
-    """Removes the effects of lamps and water from an image: returns the albedo (H, W, 3) float32, 255 = white.
-
-    The pose (4, 4) of the camera is in the axes of the map.
-    """
+    """Removes the effects of lamps and water: returns the albedo (H, W, 3) float32, 255 = white; pose in map axes."""
 
     def __call__(self, image: Image, exposure: Exposure | None, world_from_camera: Array, /) -> Map: ...
 
@@ -56,15 +40,12 @@ def orthomosaic(
     elevation: ElevationMap,
     rig: StereoRig,
     restore: Restore | None = None,
-    progress: Callable[[float], None] | None = None,
+    progress: Callable[[float], None] = lambda _: None,
 ) -> Iterator[OrthoTile]:
     """Yields all tiles of the orthomosaic, row by row from the north-west, also those without any colour.
 
     The pixels divide the cells of the map and are not larger than the median ground sample distance of the images.
-
-    Args:
-        restore: function that removes the effects of lamps and water. None: colours as seen, at equal exposure.
-        progress: called with the finished fraction, 0 to 1.
+    Without `restore`, colours are as seen, at equal exposure. `progress` is called with the finished fraction, 0 to 1.
     """
     grid = ortho_grid(views, elevation, rig)
     factors = np.ones((len(views.depth_m), 3)) if restore else _exposure_factors(views, elevation, rig)
@@ -79,16 +60,14 @@ def orthomosaic(
     for (row, col), part, numbers in zip(tiles, parts, touching, strict=True):
         layers = empty_layers(part, heights_of(elevation, part))
         prepared = prefetched(_colours(views, k, factors[k], restore) for k in numbers)
-        for k, colours in zip(numbers, prepared, strict=True):
-            add_view(layers, colours, views.world_from_camera[k], rig, heights_m)
+        for k, (rgb, saturated) in zip(numbers, prepared, strict=True):
+            add_view(layers, rgb, saturated, views.world_from_camera[k], rig, heights_m)
             n_done += 1
-            if progress is not None:
-                progress(n_done / n_all)
+            progress(n_done / n_all)
         yield OrthoTile(grid, row, col, _rgba(layers)[_MARGIN_PX:-_MARGIN_PX, _MARGIN_PX:-_MARGIN_PX])
 
 
 def ortho_grid(views: Views, elevation: ElevationMap, rig: StereoRig) -> MapGrid:
-    """Returns the grid of an orthomosaic: pixels that divide the cells of the map, up to the median sample distance."""
     return finer_grid(elevation.grid, float(np.median(views.depth_m)) / rig.focal_px)
 
 
@@ -112,7 +91,7 @@ def heights_of(elevation: ElevationMap, part: MapGrid) -> Map:
     return np.ascontiguousarray(fine[top : top + part.rows, left : left + part.cols], np.float32)
 
 
-def _filled(height: Map) -> tuple[Map, NDArray[np.bool_]]:
+def _filled(height: Map) -> tuple[Map, Mask]:
     """Returns heights with NaN replaced by the nearest known (0: none), and a mask of known cells and small holes."""
     unknown = np.isnan(height)
     if unknown.all():
@@ -147,18 +126,18 @@ def _touching(boxes: Array, part: MapGrid) -> NDArray[np.int64]:
     return np.flatnonzero((west < east_m) & (east > part.west_m) & (south < part.north_m) & (north > south_m))
 
 
-def _colours(views: Views, k: int, factor: Array, restore: Restore | None) -> Colours:
-    """Returns the colours of an image: restored, or multiplied by the factor (3,) of its exposure."""
+def _colours(views: Views, k: int, factor: Array, restore: Restore | None) -> tuple[Map, Image]:
+    """Returns an image, restored or multiplied by the factor (3,) of its exposure, and `saturated` of `add_view`."""
     image = views.load(int(k))
     saturated = cv2.dilate((image.max(axis=2) == 255).astype(np.uint8), np.ones((3, 3), np.uint8))
     if restore is None:
-        return Colours(image * factor.astype(np.float32), np.asarray(saturated, np.uint8))
-    rgb = restore(image, views.exposures[k], views.world_from_camera[k])
-    return Colours(rgb, np.asarray(saturated, np.uint8))
+        rgb = image * factor.astype(np.float32)
+    else:
+        rgb = restore(image, views.exposures[k], views.world_from_camera[k])
+    return rgb, np.asarray(saturated, np.uint8)
 
 
-def _rgba(layers: OrthoLayers) -> NDArray[np.uint8]:
-    """Returns the colours and alpha (rows, cols, 4) of layers; alpha is 255 where there is a colour, else 0."""
+def _rgba(layers: OrthoLayers) -> Image:
     known = layers.weight > 0
     rgba = np.zeros((*known.shape, 4), np.uint8)
     rgba[known, :3] = np.clip(layers.colour[known] / layers.weight[known][:, None] + 0.5, 0, 255)

@@ -11,14 +11,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.interpolation import catmull_rom_weights
-from twin.core.records import Array, MapGrid, StereoRig
+from twin.core.records import Array, Image, Map, MapGrid, StereoRig
 from twin.kernels import kernel
-
-Map = NDArray[np.float32]
 
 #: K of the weight. Between two cameras 0.15 heights apart, the seam (10 % to 90 % of the weight) is 0.06 heights wide:
 #: 17 pixels of an image with a focal length of 277 px.
@@ -42,17 +39,15 @@ class OrthoLayers(NamedTuple):
 
 
 def empty_layers(grid: MapGrid, height_m: Map) -> OrthoLayers:
-    """Returns the layers of a grid before the first view, given the heights (rows, cols) of its pixels [m]."""
     shape = grid.rows, grid.cols
     best = np.full(shape, np.inf, np.float32)
     return OrthoLayers(grid, height_m, np.zeros((*shape, 3), np.float32), np.zeros(shape, np.float32), best)
 
 
 def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]) -> Array:
-    """Returns the bounding box (west, south, east, north) [m] of all floor that an image can show.
+    """Returns the bounding box (west, south, east, north) [m] of all floor between two heights that an image can show.
 
-    It encloses the parts of the corner rays between the highest and the lowest floor (`heights_m`), from the camera if
-    that is lower; infinite if the camera is not above the lowest floor or a ray does not point downwards.
+    Infinite if the camera is not above the lowest floor or a corner ray does not point downwards.
     """
     u, v = np.array([-0.5, rig.width_px - 0.5]), np.array([-0.5, rig.height_px - 0.5])
     corners = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
@@ -65,19 +60,18 @@ def footprint(world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, 
     return np.concatenate([at.min(axis=0), at.max(axis=0)])
 
 
-class Colours(NamedTuple):
-    """Colours of an image."""
-
-    rgb: Map  #: (H, W, 3) float32 red, green and blue, 0 to 255 (values above are possible)
-    #: (H, W) uint8, 1 where the colour is not reliable because the image is saturated there or at a neighbouring pixel,
-    #: else 0.
-    saturated: NDArray[np.uint8]
-
-
 def add_view(
-    layers: OrthoLayers, colours: Colours, world_from_camera: Array, rig: StereoRig, heights_m: tuple[float, float]
+    layers: OrthoLayers,
+    rgb: Map,
+    saturated: Image,
+    world_from_camera: Array,
+    rig: StereoRig,
+    heights_m: tuple[float, float],
 ) -> None:
-    """Adds an image to the layers, in place; the pose (4, 4) of its camera is in the axes of the map."""
+    """Adds an image (H, W, 3), seen at a pose (4, 4) in map axes, to the layers, in place.
+
+    `saturated` (H, W) is 1 where the colour is not reliable, because this pixel or a neighbour is saturated, else 0.
+    """
     grid = layers.grid
     bounds = _pixels_within(footprint(world_from_camera, rig, heights_m), grid)
     if bounds[0] >= bounds[1] or bounds[2] >= bounds[3]:
@@ -92,9 +86,9 @@ def add_view(
         np.append(world_from_camera[:3, 3] - north_west, grid.cell_m),
         np.array([rig.focal_px, rig.cx_px, rig.cy_px]),
     )
-    nearest = np.full(colours.saturated.shape, np.inf, np.float32)
+    nearest = np.full(saturated.shape, np.inf, np.float32)
     _mark_nearest(layers.height_m, *bounds, *view, nearest)
-    _blend(*layers[1:], *bounds, *view, *colours, nearest)
+    _blend(*layers[1:], *bounds, *view, rgb, saturated, nearest)
 
 
 def _pixels_within(box_m: Array, grid: MapGrid) -> tuple[int, int, int, int]:
@@ -129,16 +123,10 @@ def _blend(
     height, colour, weight, best, first, end, left, right, steps, origin, camera_at, camera, image, clipped,
     nearest,
 ):  # fmt: skip
-    """Adds the colours of an image to `colour`, `weight` and `best`, see `OrthoLayers`.
+    """Adds the colours of an image to `colour`, `weight` and `best` (see `OrthoLayers`) in these rows and columns.
 
-    Args:
-        first, end, left, right: first row, end row, first column and end column of the pixels to process; ends are
-            exclusive.
-        steps: (3, 3) columns: displacement in camera axes per column, per row and per metre of height [m].
-        origin: (3,) position of pixel (0, 0) at height 0, in camera axes [m].
-        camera_at: (4,) x, y, z of the camera relative to pixel (0, 0) at height 0, and size of a pixel [m].
-        camera: focal length, column and row of the principal point [px].
-        nearest: (H, W) smallest depth in each pixel of the image [m], from `_mark_nearest`.
+    `steps` (3, 3) has as columns the displacements in camera axes per column, row and metre of height; `origin` (3,) is
+    pixel (0, 0) at height 0 in camera axes, `camera_at` (4,) the camera relative to it and the size of a pixel [m].
     """
     focal, cx, cy = camera
     rows, cols, _ = image.shape

@@ -5,17 +5,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.core.records import MapGrid, StereoRig
+from twin.core.geometry import Array
+from twin.core.records import Map, MapGrid, StereoRig
 from twin.estimate.mapping.depth_filter import JUMP_PX, DepthMap, variance_along
 from twin.kernels import kernel
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
-
-#: Smallest cosine of the angle between the normal of a triangle and the ray from the triangle to the camera; with a
-#: smaller cosine, the triangle may connect two separate surfaces.
+#: Smallest cosine between normal and line of sight of a triangle; a grazing one may connect two separate surfaces.
 MIN_COSINE = 0.05
 #: Standard deviation of the lateral error of the surface [px of the image]; in metres, it is this value times depth /
 #: focal length. Fusion does not reduce it, because the matching window smooths relief and displaces edges in similar
@@ -30,12 +26,8 @@ class HeightPatch(NamedTuple):
     row: int
     col: int
     height_m: Map  #: (rows, cols) height at the cell centres, NaN where the surface does not cover them
-    #: (rows, cols) variance due to errors of depth. These are independent between the heights that different keyframes
-    #: add to the map, because each depth enters the map only once.
-    variance_m2: Map
-    #: (rows, cols) variance due to the errors of the pose and to the smoothing of slopes, which are common to all
-    #: views.
-    systematic_m2: Map
+    variance_m2: Map  #: (rows, cols) variance due to errors of depth, which enters the map only once: independent
+    systematic_m2: Map  #: (rows, cols) variance due to pose and smoothing of slopes, common to all views
     pixel: Map  #: (rows, cols, 2) position (u, v) of the cell centre in the image [px]
     lateral_m: float  #: standard deviation of the lateral error at the mean depth of the depth map [m]
     camera_m: Array | None = None  #: (3,) position of the camera in the frame of the map [m]; None if it is not known
@@ -48,14 +40,8 @@ def rasterise(
 
     Triangles across a depth discontinuity, downward-facing and grazing ones are omitted, so that no surface appears
     between the edge of a reef and the floor. The variances of depth and pose are propagated to the height at the cell
-    centre, with the effect of horizontal errors on slopes.
-
-    Args:
-        world_from_camera: (4, 4) pose of the left camera.
-        pose_cov: (6, 6) covariance of the pose [rotation, translation] (rad, m), in camera axes.
-
-    Returns:
-        The patch, or None if the surface does not overlap the grid.
+    centre, with the effect of horizontal errors on slopes. `pose_cov` (6, 6) is [rotation, translation] (rad, m), in
+    camera axes. None if the surface does not overlap the grid.
     """
     camera = (rig.focal_px, rig.cx_px, rig.cy_px)
     points, bounds = _grid_points(depth_map.depth_m, world_from_camera, camera, grid.west_m, grid.north_m, grid.cell_m)
@@ -77,16 +63,12 @@ def rasterise(
 
 
 class _ViewGeometry(NamedTuple):
-    """Pose of the camera relative to the grid, and constants of the rasterisation."""
-
     position: Array  #: (3,) position of the camera relative to the north-west corner of the grid at height 0 [m]
     axis: Array  #: (3,) optical axis in the world
     cov: Array  #: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m)
     cell_m: float  #: cell size [m]
     focal_px: float  #: focal length [px]
-    #: largest difference of inverse depth between the corners of a triangle [1/m]; with a larger one, the triangle is
-    #: omitted.
-    max_jump: float
+    max_jump: float  #: largest difference of inverse depth between the corners of a triangle [1/m]
 
 
 def _window(bounds: Array, grid: MapGrid) -> tuple[int, int, int, int] | None:
@@ -121,7 +103,6 @@ def _grid_points(depth, pose, camera, west, north, cell):
 
 @kernel(inline="always")
 def _spans_integer(points, v, u, k):
-    """Returns whether coordinate k of four neighbouring points includes an integer."""
     a, b, c, e = points[v, u, k], points[v, u + 1, k], points[v + 1, u, k], points[v + 1, u + 1, k]
     return np.ceil(min(min(a, b), min(c, e)) - 1e-9) <= np.floor(max(max(a, b), max(c, e)) + 1e-9)
 
@@ -184,9 +165,7 @@ def _triangle(
 def pose_variance(px, py, pz, sx, sy, cov):
     """Returns the variance [m^2] of a surface's height at the x and y of a point, due to the error of the camera pose.
 
-    Args:
-        px, py, pz: point relative to the camera, in world axes [m].
-        sx, sy: slopes of the surface.
-        cov: (6, 6) covariance of the pose [rotation, translation], in world axes (rad, m).
+    The point is relative to the camera [m]; (sx, sy) is the slope of the surface; `cov` (6, 6) is that of the pose
+    [rotation, translation] (rad, m); all in world axes.
     """
     return variance_along(px, py, pz, -sx, -sy, 1.0, cov)

@@ -1,19 +1,14 @@
-"""Heights of a map that their camera cannot have seen, because the line of sight passes below the mapped surface.
-
-A mismatch of stereo is usually too far away; a group of them becomes an island far below the surface around it.
-"""
+"""Heights that their camera cannot have seen: usually mismatches, which are too far away and form islands."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import MapGrid
+from twin.core.geometry import Array
+from twin.core.records import Map, MapGrid, Mask
 from twin.estimate.mapping.depth_filter import GATE
 from twin.kernels import kernel
-
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 #: Connected groups of cells of agreeing heights with at most this many cells are islands; larger ones are the surface.
 LARGEST_ISLAND = 400
@@ -23,16 +18,14 @@ _SIGMAS = 3.0
 
 
 def main_surface(height: Map, variance: Map) -> Mask:
-    """Returns a mask (rows, cols) of the known cells in connected groups of more than `LARGEST_ISLAND` cells.
+    """Returns a mask of the known cells in groups of more than `LARGEST_ISLAND` cells of agreeing heights.
 
     Neighbouring cells, of heights h and k and variances P and Q, are connected if (h - k)^2 < GATE (P + Q).
     """
     return _large_groups(height, variance, GATE, LARGEST_ISLAND)
 
 
-def hidden(
-    height: Map, camera: NDArray[np.int32], cameras_m: NDArray[np.float64], surface: tuple[Map, Map], grid: MapGrid
-) -> Mask:
+def hidden(height: Map, camera: NDArray[np.int32], cameras_m: Array, surface: tuple[Map, Map], grid: MapGrid) -> Mask:
     """Returns a mask (rows, cols) of the heights that their camera cannot have seen.
 
     The line of sight from a height to its camera is followed in steps of one cell. It is blocked where it passes below
@@ -40,8 +33,7 @@ def hidden(
 
     Args:
         height: (rows, cols) heights to check [m]; NaN where there is none.
-        camera: (rows, cols) row of `cameras_m` for each height; negative where it is not known: such a height passes.
-        cameras_m: (n, 3) positions of cameras in the frame of the map [m].
+        camera: (rows, cols) row of `cameras_m` (n, 3) [m] for each height; a height with a negative one passes.
         surface: heights of the surface (rows, cols) [m], NaN where there is none, and their variance [m2].
     """
     low, variance = surface

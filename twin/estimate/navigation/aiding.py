@@ -1,7 +1,4 @@
-"""Factors of the navigation sensors in the graph of the global alignment; residuals are predicted minus measured.
-
-The scale error of the DVL is one parameter shared by all displacements: as noise of each, it would average out.
-"""
+"""Factors of the navigation sensors in the graph of the global alignment; residuals are predicted minus measured."""
 
 from __future__ import annotations
 
@@ -15,12 +12,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import symmetric_inverses
 from twin.core.records import SensorNoise, StereoRig
-from twin.estimate.adjustment.pose_graph import (
-    BinaryFactors,
-    UnaryFactors,
-    pose_residual_jacobians,
-    pose_residuals,
-)
+from twin.estimate.adjustment.pose_graph import BinaryFactors, UnaryFactors, pose_residual_jacobians, pose_residuals
 from twin.estimate.navigation import pose_filter
 from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.stereo import Keyframe
@@ -28,15 +20,11 @@ from twin.kernels import kernel
 
 
 def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> list[UnaryFactors]:
-    """Returns the factors of pressure, attitude, position fixes, beacons and verticals, in this order.
-
-    Args:
-        nodes: nodes, in the order of the poses in the graph.
-    """
+    """Returns the factors of pressure, attitude, position fixes, beacons and verticals of nodes in their order."""
     return [
-        _height_factors(nodes, noise),
+        _coordinate_factors(nodes, "pressure_z_m", 2, noise.pressure_m),
         _attitude_factors(nodes, rig, noise),
-        _position_factors(nodes, noise),
+        _coordinate_factors(nodes, "usbl_m", 0, noise.usbl_m),
         _beacon_factors(nodes, rig, noise),
         _vertical_factors(nodes, rig, noise),
     ]
@@ -58,17 +46,17 @@ def _factors(
     return UnaryFactors(index, np.tile(information, (len(index), 1, 1)), residuals, jacobians)
 
 
-def _height_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    index, height_m = _readings(nodes, "pressure_z_m")
+def _coordinate_factors(nodes: Sequence[Keyframe], name: str, first: int, sigma_m: float) -> UnaryFactors:
+    """Returns the factors of readings of the coordinates of the camera in the world, from axis `first` on."""
+    index, measured_m = _readings(nodes, name)
+    measured_m = measured_m.reshape(-1, 3 - first)
 
     def jacobians(poses: Array, _: Array) -> Array:
-        by_pose = np.zeros((len(poses), 1, 6))
-        by_pose[:, 0, 3:] = poses[:, 2, :3]
-        return by_pose
+        rotations = poses[:, first:3, :3]
+        return np.concatenate([np.zeros_like(rotations), rotations], axis=2)
 
-    return _factors(
-        index, np.eye(1) * noise.pressure_m**-2, lambda poses: poses[:, 2, 3:] - height_m[:, None], jacobians
-    )
+    information = np.eye(3 - first) * sigma_m**-2
+    return _factors(index, information, lambda poses: poses[:, first:3, 3] - measured_m, jacobians)
 
 
 def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
@@ -88,18 +76,6 @@ def _attitude_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
         return pose_residual_jacobians(np.column_stack([residuals, np.zeros_like(residuals)]))[:, :3]
 
     return _factors(index, symmetric_inverses(cov[None])[0], residuals, jacobians)
-
-
-def _position_factors(nodes: Sequence[Keyframe], noise: SensorNoise) -> UnaryFactors:
-    index, position_m = _readings(nodes, "usbl_m")
-    position_m = position_m.reshape(-1, 3)
-
-    def jacobians(poses: Array, _: Array) -> Array:
-        by_pose = np.zeros((len(poses), 3, 6))
-        by_pose[:, :, 3:] = poses[:, :3, :3]
-        return by_pose
-
-    return _factors(index, np.eye(3) * noise.usbl_m**-2, lambda poses: poses[:, :3, 3] - position_m, jacobians)
 
 
 def _beacon_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> UnaryFactors:
@@ -124,8 +100,7 @@ def _vertical_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNo
     """Returns the factors of the verticals measured by an IMU.
 
     The residuals (m, 2) are the components of the predicted vertical perpendicular to the measured one, in the camera.
-    The error of the accelerometer is common to all n readings, so each has n times the variance: all together, they
-    determine the direction as precisely as one.
+    The accelerometer's error is common to all n readings, so each has n times the variance.
     """
     index, up = _readings(nodes, "up")
     measured = up.reshape(-1, 3) @ rig.body_from_camera[:3, :3]
@@ -165,7 +140,6 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
 
 @kernel
 def _body_displacements(motions, body_from_camera):
-    """Returns the displacements (m, 3) [m] and Jacobians (m, 3, 6) from `body_displacement` for motions (m, 4, 4)."""
     displacements, by_motion = np.empty((len(motions), 3)), np.empty((len(motions), 3, 6))
     for k in range(len(motions)):
         displacement, jacobian = body_displacement(motions[k], body_from_camera)

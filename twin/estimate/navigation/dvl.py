@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Displacement, SensorNoise, StereoRig
+from twin.core.records import Displacement, Mask, SensorNoise, StereoRig
 from twin.estimate.navigation.kalman import DVL, fuse_reading
 from twin.kernels import kernel
 
@@ -36,7 +35,7 @@ class DvlState(NamedTuple):
     displacement_m: Array
     cov: Array
     path_m: Array  #: (1,) path length since the node [m]
-    complete: NDArray[np.bool_]  #: (1,) false if the reading at the node or at a frame after it is missing
+    complete: Mask  #: (1,) false if the reading at the node or at a frame after it is missing
 
 
 class DvlIntegrator:
@@ -44,9 +43,6 @@ class DvlIntegrator:
 
     Each reading has half weight in two consecutive displacements. The variance of their sum, (n - 1/2) (sigma dt)^2 for
     readings of deviation sigma, is approximated by independent displacements of variance (sigma dt)^2.
-
-    Attributes:
-        state: integration since the last node.
     """
 
     def __init__(self, rig: StereoRig, noise: SensorNoise):
@@ -55,15 +51,11 @@ class DvlIntegrator:
         self.state = DvlState(np.full(3, np.nan), np.eye(3), np.zeros((3, 3)), *displacement, np.ones(1, np.bool_))
 
     def model(self, interval_s: float) -> DvlModel:
-        """Returns the error model for a given interval between frames [s]."""
         white_m2 = (self._noise.dvl_mps * interval_s) ** 2
         return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
 
     def displacement_at_node(self, number: int) -> Displacement | None:
-        """Returns the displacement from the last node to the node `number`, and restarts the integration.
-
-        None if the reading at the last node or at a frame after it is missing.
-        """
+        """Returns the displacement since the last node, and restarts the integration; None if a reading is missing."""
         state, node, self._node = self.state, self._node, number
         complete = state.complete[0]
         displacement = Displacement(node, state.displacement_m.copy(), _displacement_cov(state)) if complete else None
@@ -94,13 +86,9 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
     """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
 
-    Args:
-        velocity: (3,) reading of this frame, in body axes [m/s]; NaN if there is none.
-
-    Returns:
-        The fused motion (4, 4) and its covariance (6, 6). If the reading of this frame or of the previous one is
-        missing, or if they contradict the visual motion, these are `a_from_b` and `cov` unchanged, and the integration
-        becomes incomplete.
+    Returns the fused motion (4, 4) and its covariance (6, 6). If the reading of this frame, `velocity` (3,) in body
+    axes [m/s], or of the previous one is NaN, or if they contradict the visual motion, these are `a_from_b` and `cov`
+    unchanged, and the integration becomes incomplete.
     """
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
@@ -134,8 +122,7 @@ def _length(step):
 def _step_cov(state, model, step):
     """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
 
-    The scale error s accumulates: a displacement of length l after a path L adds s^2 ((L + l)^2 - L^2) along its
-    direction.
+    The scale error s accumulates: a displacement l after a path L adds s^2 ((L + l)^2 - L^2) along its direction.
     """
     length = max(_length(step), 1e-12)
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))

@@ -23,21 +23,16 @@ _PATIENCE = (300, 300, 30, 5, 20, 300)
 class ReadingGates(NamedTuple):
     """States of the gates that reject readings, one row per sensor in `SENSORS`; arrays are modified in place."""
 
-    #: (6, 3) numbers of readings: consecutive contradictions of the same kind; rejected; disputed, i.e. used although
-    #: they contradict the pose.
+    #: (6, 3) numbers of readings: contradicting in succession; rejected; disputed (used although they contradict).
     counts: NDArray[np.int64]
     residuals: Array  #: (6, 3) residual of the last reading that contradicted the pose
 
 
 @kernel
 def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
-    """Updates a pose with a reading of a sensor, unless the chi-square of its residual is above the limit.
+    """Updates a pose (4, 4) and covariance (6, 6) with a reading unless its chi-square is too high; returns if used.
 
-    If many readings in succession contradict the pose in the same way, the pose is taken to be wrong: its covariance is
-    increased by that of the error they imply.
-
-    Returns:
-        Pose (4, 4) and covariance (6, 6) after the update, and whether the reading was used.
+    If many readings in succession contradict the pose alike, its covariance is increased by that of the implied error.
     """
     counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
     innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov

@@ -14,18 +14,9 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Displacement, Readings, SensorNoise, StereoRig
+from twin.core.records import BeaconDetection, Displacement, Readings, SensorNoise, StereoRig
 from twin.estimate.navigation.dvl import DvlIntegrator, DvlModel, DvlState, fuse_dvl
-from twin.estimate.navigation.kalman import (
-    AHRS,
-    BEACONS,
-    PRESSURE,
-    SENSORS,
-    USBL,
-    VERTICAL,
-    ReadingGates,
-    fuse_reading,
-)
+from twin.estimate.navigation.kalman import AHRS, BEACONS, PRESSURE, SENSORS, USBL, VERTICAL, ReadingGates, fuse_reading
 from twin.estimate.vision.two_view_motion import Motion
 from twin.kernels import kernel
 
@@ -44,18 +35,12 @@ class DeadReckoningState(NamedTuple):
     since_node_cov: Array
 
 
-class PressureAhrsModel(NamedTuple):
-    """Error model of the pressure sensor and the AHRS."""
+class FrameAiding(NamedTuple):
+    """Error models of the sensors that are read at every frame; states, whose arrays are modified in place."""
 
     camera_from_body: Array  #: (4, 4) pose of the body in the camera
     pressure_m2: float  #: variance of the height measured by the pressure sensor [m^2]
     attitude_sigmas_rad: Array  #: (3,) standard deviations of roll, pitch and yaw measured by the AHRS [rad]
-
-
-class FrameAiding(NamedTuple):
-    """Error models of the sensors that are read at every frame; states, whose arrays are modified in place."""
-
-    pressure_ahrs: PressureAhrsModel
     dvl: DvlModel
     dvl_state: DvlState
     gates: ReadingGates
@@ -82,15 +67,10 @@ def dead_reckon(
     rpy_rad: Array,
     velocity_mps: Array,
 ) -> tuple[DeadReckoningState, Array]:
-    """Advances dead reckoning by one frame: returns its state, and the motion (4, 4) after fusion with the DVL.
-
-    Args:
-        a_from_b, cov: (4, 4), (6, 6) visual motion since the previous frame and its covariance.
-        height_m, rpy_rad, velocity_mps: readings (`readings_as_arrays`).
-    """
+    """Advances by a frame with a visual motion and readings; also returns the motion (4, 4) fused with the DVL."""
     motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)
     online, online_cov = predict(last.online, last.cov, motion, motion_cov)
-    online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding.pressure_ahrs, height_m, rpy_rad, aiding.gates)
+    online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding, height_m, rpy_rad)
     since_node, since_node_cov = predict(last.since_node, last.since_node_cov, motion, motion_cov)
     f2f = geometry.compose(last.f2f, a_from_b)
     return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion
@@ -98,26 +78,22 @@ def dead_reckon(
 
 @kernel
 def predict(world_from_camera, cov, a_from_b, motion_cov):
-    """Returns the pose (4, 4) and its covariance (6, 6) after a motion `a_from_b` with covariance `motion_cov`.
-
-    These are equations (3) to (5) of Negahdaripour & Madjidi (2003).
-    """
+    """Returns the pose (4, 4) and its covariance (6, 6) after a motion, eqs. (3) to (5) of the paper."""
     return geometry.compose(world_from_camera, a_from_b), geometry.transport_covariance(cov, a_from_b) + motion_cov
 
 
 @kernel
-def fuse_pressure_ahrs(world_from_camera, cov, model, height_m, rpy_rad, gates):
-    """Returns a pose (4, 4) and its covariance (6, 6) after the update with the readings of height and attitude."""
+def fuse_pressure_ahrs(world_from_camera, cov, aiding, height_m, rpy_rad):
     pose = world_from_camera
     if not np.isnan(height_m):
         by_pose, residual, height_cov = np.zeros((1, 6)), np.empty(1), np.empty((1, 1))
         geometry.copy_into(by_pose[0, 3:], pose[2, :3])
-        residual[0], height_cov[0, 0] = height_m - pose[2, 3], model.pressure_m2
-        pose, cov, _ = fuse_reading(pose, cov, residual, by_pose, height_cov, gates, PRESSURE)
+        residual[0], height_cov[0, 0] = height_m - pose[2, 3], aiding.pressure_m2
+        pose, cov, _ = fuse_reading(pose, cov, residual, by_pose, height_cov, aiding.gates, PRESSURE)
     if not np.isnan(rpy_rad[0]):
-        measured, attitude_cov = camera_attitude(rpy_rad, model.camera_from_body, model.attitude_sigmas_rad)
+        measured, attitude_cov = camera_attitude(rpy_rad, aiding.camera_from_body, aiding.attitude_sigmas_rad)
         residual = geometry.so3_log(np.ascontiguousarray(pose[:3, :3].T) @ measured)
-        pose, cov, _ = fuse_reading(pose, cov, residual, np.eye(3, 6), attitude_cov, gates, AHRS)
+        pose, cov, _ = fuse_reading(pose, cov, residual, np.eye(3, 6), attitude_cov, aiding.gates, AHRS)
     return pose, cov
 
 
@@ -136,14 +112,8 @@ class PoseFilter:
     """Extended Kalman filter of the online pose, with the state of dead reckoning.
 
     Errors are motions in camera axes: pose = true pose @ exp(error). The initial pose is known with a standard
-    deviation of 1e-4 rad and 1e-4 m.
-
-    Attributes:
-        world_from_camera, cov: (4, 4), (6, 6) online pose and covariance of its error.
-        f2f: (4, 4) world_from_camera from frame-to-frame motion alone.
-        since_node, since_node_cov: (4, 4), (6, 6) motion since the last node from vision and DVL, and its covariance.
-        cov_at_node: (6, 6) covariance of the online pose at the last node, in the camera axes there.
-        gates: states of the gates of all sensors.
+    deviation of 1e-4 rad and 1e-4 m. Attributes are those of `DeadReckoningState`, with the online pose as
+    `world_from_camera`, and `cov_at_node` (6, 6), its covariance at the last node in the camera axes there.
     """
 
     def __init__(self, world_from_camera: Array, rig: StereoRig, noise: SensorNoise):
@@ -152,8 +122,7 @@ class PoseFilter:
         self.f2f: Array = world_from_camera.copy()
         self.since_node, self.since_node_cov, self.cov_at_node = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
         self.rig, self.noise = rig, noise
-        camera_from_body = geometry.inverse(rig.body_from_camera)
-        self.pressure_ahrs = PressureAhrsModel(camera_from_body, noise.pressure_m**2, noise.attitude_sigmas_rad)
+        self._pressure_ahrs = geometry.inverse(rig.body_from_camera), noise.pressure_m**2, noise.attitude_sigmas_rad
         self.gates = ReadingGates(np.zeros((len(SENSORS), 3), np.int64), np.zeros((len(SENSORS), 3)))
         self.dvl = DvlIntegrator(rig, noise)
 
@@ -168,8 +137,7 @@ class PoseFilter:
         self.f2f, self.world_from_camera, self.cov, self.since_node, self.since_node_cov = state
 
     def aiding(self, interval_s: float) -> FrameAiding:
-        """Returns the sensors' error models for the interval since the last frame [s], and the states."""
-        return FrameAiding(self.pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.gates)
+        return FrameAiding(*self._pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.gates)
 
     def advance(self, motion: Motion, readings: Readings, interval_s: float) -> Array:
         """Advances by a frame with a visual motion; returns the motion (4, 4) after fusion with the DVL."""
@@ -178,10 +146,7 @@ class PoseFilter:
         return moved
 
     def start_from_node(self, number: int) -> Displacement | None:
-        """Restarts the motion since the last node at the node `number`; returns the displacement by the DVL until then.
-
-        None if the reading at the last node or at a frame after it is missing.
-        """
+        """Restarts the motion since the last node at node `number`; returns the displacement by the DVL until then."""
         self.since_node, self.since_node_cov, self.cov_at_node = np.eye(4), np.zeros((6, 6)), self.cov
         return self.dvl.displacement_at_node(number)
 
@@ -191,9 +156,7 @@ class PoseFilter:
         Only the motion since the earlier pose is constrained: with the covariances S of this motion (`motion_cov`, at
         most that of the pose, `clip_covariance`) and R of the measurement (`cov`), the gain is S (S + R)^-1, and the
         covariance decreases by the gain times S (Schmidt-Kalman filter, with the earlier pose as consider parameter).
-
-        Returns:
-            (6, 6) decrease of the covariance of the pose; None if the measurement was rejected as an outlier.
+        Returns the decrease (6, 6); None if the measurement was rejected as an outlier.
         """
         chi2, pose, decrease = _correct(self.world_from_camera, self.cov, measured, cov, motion_cov)
         if chi2 > _GATE:
@@ -202,30 +165,25 @@ class PoseFilter:
         return decrease
 
     def fuse_position_fixes(self, readings: Readings) -> Readings:
-        """Fuses the readings that are taken only at keyframes: an acoustic position fix, and the beacons detected.
+        """Fuses the readings that are taken only at keyframes, position fix and beacons; returns those not rejected."""
+        usbl_m, beacons = readings.usbl_m, readings.beacons
+        if usbl_m is not None:
+            residual, rotation = usbl_m - self.world_from_camera[:3, 3], self.world_from_camera[:3, :3]
+            jacobian = np.hstack([np.zeros((3, 3)), rotation])
+            usbl_m = usbl_m if self._update(USBL, residual, jacobian, np.eye(3) * self.noise.usbl_m**2) else None
+        if beacons is not None:
+            beacons = tuple(sighting for sighting in beacons if self._fuse_beacon(sighting))
+        return replace(readings, usbl_m=usbl_m, beacons=beacons)
 
-        Returns the readings without those that were rejected.
-        """
-        counts, beacons = self.rejected, []
-        if readings.usbl_m is not None:
-            rotation = self.world_from_camera[:3, :3]
-            residual = readings.usbl_m - self.world_from_camera[:3, 3]
-            self._update(USBL, residual, np.hstack([np.zeros((3, 3)), rotation]), np.eye(3) * self.noise.usbl_m**2)
-        for sighting in readings.beacons or ():
-            beacon = np.array(self.noise.beacons_m[sighting.beacon])
-            expected, jacobian = project_beacon(self.world_from_camera, beacon, self.rig)
-            before = self.rejected[BEACONS]
-            if np.isfinite(expected).all():
-                residual = np.array(sighting.pixel) - expected
-                self._update(BEACONS, residual, jacobian, np.eye(2) * self.noise.beacon_px**2)
-            if self.rejected[BEACONS] == before:
-                beacons.append(sighting)
-        used = self.without_rejected(readings, counts)
-        return used if used.beacons is None else replace(used, beacons=tuple(beacons))
+    def _fuse_beacon(self, sighting: BeaconDetection) -> bool:
+        """Returns whether a beacon was not rejected; one predicted behind the camera is neither used nor rejected."""
+        beacon_m = np.array(self.noise.beacons_m[sighting.beacon])
+        expected, jacobian = project_beacon(self.world_from_camera, beacon_m, self.rig)
+        cov = np.eye(2) * self.noise.beacon_px**2
+        return not np.isfinite(expected).all() or self._update(BEACONS, sighting.pixel - expected, jacobian, cov)
 
     @property
     def rejected(self) -> NDArray[np.int64]:
-        """Returns the number (6,) of rejected readings of each sensor in `SENSORS`."""
         return self.gates.counts[:, 1].copy()
 
     def without_rejected(self, readings: Readings, counts: NDArray[np.int64]) -> Readings:
@@ -253,12 +211,12 @@ class PoseFilter:
             self._update(VERTICAL, -known @ across @ predicted, known @ jacobian, np.diag(noise))
 
     def reset(self, world_from_camera: Array, cov: Array) -> None:
-        """Replaces pose and covariance, for example by those of a global alignment."""
         self.world_from_camera, self.cov = geometry.nearest_rigid(world_from_camera), cov
 
-    def _update(self, sensor: int, residual: Array, jacobian: Array, cov: Array) -> None:
+    def _update(self, sensor: int, residual: Array, jacobian: Array, cov: Array) -> bool:
         pose = self.world_from_camera, self.cov
-        self.world_from_camera, self.cov, _ = fuse_reading(*pose, residual, jacobian, cov, self.gates, sensor)
+        self.world_from_camera, self.cov, used = fuse_reading(*pose, residual, jacobian, cov, self.gates, sensor)
+        return used
 
 
 def perpendicular_axes(direction: Array) -> Array:
@@ -270,11 +228,9 @@ def perpendicular_axes(direction: Array) -> Array:
 
 
 def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Projects a beacon, at the position (3,) in the world [m], into the left image.
+    """Returns the pixel (2,) of a beacon at a position (3,) in the world [m]; NaN up to a depth of 1 mm.
 
-    Returns:
-        Column and row (2,) [px], NaN for a beacon behind the camera or at a depth of up to 1 mm, and their Jacobian
-        (2, 6) with respect to an increment [rotation, translation] (rad, m) of the pose in camera axes.
+    Also its Jacobian (2, 6) with respect to an increment [rotation, translation] (rad, m) of the pose in camera axes.
     """
     point = geometry.transform(geometry.inverse(world_from_camera), beacon_m[None])
     x, y, depth = point[0]
@@ -286,8 +242,7 @@ def project_beacon(world_from_camera: Array, beacon_m: Array, rig: StereoRig) ->
 def clip_covariance(cov: Array, reference: Array, lower: float = 0.0, upper: float = np.inf) -> Array:
     """Returns a covariance (n, n) limited to the range from `lower` to `upper` times a reference covariance.
 
-    The limits apply to the eigenvalues of L^-1 cov L^-T, with L L^T = reference. Raises LinAlgError if the reference is
-    not positive definite.
+    The limits apply to eigenvalues of L^-1 cov L^-T, L L^T = reference; LinAlgError unless that is positive definite.
     """
     root = np.linalg.cholesky(reference)
     inverse_root = np.linalg.inv(root)

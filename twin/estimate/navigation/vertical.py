@@ -2,8 +2,7 @@
 
 Extended Kalman filter of attitude and gyroscope bias (multiplicative: Markley 2003, "Attitude error representations for
 Kalman filtering"), run forwards and backwards over the record; the two estimates at a time share no reading but one,
-and their mean is weighted by their variances (two-filter smoother, Fraser & Potter 1969). The heading is not observable
-and not used.
+and their mean is weighted by their variances (two-filter smoother, Fraser & Potter 1969). The heading is unobservable.
 
 The specific force f of a body with rotation R (world_from_body) and acceleration a is R' (a + g z). The filter treats
 R' a as noise: an acceleration of `_ACCELERATION_MPS2`, correlated over `_ACCELERATION_S`.
@@ -36,14 +35,10 @@ class InertialNoise(NamedTuple):
 
 
 def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array]:
-    """Returns the direction of the vertical at each reading and its standard deviation.
+    """Returns upward unit vectors (n, 3) in the axes of the IMU, and standard deviations (n,) about each axis [rad].
 
-    The standard deviation includes the noise of both sensors, the bias of the gyroscope and the accelerations of the
-    vehicle, not the bias of the accelerometer: a bias b adds an error of b / g, common to all readings.
-
-    Returns:
-        Unit vectors (n, 3) that point upwards, in the axes of the IMU, and standard deviations (n,) about each
-        perpendicular axis [rad].
+    These include the noise of both sensors, the bias of the gyroscope and the accelerations of the vehicle, not the
+    bias of the accelerometer: a bias b adds an error of b / g, common to all readings.
     """
     times_s, rates, forces = (np.ascontiguousarray(values, np.float64) for values in readings)
     density = np.hypot(noise.force_density, _ACCELERATION_MPS2 * np.sqrt(2 * _ACCELERATION_S))

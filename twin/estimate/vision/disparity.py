@@ -6,13 +6,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.core.records import StereoRig
+from twin.core.records import Image, Map, StereoRig
 from twin.estimate.vision import epipolar
-
-Gray = NDArray[np.uint8]
-Map = NDArray[np.float32]
 
 #: Block size of semi-global matching [px]. In turbid water, more pixels are matched with a block of 5 px than with one
 #: of 3 px; the refinement restores the sharpness of edges.
@@ -21,8 +17,7 @@ SPECKLE_PX = 60  #: connected regions of at most this many pixels are removed as
 #: Width of the window of the contrast normalisation before matching, as a fraction of the image width. It can be large,
 #: because illumination and backscatter vary slowly; in a small one, the mean near an object depends on the background.
 NORMALISATION_WINDOW = 1 / 7
-#: Largest difference between the left-to-right and the right-to-left disparity of a valid pixel [px]; a larger one
-#: indicates an occlusion or a mismatch.
+#: Largest difference between left-to-right and right-to-left disparity [px]; above, occlusion or mismatch.
 CONSISTENCY_PX = 1.0
 #: Standard deviation of errors that the refinement does not model (interpolation, relief inside the window) [px].
 MIN_SIGMA_PX = 0.03
@@ -38,22 +33,18 @@ class Disparity(NamedTuple):
     sigma_px: Map  #: (H, W) float32 standard deviation of the disparity [px], NaN where unknown
 
     def with_sigma_below(self, sigma_px: float | Map) -> Disparity:
-        """Returns the disparity, NaN where its standard deviation is not below `sigma_px`, one limit or (H, W) [px]."""
+        """Returns the disparity, NaN where its standard deviation is not below a limit, one or one per pixel [px]."""
         accepted = self.sigma_px < sigma_px
         unknown = np.float32(np.nan)
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
 
 
-def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) -> Disparity:
+def dense_disparity(left: Image | Map, right: Image | Map, max_disparity_px: int) -> Disparity:
     """Returns the disparity of the pixels of the left image that are matched in the right one; NaN elsewhere.
 
-    Semi-global matching (Hirschmueller 2008; OpenCV, three path directions) of images with locally normalised contrast,
-    with a left-right check, is refined by `epipolar.refine` (bias on a rendered reef 0.002 instead of 0.02 px). The
-    standard deviation is that without the prior of the refinement.
-
-    Args:
-        left, right: (H, W) uint8 or float32 rectified grey images.
-        max_disparity_px: number of whole-pixel disparities searched, rounded up to a multiple of 16.
+    Semi-global matching (Hirschmueller 2008; OpenCV, three path directions) of images (H, W) with locally normalised
+    contrast, with a left-right check, is refined by `epipolar.refine` (bias on a rendered reef 0.002 instead of 0.02
+    px). The standard deviation is that without the prior of the refinement.
     """
     coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
@@ -62,11 +53,7 @@ def dense_disparity(left: Gray | Map, right: Gray | Map, max_disparity_px: int) 
 
 
 class SearchRange:
-    """Range of the disparity search, at first the widest one, then adapted to the largest disparities of the last pair.
-
-    Attributes:
-        max_disparity_px: largest disparity to search [px].
-    """
+    """Largest disparity to search: the widest one at first, then adapted to the disparities of the last pair."""
 
     def __init__(self, rig: StereoRig):
         self._widest_px = self.max_disparity_px = int(MAX_DISPARITY_FRACTION * rig.width_px)
@@ -78,14 +65,11 @@ class SearchRange:
         self.max_disparity_px = min(int(wanted), self._widest_px)
 
 
-def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
+def search(left: Image, right: Image, max_disparity_px: int) -> Map:
     """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
 
-    The images are padded on the left; otherwise the left margin, as wide as the search range, would have no disparity.
-
-    Args:
-        left, right: (H, W) uint8 rectified images with normalised contrast.
-        max_disparity_px: number of whole-pixel disparities searched, rounded up to a multiple of 16.
+    The images (H, W) have normalised contrast. They are padded on the left; otherwise the left margin, as wide as the
+    search range (rounded up to a multiple of 16), would have no disparity.
     """
     count = -(-max_disparity_px // 16) * 16
     matcher = cv2.StereoSGBM.create(
@@ -99,7 +83,7 @@ def search(left: Gray, right: Gray, max_disparity_px: int) -> Map:
     return disparity.astype(np.float32)
 
 
-def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
+def search_consistent(left: Image, right: Image, max_disparity_px: int) -> Map:
     """Returns the disparity from `search`, with NaN at the pixels that fail the left-right consistency check."""
     disparity = search(left, right, max_disparity_px)
     mirrored = search(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), max_disparity_px)
@@ -112,11 +96,8 @@ def search_consistent(left: Gray, right: Gray, max_disparity_px: int) -> Map:
     return consistent
 
 
-def _normalise_contrast(image: Gray | Map) -> Gray:
-    """Returns an image with normalised local mean and contrast, because illumination and backscatter disturb matching.
-
-    Areas of low contrast are amplified less, because their contrast is mostly noise.
-    """
+def _normalise_contrast(image: Image | Map) -> Image:
+    """Returns an image with normalised local mean and contrast; low contrast, mostly noise, is amplified less."""
     window = (2 * int(image.shape[1] * NORMALISATION_WINDOW / 2) + 1,) * 2
     centred = image.astype(np.float32)
     centred -= cv2.boxFilter(centred, -1, window)

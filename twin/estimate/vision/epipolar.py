@@ -11,14 +11,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.interpolation import bicubic_with_gradient
+from twin.core.records import Map, Mask
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
-Mask = NDArray[np.bool_]
 
 #: Value of an unknown disparity in the kernels; no real disparity is so near that such a pixel supports its fit.
 UNKNOWN_PX = np.float32(-1e4)
@@ -37,51 +34,32 @@ _PRIORS = np.array([1 / PRIOR_PX**2, 1 / PRIOR_SLOPE**2, 1 / 8], np.float32)
 
 
 class TwoView(NamedTuple):
-    """Two-view geometry: pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image.
-
-    p is in homogeneous pixel coordinates.
-    """
+    """Pixel (u, v) with disparity d projects to p = matrix [u, v, 1] + epipole d in the other image (homogeneous)."""
 
     matrix: Array  #: (3, 3) K R K^-1, the infinite homography other_from_reference
     epipole: Array  #: (3,) K t / (f b), the displacement in homogeneous pixel coordinates per pixel of disparity
 
 
 class Refinement(NamedTuple):
-    """Result of `refine`."""
-
     disparity_px: Map  #: (H, W) refined disparity [px]; NaN where the initial one is unknown or the refinement failed
-    #: (H, W) standard deviation of the refined disparity, for an initial disparity with the standard deviation
-    #: `PRIOR_PX` [px].
-    sigma_px: Map
-    #: (H, W) fraction of an error of the disparity that the last iteration removes: near 1 on texture, near 0 without
-    #: texture.
-    gain: Map
-    noise: float  #: standard deviation of the image noise in the difference of both images [grey levels]
-    #: factor by which the correlation of the noise of neighbouring pixels increases the variance; not included in
-    #: `sigma_px`.
-    variance_inflation: float
-
-    @property
-    def measurement_sigma_px(self) -> Map:
-        """Returns the standard deviation (H, W) of the disparity without the prior [px], with `variance_inflation`."""
-        return _measurement_sigma(self.sigma_px, self.gain) * np.float32(self.variance_inflation**0.5)
+    #: (H, W) standard deviation of the disparity without the prior [px]; too large over little texture.
+    measurement_sigma_px: Map
+    gain: Map  #: (H, W) fraction of an error that the last iteration removes: 1 on texture, 0 without
+    variance_inflation: float  #: factor on the variance for correlated noise of neighbours
 
 
 STEREO = TwoView(np.eye(3), np.array([-1.0, 0.0, 0.0]))
 
 
 def two_view(other_from_reference: Array, matrix: Array, baseline_m: float) -> TwoView:
-    """Returns the two-view geometry of the pose (4, 4) of the reference camera in the other camera.
-
-    Both have the camera matrix (3, 3) [px]; the baseline of the stereo pair [m] defines disparity.
-    """
+    """Returns the two-view geometry of the pose (4, 4) of the reference camera in the other one."""
     focal_baseline = matrix[0, 0] * baseline_m
     rotation, translation = other_from_reference[:3, :3], other_from_reference[:3, 3]
     return TwoView(matrix @ rotation @ np.linalg.inv(matrix), matrix @ translation / focal_baseline)
 
 
 def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterations: int = 2) -> Refinement:
-    """Refines each disparity to sub-pixel accuracy by least squares over a Gaussian window.
+    """Refines disparities (H, W) [px], NaN where unknown, to sub-pixel accuracy by least squares over Gaussian windows.
 
     With the other image O warped to the reference image I by the disparities d, each pixel measures the error e = (I -
     O) / (dO/dd). The refined disparity is the centre of a plane fitted to d + e, weighted by (dO/dd)^2 and the window,
@@ -91,13 +69,9 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
     The noise variance is that of nearby residuals, or of the window's own if larger. `measurement_sigma_px` agrees with
     the error to 15 % in clear water; the error is 1.3 times larger for noise of a fifth of the contrast, 1.7 times for
     half.
-
-    Args:
-        reference, other: (H, W) float32 grey images.
-        disparity_px: (H, W) float32 initial disparity [px], NaN where unknown.
     """
     fitted = np.where(np.isfinite(disparity_px), disparity_px, UNKNOWN_PX).astype(np.float32)
-    sigma, gain, mean_square, noise_variance, inflation, window_px = fitted, fitted, fitted, 1.0, 1.0, WINDOW_PX
+    sigma, gain, mean_square, inflation, window_px = fitted, fitted, fitted, 1.0, WINDOW_PX
     for _ in range(iterations):
         residual, slope, locking, visible = _balanced_warp(reference, other, fitted, view)
         fitted = np.where(visible, fitted, UNKNOWN_PX)
@@ -110,19 +84,15 @@ def refine(reference: Map, other: Map, disparity_px: Map, view: TwoView, iterati
         inflation = _variance_inflation(remaining, visible, noise_variance)
         fitted, unit_variance, gain, mean_square = fit
         sigma = np.sqrt(unit_variance * np.maximum(mean_square, noise))
-        window_px = _choose_window_sigma(_measurement_sigma(sigma, gain), fitted, window_px)
+        sigma = np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)  # without the prior
+        window_px = _choose_window_sigma(sigma, fitted, window_px)
     known = (fitted >= 0) & (mean_square < 2 * (1 - MIN_CORRELATION) * _contrast(reference))
-    disparity_px, sigma, gain = (np.where(known, layer, np.nan).astype(np.float32) for layer in (fitted, sigma, gain))
-    return Refinement(disparity_px, sigma, gain, float(noise_variance**0.5), inflation)
-
-
-def _measurement_sigma(sigma: Map, gain: Map) -> Map:
-    """Returns the standard deviation (H, W) from the measurement alone, sigma / gain; too large over little texture."""
-    return np.asarray(sigma / np.maximum(gain, 1e-6), np.float32)
+    layers = fitted, sigma * np.float32(inflation**0.5), gain
+    disparity_px, sigma, gain = (np.where(known, layer, np.nan).astype(np.float32) for layer in layers)
+    return Refinement(disparity_px, sigma, gain, inflation)
 
 
 def _choose_window_sigma(sigma: Map, fitted: Map, window_px: float) -> float:
-    """Returns the standard deviation [px] of the window of the next iteration, larger for more noise."""
     typical = sigma[::4, ::4][fitted[::4, ::4] > UNKNOWN_PX]
     if typical.size == 0:
         return window_px
@@ -136,10 +106,7 @@ def _contrast(image: Map) -> Map:
 
 
 def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) -> tuple[Map, Map, Map, Mask]:
-    """Warps the other image O to the reference I, and adapts its local mean and standard deviation to those of I.
-
-    Returns residual I - O (0 where not visible), gradient dO/dd and pixel locking (`_warp`), mask of visible pixels.
-    """
+    """Returns residual I - O (0 where not visible), gradient dO/dd, pixel locking (`_warp`), mask of visible pixels."""
     warped, slope, locking = np.zeros_like(reference), np.zeros_like(reference), np.zeros_like(reference)
     visible = _warp(reference, other, disparity, view.matrix, view.epipole, warped, slope, locking)
     weight = visible.astype(np.float32)
@@ -151,10 +118,7 @@ def _balanced_warp(reference: Map, other: Map, disparity: Map, view: TwoView) ->
 
 
 def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
-    """Returns the gain and the offset (H, W) that give `other` the local mean and standard deviation of `image`.
-
-    The gain is near 1 where there is little texture.
-    """
+    """Returns gain and offset (H, W) that give `other` the local mean and standard deviation of `image`."""
     count = _mean(weight) + 1e-3
     mean_i, mean_o = _mean(image * weight) / count, _mean(other * weight) / count
     power_i, power_o = _mean(image * image * weight) / count, _mean(other * other * weight) / count
@@ -164,7 +128,6 @@ def _balance(image: Map, other: Map, weight: Map) -> tuple[Map, Map]:
 
 
 def _mean(image: Map) -> Map:
-    """Returns the mean (H, W) of an image over a square of `BALANCE_PX` pixels around each pixel."""
     return np.asarray(cv2.boxFilter(image, -1, (BALANCE_PX, BALANCE_PX)), np.float32)
 
 
@@ -182,11 +145,7 @@ def _noise_variance(residual: Map, visible: Mask) -> float:
 
 
 def _variance_inflation(remaining: Map, visible: Mask, variance: float) -> float:
-    """Returns the factor by which correlated noise of neighbouring pixels increases the variance of a fit.
-
-    It follows from the correlation of the residuals that remain after the fit. Without it, the standard deviation was
-    1.6 times too small for the interpolated colours of a Bayer sensor.
-    """
+    """Returns the factor of correlated noise of neighbours on a variance: 1.6^2 for colours of a Bayer sensor."""
     along, across = _correlations(remaining, visible, variance)
     return (1 + 2 * max(along, 0.0)) * (1 + 2 * max(across, 0.0))
 
@@ -210,7 +169,6 @@ def _locking_factor(residual: Map, visible: Mask, variance: float) -> float:
 
 
 def _local_noise(residual: Map, visible: Mask, max_variance: float) -> Map:
-    """Returns the local mean square (H, W) of the residuals, limited to `MIN_NOISE_VARIANCE` to `max_variance`."""
     count = _mean(visible.astype(np.float32)) + 1e-3
     return np.clip(_mean(residual * residual) / count, MIN_NOISE_VARIANCE, max_variance).astype(np.float32)
 
@@ -266,10 +224,7 @@ def _interpolated_noise(t):
 
 @kernel(forceinline=True, fastmath=True)
 def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
-    """Adds, for n pixels of a row, the neighbour at offset (i, j) to the sums (13, n) of the plane fits, in place.
-
-    `centre` are the disparities of the pixels, the others belong to the neighbours.
-    """
+    """Adds the neighbours at offset (i, j) of the pixels `centre` of a row to the sums (13, n) of the plane fits."""
     s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     s6, s7, s8, s9, s10, s11, s12 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11], sums[12]
     for u in range(centre.size):
@@ -299,10 +254,8 @@ def _fit_planes(disparity, residual, slope, locking, noise, window, support, pri
     """Fits a plane to the disparities around each pixel.
 
     The expected noise product of residual and slope is subtracted: `locking` times the mean squared residual of the
-    window, or times `noise` (H, W) if that is smaller.
-
-    Returns disparity (`UNKNOWN_PX` where the fit failed), its variance for a noise variance of 1, gain (`Refinement`)
-    and mean squared residual, each (H, W).
+    window, or times `noise` (H, W) if that is smaller. Returns disparity (`UNKNOWN_PX` where the fit failed), its
+    variance for a noise variance of 1, gain (`Refinement`) and mean squared residual, each (H, W).
     """
     height, width = disparity.shape
     half = window.size // 2

@@ -36,14 +36,10 @@ _REGIONS = (4, 3)  # regions of the image along columns and rows
 
 
 def _pattern(regions: Array, estimate: Array) -> float:
-    """Returns the weighted RMS over the regions of the mean row difference that `estimate` (4,) does not explain.
+    """Returns the weighted RMS over m regions of the mean row difference that `estimate` does not explain.
 
-    The weighted sum of the squared means has the expectation m - 4 due to matching noise, which is subtracted, for m
-    regions with observations. The unit is the focal length; 0 without observations.
-
-    Args:
-        regions: (m, 6) for each region of the image, the sums of the weights, which are inverse variances, of the
-            weighted normalised row differences, and of their weighted derivatives (`row_jacobian`).
+    The weighted sum of the squared means has the expectation m - 4 due to matching noise, which is subtracted.
+    `regions` (m, 6) are sums of weights, weighted normalised row differences and weighted derivatives (`row_jacobian`).
     """
     regions = regions[regions[:, 0] > 0]
     weight, rows, jacobian = regions[:, 0].copy(), regions[:, 1], regions[:, 2:].copy()
@@ -55,8 +51,7 @@ def _pattern(regions: Array, estimate: Array) -> float:
 class EpipolarCalibration:
     """Errors of the rectification, estimated from all stereo pairs so far (recursive weighted least squares).
 
-    Attributes:
-        removed: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that `rectify` removes.
+    `removed` (4,) are the pitch, yaw (always 0), roll [rad] and row offset (normalised) that `rectify` removes.
     """
 
     def __init__(self) -> None:
@@ -90,9 +85,9 @@ class EpipolarCalibration:
         return np.asarray(np.linalg.solve(self._information, self._vector), np.float64)
 
     def update(self, rig: StereoRig) -> bool:
-        """Sets pitch, roll and offset of `removed` to their estimates if this changes a row significantly.
+        """Sets pitch, roll and offset of `removed` to their estimates; returns whether they were changed.
 
-        That is by more than 4 standard deviations and 0.02 px in a corner of the image. Returns whether it was changed.
+        They are if this changes a row by more than 4 standard deviations and 0.02 px in a corner of the image.
         """
         change = (self.estimate - self.removed) * CORRECTED
         x, y = np.meshgrid(
@@ -126,31 +121,23 @@ class EpipolarCalibration:
         return np.asarray(warped, np.uint8)
 
     def report(self) -> EpipolarError:
-        """Returns the estimated errors with standard deviations, the part that `rectify` removes, and the pattern."""
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))
         return EpipolarError(self.estimate, sigma, self.removed.copy(), _pattern(self._regions, self.estimate))
 
 
 def row_jacobian(x: Array, y: Array) -> Array:
-    """Returns the derivatives (n, 4) of the normalised rows of points at normalised x, y (n,) in the right image.
-
-    They are the derivatives with respect to pitch, yaw, roll [rad] and the normalised row offset.
-    """
+    """Returns the derivatives (n, 4) of normalised rows by pitch, yaw, roll [rad] and normalised row offset."""
     return np.column_stack([1 + y**2, -x * y, -x, np.ones_like(x)])
 
 
 def _region(pixels: NDArray[np.floating], rig: StereoRig) -> NDArray[np.int64]:
-    """Returns the number (n,) of the image region that contains each of the pixels (n, 2)."""
     columns, rows = _REGIONS
     column = np.clip(pixels[:, 0] * columns / rig.width_px, 0, columns - 1).astype(np.int64)
     return column + columns * np.clip(pixels[:, 1] * rows / rig.height_px, 0, rows - 1).astype(np.int64)
 
 
 def row_sigma(points: StereoPoints) -> Array:
-    """Returns the standard deviation (n,) of the normalised row differences.
-
-    `points.cov` has the variance of the average of the two rows; that of their difference is four times as large.
-    """
+    """Returns the standard deviation (n,) of normalised row differences; `points.cov` has that of the mean row."""
     return 2 * np.sqrt(points.cov[:, 1, 1])
 
 

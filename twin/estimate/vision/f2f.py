@@ -16,6 +16,7 @@ from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion, PairMotionSettings
 
 MAX_POINTS = 150  # only the strongest points are tracked; keyframes correct the drift between them
+NOT_MATCHED = "too few points matched"  # status of a frame
 _MIN_TRACKED = 0.7  # if a smaller fraction of the reference points is tracked, the frame becomes the reference
 MIN_MATCHED = 0.25  # smallest fraction of the reference points that must be tracked; in pure noise, about a tenth are
 _MIN_INLIERS = 0.5  # smallest fraction of the tracked points that must agree with a motion
@@ -26,22 +27,17 @@ _UNKNOWN_VARIANCE = 1.0  # variance of the normalised disparity, which a single 
 
 
 class _Reference(NamedTuple):
-    """Image with which frames are matched, and its points."""
-
     image: matching.Image  #: (height, width) normalised left image
     pixels: matching.Points  #: (n, 2) positions of the points in the image [px]
     measured: Array  #: (n, 3) normalised (x, y, disparity) of the points
     cov: Array  #: (n, 3, 3) covariance of each row of `measured`
 
     def xyz(self, baseline_m: float) -> Array:
-        """Returns the positions (n, 3) of the points in the axes of the reference camera [m]."""
         x, y, disparity = self.measured.T
         return np.column_stack([x, y, np.ones_like(x)]) * (baseline_m / disparity[:, None])
 
 
 class _Located(NamedTuple):
-    """Pose of an image relative to the reference, from tracked points."""
-
     #: pose of the image in the reference camera, its covariance and the number of inliers.
     motion: Motion
     inlier_share: float  #: fraction of the tracked points that are inliers, 0 to 1
@@ -64,12 +60,8 @@ class FrameToFrame:
     too few points are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is
     then returned, with a large covariance.
 
-    Args:
-        patch_px: side of the tracking window [px].
-
     Attributes:
         reference: image with which frames are matched, and its points; None before the first keyframe.
-        started: whether a frame has been processed.
         filter: pose of the last frame in the reference camera, and velocity.
     """
 
@@ -92,12 +84,9 @@ class FrameToFrame:
         """Returns the motion from the last frame to this normalised image, and "ok" or the reason for a failure.
 
         At the first frame, these are the identity and "ok". As covariance of a measured motion, that of the pose of
-        this frame in the reference camera is returned. The errors of successive motions partly cancel, so the sum of
-        these covariances is an upper bound.
-
-        Args:
-            interval_s: time since the last frame [s]; by default that of the frame rate.
-            unusable: reason why the frame must not be matched; "" if it may be.
+        this frame in the reference camera is returned: the errors of successive motions partly cancel, so the sum of
+        these is an upper bound. The interval is by default that of the frame rate; `unusable` is the reason why the
+        frame must not be matched.
         """
         if not self.started:
             self.started = True
@@ -111,7 +100,7 @@ class FrameToFrame:
         if status != "ok":
             self._common_cov = geometry.transport_covariance(self._common_cov, motion)
         if located is None or status != "ok":
-            return constant_velocity_motion(motion, status)
+            return constant_velocity_motion(motion), status
         cov = self.filter.cov.copy()
         if located.tracked_share < _MIN_TRACKED:
             self._reference_cov = self.cov_since_keyframe
@@ -121,7 +110,7 @@ class FrameToFrame:
     def _fuse(self, located: _Located | None) -> str:
         """Fuses a measured pose with the prediction; returns "ok", or the reason why it was not used."""
         if located is None or located.tracked_share < MIN_MATCHED:
-            return "too few points matched"
+            return NOT_MATCHED
         if located.inlier_share < _MIN_INLIERS or located.residual_px > _MAX_RESIDUAL_PX:
             return "too few points agree"
         used = self.filter.correct(located.motion.a_from_b, located.motion.cov)
@@ -167,7 +156,7 @@ class FrameToFrame:
         current[:, :2], current_cov[:, :2, :2] = self.rig.normalised(pixels), cov[:, :2, :2]
         current_cov[:, 2, 2] = _UNKNOWN_VARIANCE
         inflation = matching.variance_inflation(pixels, self.patch_px)
-        settings = PairMotionSettings(variance_inflation=inflation, n_measured=2, measured_scatter=True)
+        settings = PairMotionSettings(variance_inflation=inflation, n_measured=2)
         pair = PairMeasurements(current, measured, current_cov, cov)
         motion = two_view_motion.pair_motion(pair, self.rig.baseline_m, current_from_reference, settings)
         if motion is None:
@@ -202,8 +191,8 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
     return measured, cov
 
 
-def constant_velocity_motion(motion: Array, status: str = "too few points matched") -> tuple[Motion, str]:
-    """Returns a motion (4, 4) predicted at constant velocity, with a large covariance, and `status` unchanged."""
+def constant_velocity_motion(motion: Array) -> Motion:
+    """Returns a motion (4, 4) predicted at constant velocity, with a large covariance."""
     twist = geometry.log(motion)
     sigma = np.concatenate([np.full(3, 0.01), np.full(3, 0.01 + np.linalg.norm(twist[3:]))])
-    return Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf), status
+    return Motion(motion, np.diag(np.asarray(sigma**2, np.float64)), 0, np.inf)

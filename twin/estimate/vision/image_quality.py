@@ -20,22 +20,16 @@ def saturated_fraction(image: Image) -> float:
 
 
 def contrast(levels: Gray) -> float:
-    """Returns the local RMS contrast of an image: standard deviation / mean, median over the image.
-
-    The image must not be normalised. The contrast includes image noise, which dominates it in dark or turbid images.
-    """
+    """Returns the median over the image of standard deviation / mean around a pixel; image noise is included."""
     mean, square = (moment[::4, ::4] for moment in local_moments(levels))
     sigma = np.sqrt(np.maximum(square - mean**2, 0))
     return float(np.median(sigma / np.maximum(mean, 1.0)))
 
 
 def repetition(image: Image, patch_px: int) -> float:
-    """Returns the largest autocorrelation of an image, 0 to 1, at shifts of at least one patch side.
+    """Returns the largest autocorrelation of a normalised image at shifts of at least one patch side.
 
-    Natural texture stays below 0.4. Repetitive texture (tiles, dots, a chequerboard) comes close to 1: a patch then has
-    several equally good matches.
-
-    The image (height, width) is normalised (`matching.normalise`); shifts below `patch_px` belong to the main peak.
+    Natural texture stays below 0.4; repetitive texture, whose matches are ambiguous, comes close to 1.
     """
     taper, weight = _taper(*image.shape)
     correlation = _autocorrelation((image.astype(np.float64) - image.mean()) * taper)
@@ -50,16 +44,13 @@ def repetition(image: Image, patch_px: int) -> float:
 
 @lru_cache(maxsize=4)
 def _taper(height: int, width: int) -> tuple[Array, Array]:
-    """Returns the taper (height, width), a Hann window, for images of this size, and its autocorrelation."""
+    """Returns a Hann window (height, width) and its autocorrelation."""
     taper = np.outer(np.hanning(height), np.hanning(width))
     return taper, _autocorrelation(taper)
 
 
 def _autocorrelation(values: Array) -> Array:
-    """Returns the autocorrelation of zero-padded values (height, width), in the order of a Fourier transform.
-
-    Row shifts are from 0 up to half the height.
-    """
+    """Returns the autocorrelation of zero-padded values, in the order of a Fourier transform, for row shifts from 0."""
     shape = [cv2.getOptimalDFTSize(2 * side) for side in values.shape]
     spectrum = np.abs(np.fft.rfft2(values, shape)) ** 2
     return np.asarray(np.fft.irfft2(spectrum, shape)[: values.shape[0] // 2], np.float64)

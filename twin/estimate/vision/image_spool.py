@@ -18,10 +18,9 @@ _CACHE_BYTES = 384 * 2**20
 
 
 class ImageSpool:
-    """Stores stereo pairs on disk as lossless PNG, with a cache of the most recently used grey levels in memory.
+    """Stores stereo pairs on disk as lossless PNG, with a cache of limited size of the last grey levels used.
 
-    The size of the cache is limited, so memory does not grow with the length of the survey. `gray` may be called from
-    several threads. All methods but `close` raise OSError if images could not be read, or the last pair not written.
+    `gray` may be called by several threads. Methods but `close` raise OSError if images could not be read or written.
 
     Args:
         folder: folder of the images; created if missing.
@@ -54,11 +53,10 @@ class ImageSpool:
         self._writer.shutdown()
 
     def pair(self, row: int) -> tuple[Image, Image]:
-        """Returns the left and the right image (height, width, 3) of the keyframe at frame index `row`."""
+        """Returns the left and the right image (H, W, 3) of the keyframe at frame index `row`."""
         return self.left(row), self._read(row, "right")
 
     def left(self, row: int) -> Image:
-        """Returns the left image (height, width, 3) of the keyframe at frame index `row`."""
         self.flush()
         return self._read(row, "left")
 
@@ -73,7 +71,6 @@ class ImageSpool:
         return left.astype(np.float32), right.astype(np.float32)
 
     def _cache(self, row: int, pair: tuple[matching.Gray, matching.Gray]) -> None:
-        """Adds the grey levels of a pair to the cache, and removes the least recently used beyond `_CACHE_BYTES`."""
         self._gray[row] = pair[0].astype(np.float16), pair[1].astype(np.float16)
         while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
@@ -86,8 +83,7 @@ class ImageSpool:
     def _path(self, row: int, side: str) -> Path:
         return self.folder / f"{row:06d}_{side}.png"
 
-    def _read(self, row: int, side: str) -> NDArray[np.uint8]:
-        """Returns an image (height, width, 3) RGB from disk; raises OSError if it is missing or damaged."""
+    def _read(self, row: int, side: str) -> Image:
         path = self._path(row, side)
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_COLOR_RGB) if len(data) else None

@@ -8,38 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
 
+import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Map = NDArray[np.float32]
+from twin.core.geometry import Array
+from twin.core.records import Image, Map, StereoRig
 
-#: Degree, along the rows and along the columns, of the polynomial that describes the pattern. Texture is finer than the
-#: pattern, so little of it is removed with the polynomial.
+#: Degree of the polynomial along rows and columns. Texture is finer, so little of it is removed.
 DEGREE = 6
 
 
-class LightPattern(NamedTuple):
-    """Light pattern of a stereo camera."""
-
-    #: left, right: (H, W) float32 pattern in each image [grey levels].
-    left: Map
-    right: Map
-
-
 def pattern_fit(pair: tuple[Map, Map]) -> Array:
-    """Returns the coefficients (2, `DEGREE` + 1, `DEGREE` + 1) of Legendre polynomials fitted to a pair (H, W).
-
-    The second axis is the degree along the columns of the image, the third axis that along its rows.
-    """
+    """Returns the coefficients (2, d, d) of Legendre polynomials fitted to a pair, by degree along columns and rows."""
     rows, columns = (_fitting_matrix(n) for n in pair[0].shape)
     return np.array([rows @ image.astype(np.float64) @ columns.T for image in pair])
 
 
-def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern | None:
-    """Returns the light pattern of a survey; None if it is not needed or not known.
+def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> Map | None:
+    """Returns the light pattern (2, H, W) of a survey from the fits of its keyframes, in chronological order.
 
     A coefficient is its mean m over the n keyframes times max(0, 1 - v / m^2) (positive-part shrinkage, James & Stein
     1961), which leaves texture and relief in the images. Images of neighbouring keyframes overlap, so the variance of
@@ -48,10 +35,6 @@ def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern
 
     None for fewer than two keyframes, and if the sum of m^2 (without constants) does not exceed that of s^2: the floor
     in view then dominates the light, and the mean may be that of a part of the floor.
-
-    Args:
-        fits: coefficients of the keyframes (`pattern_fit`), in chronological order.
-        shape: height and width (H, W) of the images [px].
     """
     if len(fits) < 2:
         return None
@@ -62,12 +45,10 @@ def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> LightPattern
         return None
     variance = scatter * _images_per_independent_image(deviation) / len(fits)
     kept = np.maximum(1 - variance / np.maximum(mean**2, 1e-12), 0) * mean
-    left, right = (_polynomials(shape[0]) @ side @ _polynomials(shape[1]).T for side in kept)
-    return LightPattern(left.astype(np.float32), right.astype(np.float32))
+    return np.array([_polynomials(shape[0]) @ side @ _polynomials(shape[1]).T for side in kept], np.float32)
 
 
 def _power_without_mean(squares: Array) -> float:
-    """Returns the sum of squared coefficients (2, d, d) without those of the constant polynomial."""
     return float(squares.sum() - squares[:, 0, 0].sum())
 
 
@@ -78,7 +59,6 @@ def _polynomials(n: int) -> Array:
 
 @lru_cache(maxsize=8)
 def _fitting_matrix(n: int) -> Array:
-    """Returns the pseudo-inverse (`DEGREE` + 1, n) of the matrix `_polynomials(n)`."""
     return np.asarray(np.linalg.pinv(_polynomials(n)), np.float64)
 
 
@@ -87,3 +67,22 @@ def _images_per_independent_image(deviation: Array) -> float:
     power = np.sum(deviation[1:] ** 2 + deviation[:-1] ** 2) / 2
     r = float(np.clip(np.sum(deviation[1:] * deviation[:-1]) / max(power, 1e-12), 0.0, 0.9))
     return (1 + r) / (1 - r)
+
+
+class MeanIllumination:
+    """Light pattern in colour, the mean of all images added so far, and the gain that removes it from a map."""
+
+    def __init__(self, rig: StereoRig) -> None:
+        self._size = (rig.width_px, rig.height_px)
+        self._sum = np.zeros((-(-rig.height_px // 4), -(-rig.width_px // 4), 3), np.float32)
+        self._count = 0
+
+    def add(self, rgb: Image) -> None:
+        small = cv2.resize(rgb, self._sum.shape[1::-1], interpolation=cv2.INTER_AREA).astype(np.float32)
+        self._sum += cv2.blur(small, (9, 9))
+        self._count += 1
+
+    def gain(self) -> Map:
+        """Returns the factor (H, W, 3) that makes the illumination of an image uniform, after at least one `add`."""
+        mean = self._sum / self._count + 1
+        return np.asarray(cv2.resize(mean.mean(axis=(0, 1)) / mean, self._size), np.float32)

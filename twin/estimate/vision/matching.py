@@ -1,7 +1,4 @@
-"""Image normalisation, corner detection, and Lucas-Kanade tracking from frame to frame.
-
-Stereo and the links between keyframes need a higher accuracy than Lucas-Kanade gives: see `patches.match_templates`.
-"""
+"""Image normalisation, corners, and Lucas-Kanade tracking between frames (less accurate than `patches`)."""
 
 from __future__ import annotations
 
@@ -11,13 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.records import Image, Map, Mask
 from twin.kernels import kernel
 
-Image = NDArray[np.uint8]
-Gray = NDArray[np.float32]
-Points = NDArray[np.float32]
-Mask = NDArray[np.bool_]
-Pixels = TypeVar("Pixels", NDArray[np.uint8], NDArray[np.float32])
+Gray = Map
+Points = Map
+Pixels = TypeVar("Pixels", Image, Map)
 
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 25, 0.005)
 _GRAY_PER_SIGMA = 36.0
@@ -28,7 +24,7 @@ _FORWARD_BACKWARD_PX = 0.5
 
 
 def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
-    """Returns the slightly smoothed grey levels (height / binning, width / binning) in which patches are matched.
+    """Returns the slightly smoothed grey levels (H / binning, W / binning) in which patches are matched.
 
     Luma without binning; the mean of the three bands with it, because noise limits binned images (signal to noise 1.14
     times that of luma over `paper_coarse`).
@@ -41,11 +37,9 @@ def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
 
 
 def normalise(levels: Gray) -> Image:
-    """Returns grey levels (height, width) uint8 with normalised local mean and contrast, without the lamps' pattern.
+    """Returns grey levels (H, W) with local mean 128 and standard deviation 36, less where the texture is weak.
 
-    The local mean is about 128, the local standard deviation about 36 grey levels, less where the texture is weak. The
-    values depend on the window around a pixel, completed by reflection at the image border. They therefore do not
-    permit matching to a hundredth of a pixel.
+    They depend on the window around a pixel, so they do not permit matching to a hundredth of a pixel.
     """
     mean, square = local_moments(levels)
     normalised = np.empty(levels.shape, np.uint8)
@@ -62,7 +56,7 @@ def local_moments(levels: Gray) -> tuple[Gray, Gray]:
 
 
 def binned(image: Pixels, by: int) -> Pixels:
-    """Returns an image (height, width, ...) with squares of `by` x `by` pixels averaged; `by` divides both sides."""
+    """Returns an image (H, W, ...) with squares of `by` x `by` pixels averaged; `by` divides both sides."""
     if by == 1:
         return image
     smaller: Any = cv2.resize(image, None, fx=1 / by, fy=1 / by, interpolation=cv2.INTER_AREA)
@@ -88,8 +82,7 @@ def _normalise(gray, mean, square, normalised):
 
 
 def corners(image: Image, count: int, patch_px: int) -> Points:
-    """Returns well-textured points (n, 2) float32 [px], the strongest first, whose patches lie inside the normalised
-    image.
+    """Returns well-textured points (n, 2) [px] of a normalised image, the strongest first, not too near its border.
 
     They are corners, spread over the image; if at least one but fewer than half of `count` are found (coarse texture,
     whose information lies between corners), the points of a square grid with the strongest texture.
@@ -114,11 +107,9 @@ def corners(image: Image, count: int, patch_px: int) -> Points:
 def track(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int = 1
 ) -> tuple[Points, Mask]:
-    """Tracks points (n, 2) [px] from one normalised image to another by Lucas-Kanade, with a forward-backward check.
+    """Tracks points (n, 2) [px] from one normalised image to another by Lucas-Kanade.
 
-    Returns:
-        (n, 2) positions in the target [px], and a mask (n,) that is true where tracking back to the source ends less
-        than half a pixel from the point, and the window is inside the target.
+    Returns positions, and a mask (n,) of points with the window inside that are tracked back to within half a pixel.
     """
     if len(points) == 0:
         return points.copy(), np.zeros(0, bool)
@@ -132,7 +123,6 @@ def track(
 def _lucas_kanade(
     source: Image, target: Image, points: Points, guess: Points, patch_px: int, levels: int
 ) -> tuple[Points, Mask]:
-    """Returns the positions (n, 2) in the target [px], and a mask (n,) of the points that were tracked."""
     options = {"winSize": (patch_px, patch_px), "maxLevel": levels, "criteria": _CRITERIA}
     flags = cv2.OPTFLOW_USE_INITIAL_FLOW
     tracked, status, _ = cv2.calcOpticalFlowPyrLK(source, target, points, guess.copy(), flags=flags, **options)

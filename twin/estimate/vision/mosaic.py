@@ -12,17 +12,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.interpolation import bilinear
-from twin.core.records import StereoRig
+from twin.core.records import Map, StereoRig
 from twin.estimate.vision import matching, two_view_motion
 from twin.estimate.vision.tiles import TiledRaster
 from twin.kernels import kernel
-
-Map = NDArray[np.float32]
 
 _MAX_CELLS = 4000
 _MIN_CELLS = 300
@@ -37,8 +34,7 @@ _MAX_TILT_RAD = np.deg2rad(45.0)
 def viewing_plane(world_from_camera: Array) -> Array:
     """Returns plane_from_world (4, 4), the transformation from the world to axes in which heights are measured along z.
 
-    The identity if the optical axis is within 45 degrees of straight down, else the smallest rotation that turns it to
-    -z.
+    The identity if the camera looks down within 45 degrees, else the smallest rotation that turns its axis to -z.
     """
     axis = world_from_camera[:3, 2]
     angle = float(np.arccos(np.clip(-axis[2], -1.0, 1.0)))
@@ -51,18 +47,14 @@ def viewing_plane(world_from_camera: Array) -> Array:
 
 
 class Registration(NamedTuple):
-    """Result of a registration with the mosaic."""
-
     #: pose of the camera at its estimated pose, relative to the camera at its predicted pose
     #: (predicted_from_estimated); `n_points` is the number of compared cells, `residual` is in normalised grey levels.
     correction: two_view_motion.Motion
-    #: median of the keyframe numbers of the compared cells; at least half of the cells come from this keyframe or older
-    #: ones.
-    reference_keyframe: int
+    reference_keyframe: int  #: median of the keyframe numbers of the compared cells
 
 
 class Mosaic:
-    """Raster of brightness, elevation [m] and keyframe number, in tiles (`TiledRaster`), so that memory is limited.
+    """Raster of brightness, elevation [m] and keyframe number, in tiles.
 
     Args:
         cell_m: cell size [m], about the ground sample distance; the south-west corner of cell (0, 0) is the origin of
@@ -73,15 +65,8 @@ class Mosaic:
     def __init__(self, cell_m: float, folder: Path):
         self.cell_m, self.cells = cell_m, TiledRaster(3, folder)
 
-    def clear(self) -> None:
-        """Empties all cells, before the mosaic is rebuilt after a global alignment."""
-        self.cells.clear()
-
     def add(self, number: int, image: matching.Image, depth_m: Map, world_from_camera: Array, rig: StereoRig) -> None:
-        """Fills empty cells of the mosaic from a keyframe with a normalised image and depth (height, width) [m].
-
-        The depth is NaN where unknown. Raises OSError if a tile could not be read or written.
-        """
+        """Fills empty cells from a keyframe with a normalised image and depth (H, W) [m]. Raises OSError."""
         known = depth_m[np.isfinite(depth_m)]
         if known.size == 0:
             return
@@ -98,19 +83,14 @@ class Mosaic:
     def register(
         self, image: matching.Image, depth_m: Map, world_from_camera: Array, half_window_m: float, rig: StereoRig
     ) -> Registration | None:
-        """Registers a frame with the mosaic.
+        """Registers a frame with the mosaic; None if too few textured cells are visible at a known depth and agree.
+
+        Raises OSError if a tile could not be read or written.
 
         Args:
-            image, depth_m: (height, width) normalised frame, and depth from its own stereo pair, NaN where unknown.
+            image, depth_m: (H, W) normalised frame, and depth from its own stereo pair, NaN where unknown.
             world_from_camera: (4, 4) predicted pose.
             half_window_m: half the side of the square of cells that is used, centred below the camera [m].
-
-        Returns:
-            The pose correction with its covariance, or None if too few cells are textured, or too few of these are
-            visible in the frame with a known depth and a small residual.
-
-        Raises:
-            OSError: a tile could not be read or written.
         """
         cells = self._textured_cells(world_from_camera[:3, 3], half_window_m)
         if cells is None:
@@ -142,11 +122,7 @@ class Mosaic:
         return int(centre[1] / self.cell_m) - half, int(centre[0] / self.cell_m) - half, 2 * half
 
     def _textured_cells(self, centre: Array, half_m: float) -> tuple[Array, Map, Map] | None:
-        """Returns positions (n, 3) [m], brightness (n,) and keyframe numbers (n,) of the textured cells in a square.
-
-        From twice `_MAX_CELLS` on, a regular subset; None for fewer than `_MIN_CELLS`, or fewer than 8 cells along a
-        side.
-        """
+        """Returns positions (n, 3) [m], brightness and keyframe (n,) of textured cells in a square; None if too few."""
         row, col, side = self._window(centre, half_m)
         bright, height, number = self.cells.read(row, col, side, side)
         if side < 8:
@@ -174,14 +150,10 @@ def _gradient(bright: Map, height: Map) -> Map:
 
 @kernel
 def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyframe, brightness, height, number):
-    """Fills the empty cells of a window, in place, from one keyframe.
+    """Fills the empty cells of a window from one keyframe, in place, given its south-west corner and cell size [m].
 
     A cell receives the mean height of its pixels, and the brightness at the projection of its centre: that of its
     pixels, which are not at the centre, would bias registered positions by 5 mm.
-
-    Args:
-        west, south, cell: south-west corner of the window and cell size [m].
-        brightness, height, number: (rows, cols) layers of the window, NaN in empty cells.
     """
     total = np.zeros(height.shape, np.float32)
     count = np.zeros(height.shape, np.int32)
@@ -214,12 +186,7 @@ def _insert(image, depth, pose, inverse, focal, cx, cy, west, south, cell, keyfr
 
 @kernel
 def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_residual):
-    """Linearises the brightness residuals (cell minus frame) of the cells visible in the frame at a known depth.
-
-    Args:
-        points, brightness: (n, 3), (n,) positions in the world [m] and brightness of the cells.
-        camera: focal length, column and row of the principal point [px].
-        max_residual: largest brightness residual of an inlier [grey levels].
+    """Linearises the brightness residuals (cell minus frame) of the n cells visible in the frame at a known depth.
 
     Returns:
         Jacobians (m, 6) with respect to an increment [rotation, translation] of the pose in camera axes, with the depth
@@ -262,12 +229,9 @@ def _linearise(points, brightness, frame, depth, camera_from_world, camera, max_
 
 @kernel
 def _normal_equations(jacobian, frame_jacobian, residuals, block):
-    """Computes the normal equations of the increment of the pose, with Huber weights, from results of `_linearise`.
+    """Returns normal matrix, right-hand side, its covariance from the scatter over image blocks, and robust sigma.
 
-    The Jacobian with the frame's depth gives instrumental variables, free of the mosaic's depth errors.
-
-    Returns normal matrix, right-hand side, its covariance from the scatter over the image blocks, and the robust
-    standard deviation of the residuals; zeros for fewer than six residuals.
+    Huber weights; the Jacobian with the frame's depth gives instrumental variables, free of the mosaic's depth errors.
     """
     normal, right, scatter = np.zeros((6, 6)), np.zeros(6), np.zeros((6, 6))
     if len(jacobian) < 6:

@@ -1,5 +1,3 @@
-"""Kalman filter of the pose of the camera relative to a reference image, and of its velocity, from frame to frame."""
-
 from __future__ import annotations
 
 import numpy as np
@@ -15,7 +13,7 @@ _GATE = 30.0  # largest chi2 (6 degrees of freedom) of a measured pose; above it
 
 
 class MotionFilter:
-    """Extended Kalman filter of the pose in a reference camera and of the velocity, with white-noise acceleration.
+    """Extended Kalman filter of the camera's pose in a reference camera and of its velocity, from frame to frame.
 
     Nearly constant velocity (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2): where the image determines a pose
     poorly, it follows from the velocity. A measurement that contradicts the prediction is rejected. Errors of the pose
@@ -34,7 +32,6 @@ class MotionFilter:
 
     @property
     def cov(self) -> Array:
-        """Returns the covariance (6, 6) of the pose."""
         return self._cov[:6, :6]
 
     def restart(self) -> None:
@@ -69,11 +66,9 @@ class MotionFilter:
 
 
 def _acceleration_cov(interval_s: float) -> Array:
-    """Returns the covariance (12, 12) of pose and velocity that unknown accelerations add within an interval.
+    """Returns the covariance (12, 12) of pose and velocity that white-noise acceleration adds within an interval.
 
-    White-noise acceleration (Bar-Shalom, Li & Kirubarajan 2001, section 6.2.2), with a standard deviation of the change
-    of velocity of `_ACCELERATION` times the interval. Constant acceleration within the interval (section 6.3.2) would
-    reverse the velocity error at each frame (an alpha-beta filter with beta = 2).
+    Constant acceleration (Bar-Shalom et al. 2001, section 6.3.2) would reverse the velocity error at each frame.
     """
     velocity = np.diag((_ACCELERATION * interval_s) ** 2)
     shared = velocity * (interval_s / 2)

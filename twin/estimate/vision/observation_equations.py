@@ -16,10 +16,7 @@ _MIN_DISPARITY = 1e-4  # keeps adjusted points in front of the camera
 
 
 class PairMeasurements(NamedTuple):
-    """Measurements of the same n points in two stereo pairs, a (earlier) and b (later).
-
-    In frame-to-frame motion (`f2f`), a is the current image, without measured disparity, and b the reference image.
-    """
+    """Measurements of n points in two stereo pairs, or (`f2f`) in an image, without disparity, and its reference."""
 
     a: Array  #: (n, 3) normalised (x, y, disparity) in pair a
     b: Array  #: (n, 3) normalised (x, y, disparity) in pair b
@@ -35,8 +32,6 @@ class PixelLocking(NamedTuple):
 
 
 class LinearisedObservations(NamedTuple):
-    """Observation equations of n points in two stereo pairs, linearised at a motion and a structure."""
-
     residual: Array  #: (n, 3) measurements in a, minus their linearised prediction from the measurements in b
     jacobian_point: Array  #: (n, 3, 3) derivative of the prediction with respect to the point (x, y, disparity) in b
     #: (n, 3, p) derivative of the prediction with respect to the p unknowns: the increment of the motion a_from_b, a
@@ -48,10 +43,7 @@ class LinearisedObservations(NamedTuple):
 
 @kernel
 def image_jacobian(x, y, depth):
-    """Returns the Jacobian (n, 2, 6) of normalised image positions with respect to the twist of the camera (rad, m).
-
-    This is eq. 1 of Negahdaripour & Madjidi 2003; x, y and depth [m] are (n,).
-    """
+    """Returns the derivative (n, 2, 6) of normalised positions by the twist of the camera (eq. 1), for depths [m]."""
     jacobian = np.empty((len(x), 2, 6))
     for i in range(len(x)):
         u, v, inverse_depth = x[i], y[i], 1 / depth[i]
@@ -62,10 +54,7 @@ def image_jacobian(x, y, depth):
 
 @kernel
 def normal_equations(jacobian, weight, residual):
-    """Returns the normal matrix (6, 6) and the right-hand side (6,) of a weighted least-squares problem of n points.
-
-    Jacobians (n, k, 6) and residuals (n, k) of k observations per point, weights (n,).
-    """
+    """Returns the normal matrix (6, 6) and right-hand side (6,) of n points with k observations each."""
     normal, right = np.zeros((6, 6)), np.zeros(6)
     for i in range(len(jacobian)):
         for k in range(jacobian.shape[1]):
@@ -81,9 +70,8 @@ def normal_equations(jacobian, weight, residual):
 def transfer(points_b, a_from_b, baseline):
     """Transfers points measured in pair b, normalised (x, y, disparity) (n, 3), to pair a.
 
-    Returns:
-        (n, 3) normalised (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an
-        increment [rotation, translation] (rad, m) of the motion in the axes of b (n, 3, 6).
+    Returns (x, y, disparity) in a, and its derivatives with respect to the point in b (n, 3, 3) and to an increment
+    [rotation, translation] (rad, m) of the motion in the axes of b (n, 3, 6).
     """
     n = len(points_b)
     points_a, jacobian_point, jacobian_motion = np.empty((n, 3)), np.empty((n, 3, 3)), np.empty((n, 3, 6))
@@ -157,11 +145,8 @@ def _invert(m, out):
 def motion_normal_equations(observations, weight):
     """Returns the normal equations of the p unknowns of the motion, with the structure eliminated.
 
-    Points of robust weight (n,) 0 are skipped.
-
-    Returns:
-        Normal matrix (p, p), right-hand side (p,), and derivative (p, 3) of the right-hand side with respect to biases
-        of x, y and disparity in a that are the same at all points.
+    These are the normal matrix (p, p), the right-hand side (p,), and its derivative (p, 3) with respect to biases of x,
+    y and disparity in a that are the same at all points. Points of robust weight (n,) 0 are skipped.
     """
     residual, jacobian, information = observations.residual, observations.jacobian_motion, observations.information
     count = jacobian.shape[2]

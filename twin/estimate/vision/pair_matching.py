@@ -7,11 +7,10 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import StereoRig
+from twin.core.records import Mask, StereoRig
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
 from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
@@ -30,30 +29,19 @@ class MatchedPair(NamedTuple):
 
 
 class PairMatcher:
-    """Matches a node with earlier nodes and estimates the motions between them.
-
-    Args:
-        rig: calibration at the image scale of the grey levels in `spool`.
-        spool: images of the keyframes.
-        patch_px: side of the matched patches (odd).
-    """
+    """Matches a node with earlier nodes, at the scale of the grey levels in `spool`, and estimates their motions."""
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
         self._workers = ThreadPoolExecutor(2)
 
     def close(self) -> None:
-        """Ends the threads that match points."""
         self._workers.shutdown()
 
-    def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[MatchedPair | None]:
-        """Returns, for each of the other nodes, the points of `node` matched in both images; None if it has no points.
-
-        Raises OSError if images could not be read or written.
-        """
+    def match(self, node: Keyframe, others: Sequence[Keyframe]) -> list[MatchedPair]:
+        """Returns the points of `node` matched in both images of each other node. Raises OSError."""
         points = node.points
-        if points is None:
-            return [None for _ in others]
+        assert points is not None
         left, _ = self.spool.gray(node.row)
         templates = patches.extract_templates(patches.pyramid(left, _LEVELS), points.pixels, self.patch_px)
         return list(self._workers.map(lambda other: self._match_pair(node, points, templates, other), others))
@@ -61,11 +49,7 @@ class PairMatcher:
     def _match_pair(
         self, node: Keyframe, points: StereoPoints, templates: Sequence[patches.PatchTemplates], other: Keyframe
     ) -> MatchedPair:
-        """Returns the points that were matched in both images of another node.
-
-        Matching starts at positions predicted from the poses and the depth. Each patch is warped according to a plane
-        fitted to the disparities around its point.
-        """
+        """Returns the points matched in both images of another node, from predicted positions, with warped patches."""
         rig = self.rig
         other_from_node = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         expected, jacobian, _ = observation_equations.transfer(points.measured, other_from_node, rig.baseline_m)
@@ -91,17 +75,14 @@ class PairMatcher:
         return MatchedPair(pair, PixelLocking(locking, self._locking_in_node(node_points)))
 
     def _locking_in_node(self, points: StereoPoints) -> Array:
-        """Returns the derivative (n, 3) [1/px] of a node's measurements with respect to the amplitude of pixel locking.
-
-        The patches are centred at whole pixels of the left image, so only their positions in the right one are biased.
-        """
+        """Returns the derivative (n, 3) of a node's measurements by pixel locking, which is only in the right image."""
         left_px, shift_px = self._project(points.measured)
         warp = np.tile(np.eye(2), (len(left_px), 1, 1))
         warp[:, 0] -= points.disparity_slope
         right_shift = patches.locking_shifts(left_px - shift_px, warp, self.patch_px)
         return stereo.fused_shift(np.zeros_like(right_shift), right_shift, points.cov, self.rig)
 
-    def _in_view(self, points: StereoPoints, other_from_node: Array) -> NDArray[np.bool_]:
+    def _in_view(self, points: StereoPoints, other_from_node: Array) -> Mask:
         """Returns a mask (n,) of the points whose patches are predicted well inside both images of the other node."""
         smoothed = np.column_stack([points.measured[:, :2], points.mean_disparity_px / self.rig.focal_px])
         expected, _, _ = observation_equations.transfer(smoothed, other_from_node, self.rig.baseline_m)
@@ -127,7 +108,6 @@ class PairMatcher:
             common_sigma=COMMON_BIAS_PX / self.rig.focal_px,
             variance_inflation=matching.variance_inflation(measured.b[:, :2] * self.rig.focal_px, self.patch_px),
             locking=matched.locking,
-            measured_scatter=True,
         )
         guess = predicted if closed_form is None else closed_form
         motion = two_view_motion.pair_motion(measured, self.rig.baseline_m, guess, settings)

@@ -3,8 +3,7 @@
 Inverse compositional Gauss-Newton, coarse to fine (Baker & Matthews 2004), with cubic B-splines (Unser 1999). Remedies
 of systematic errors: each patch is warped by the plane that stereo measures around its point (unwarped, slopes bias the
 rotation between legs by 0.4 mrad); gradients of brightness and contrast are nuisance parameters that are projected out,
-because the lamps move (0.01 px); B-splines halve the bias of cubic convolution (0.014 px); grey levels are not
-normalised locally (0.015 px near the border).
+because the lamps move (0.01 px); B-splines halve the bias of cubic convolution (0.014 px).
 """
 
 from __future__ import annotations
@@ -16,12 +15,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.interpolation import bspline_weights
+from twin.core.records import Map, Mask
 from twin.kernels import kernel
-
-Image = NDArray[np.float32]
-Spline = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 _CONVERGED_PX = 0.002
@@ -43,21 +40,21 @@ class PatchTemplates(NamedTuple):
     #: (n,) sum of squared deviations of the grey levels from the patch's mean; 0 if the patch cannot be matched,
     #: because it is too uniform, or not inside the image with a margin of one pixel.
     energy: Array
-    gradient: NDArray[np.float32]  #: (n, 2, m) image gradient, with the nuisance parameters projected out
-    nuisance: NDArray[np.float32]  #: (n, 6, m) orthonormal basis of the nuisance parameters (`_NUISANCES`)
+    gradient: Map  #: (n, 2, m) image gradient, with the nuisance parameters projected out
+    nuisance: Map  #: (n, 6, m) orthonormal basis of the nuisance parameters (`_NUISANCES`)
 
 
 class PatchMatches(NamedTuple):
     """Positions of n patches in a target image."""
 
     points: Array  #: (n, 2) positions in the target [px]
-    ok: NDArray[np.bool_]  #: (n,) bool, true if the match converged and its correlation with the template is above 0.7
+    ok: Mask  #: (n,) bool, true if the match converged and its correlation with the template is above 0.7
     #: (n, 2, 2) covariance of the position due to the noise of one image, half of that of both, in the pixels and axes
     #: of the source image [px^2]; estimated from the texture and the residuals.
     cov: Array
 
 
-def pyramid(image: Image, levels: int) -> list[Image]:
+def pyramid(image: Map, levels: int) -> list[Map]:
     """Returns the image (height, width), followed by `levels` coarser images, each half the size of the previous."""
     images = [image]
     for _ in range(levels):
@@ -65,7 +62,7 @@ def pyramid(image: Image, levels: int) -> list[Image]:
     return images
 
 
-def extract_templates(images: Sequence[Image], points: NDArray[np.floating], patch_px: int) -> list[PatchTemplates]:
+def extract_templates(images: Sequence[Map], points: NDArray[np.floating], patch_px: int) -> list[PatchTemplates]:
     """Returns the patches of side `patch_px` (odd) around points (n, 2) at whole pixels, at each level of a pyramid."""
     levels = []
     for level, image in enumerate(images):
@@ -76,24 +73,20 @@ def extract_templates(images: Sequence[Image], points: NDArray[np.floating], pat
     return levels
 
 
-def spline_coefficients(images: Sequence[Image]) -> list[Spline]:
-    """Returns the coefficients (height, width) of the cubic B-spline that interpolates each image (height, width).
-
-    The impulse response of the filter decays by a factor of 0.27 per pixel, so it is truncated at 7 px.
-    """
+def spline_coefficients(images: Sequence[Map]) -> list[Map]:
+    """Returns the coefficients (H, W) of the cubic B-spline of each image; the filter is truncated at 7 px."""
     kernel = np.sqrt(3.0) * (np.sqrt(3.0) - 2) ** np.abs(np.arange(-7, 8))
     kernel /= kernel.sum()
     return [np.asarray(cv2.sepFilter2D(i, cv2.CV_32F, kernel, kernel), np.float32) for i in images]
 
 
 def match_templates(
-    templates: Sequence[PatchTemplates], target: Sequence[Spline], guess: NDArray[np.floating], warp: Array
+    templates: Sequence[PatchTemplates], target: Sequence[Map], guess: NDArray[np.floating], warp: Array
 ) -> PatchMatches:
     """Matches patches of one image in another, from the coarsest common level of the pyramids down to the full image.
 
     Args:
-        templates: patches per pyramid level (`extract_templates`).
-        target: spline coefficients per pyramid level (`spline_coefficients`).
+        templates, target: patches and spline coefficients per pyramid level.
         guess: (n, 2) expected positions in the target [px]; accurate to about two pixels of the coarsest level.
         warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
     """
@@ -114,25 +107,17 @@ def match_templates(
     return PatchMatches(points, correlation > _MIN_CORRELATION, cov)
 
 
-def disparity_slope(disparity_px: NDArray[np.float32], points: NDArray[np.floating], patch_px: int) -> Array:
-    """Returns the gradient (n, 2) of the disparity with respect to column and row over each patch; 0 where unknown.
-
-    A plane is fitted to the disparity map (height, width) [px], NaN where unknown, around the whole pixels (n, 2).
-    """
+def disparity_slope(disparity_px: Map, points: NDArray[np.floating], patch_px: int) -> Array:
+    """Returns the gradient (n, 2) by column and row of a plane fitted to the disparities around points; 0: unknown."""
     return _slope(disparity_px, np.round(points).astype(np.int64), patch_px // 2)
 
 
 def locking_shifts(pixels: NDArray[np.floating], warp: Array, patch_px: int) -> Array:
-    """Returns the shifts (n, 2) [px] of matched positions due to pixel locking with an amplitude of 1 px.
+    """Returns the shifts (n, 2) [px] of positions `pixels` (n, 2) due to pixel locking with an amplitude of 1 px.
 
     A match at column u and row v [px] is shifted by -A sin(2 pi u) and -A sin(2 pi v) (Schreier, Braasch & Sutton 2000,
-    Opt. Eng. 39). On a smooth floor this does not average out. Where a patch of side s is warped, its pixels' biases
-    partly cancel: A along an image axis is multiplied by sinc(s d1) sinc(s d2), with (d1, d2) the row for this axis of
-    "warp minus identity", and sinc t = sin(pi t) / (pi t).
-
-    Args:
-        pixels: (n, 2) matched positions in the target image [px].
-        warp: (n, 2, 2) derivative of target pixels with respect to source pixels over each patch.
+    Opt. Eng. 39). Where a patch of side s is warped (`match_templates`), its pixels' biases partly cancel: A along an
+    image axis is multiplied by sinc(s d1) sinc(s d2), with (d1, d2) the row for this axis of "warp minus identity".
     """
     varying = np.sinc(patch_px * (warp - np.eye(2)))
     return -np.sin(2 * np.pi * pixels) * varying[:, :, 0] * varying[:, :, 1]
@@ -195,10 +180,7 @@ def _extract(source, centres, half):
 
 @kernel(forceinline=True, fastmath=_REASSOCIATE)
 def _prepare(source, u0, v0, half, rows):
-    """Writes the nuisance basis (rows 0 to 5) and projected gradient (6 and 7) of a patch to `rows` (8, m).
-
-    Returns the sum of squared deviations from the mean of the patch; 0 if the patch is too uniform.
-    """
+    """Writes the nuisance basis (rows 0 to 5) and projected gradient (6 and 7) to `rows` (8, m); returns the energy."""
     side = 2 * half + 1
     mean = 0.0
     for i in range(side):
@@ -245,10 +227,7 @@ def _dot(a, b):
 
 @kernel(forceinline=True, fastmath=True)
 def _sample(spline, u0, v0, warp, half, values):
-    """Writes the target's cubic B-spline at the m pixels of a warped patch, centred at (u0, v0), to `values` (m,).
-
-    For speed, relative positions are in single precision, and unsigned indices avoid a check for negative values.
-    """
+    """Writes the target's spline at the pixels of a patch, warped around (u0, v0), to `values`; single precision."""
     side, width = 2 * half + 1, spline.shape[1]
     flat = spline.ravel()
     uu, uv, vu, vv = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])

@@ -1,5 +1,3 @@
-"""Detection of cameras that deliver the same image again (a frozen camera)."""
-
 from __future__ import annotations
 
 import numpy as np
@@ -18,12 +16,11 @@ _TINY = 1e-6  # smallest standard deviation of a sensor: rounding errors of a no
 
 
 class RepeatedImages:
-    """Names the camera that repeats its image, frame by frame.
+    """Names the camera that repeats its image (a frozen camera), frame by frame.
 
-    Noise changes every image of a live camera, so a repeated image means that the camera is frozen. Images without
-    noise also repeat while the vehicle is at rest. They count as repeated only if the vehicle moves: it was faster at
-    the last new image than it can stop within a frame, or its sensors, with this noise, measure motion. A camera that
-    is frozen stays so until a new image arrives.
+    Noise changes every image of a live camera. Images without noise also repeat while the vehicle is at rest. They
+    count as repeated only if the vehicle moves: it was faster at the last new image than it can stop within a frame, or
+    its sensors, with this noise, measure motion. A camera that is frozen stays so until a new image arrives.
     """
 
     def __init__(self, noisy: bool, noise: SensorNoise):
@@ -34,12 +31,9 @@ class RepeatedImages:
         self._time_s = np.nan
 
     def status(self, frame: Frame, twist: Array, interval_s: float) -> str:
-        """Returns "ok", or which camera is frozen. The right camera is judged where the frame has its image.
+        """Returns "ok", or which camera is frozen; the same answer if the frame is the last one again.
 
-        Args:
-            frame: a frame; if it is the last one again, the answer is the same.
-            twist: (6,) velocity of the camera [rad/s, m/s] at the last frame.
-            interval_s: time since the last frame [s].
+        `twist` (6,) is the velocity of the camera [rad/s, m/s] at the last frame. The right image may be missing.
         """
         if frame.time_s != self._time_s:
             self._time_s = frame.time_s

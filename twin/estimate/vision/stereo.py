@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Displacement, Exposure, Image, Readings, StereoRig
+from twin.core.records import Displacement, Exposure, Image, Map, Mask, Readings, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.estimate.vision import disparity, epipolar, matching, patches
 
@@ -26,7 +26,7 @@ _MIN_ROW_DIFFERENCES = 30  # with fewer points, the scatter of their row differe
 class StereoPoints(NamedTuple):
     """Matched points of one stereo pair."""
 
-    pixels: NDArray[np.float32]  #: (n, 2) whole pixels in the left image
+    pixels: Map  #: (n, 2) whole pixels in the left image
     disparity_slope: Array  #: (n, 2) gradient of the disparity at each point with respect to column and row [px/px]
     #: (n,) mean disparity around each point [px]. It is nearly independent of the matching error of the point and is
     #: used to predict whether the point lies inside another image.
@@ -35,22 +35,16 @@ class StereoPoints(NamedTuple):
     cov: Array  #: (n, 3, 3) covariance of each point in `measured`
     xyz: Array  #: (n, 3) positions in the axes of the left camera [m]
     row_difference_px: Array  #: (n,) row in the right image minus row in the left image [px]
-    #: ratio of the measured to the expected standard deviation of the row differences (`row_noise_ratio`); `cov` was
-    #: computed with matching noise that is larger by this factor.
-    noise_ratio: float = 1.0
+    noise_ratio: float = 1.0  #: `row_noise_ratio`, the factor on the matching noise from which `cov` was computed
 
-    def subset(self, keep: NDArray[np.bool_]) -> StereoPoints:
-        """Returns the points where `keep` (n,) is true."""
+    def subset(self, keep: Mask) -> StereoPoints:
         *columns, noise_ratio = self
         return StereoPoints._make([*(column[keep] for column in columns), noise_ratio])
 
 
 @dataclass
 class Keyframe:
-    """Frame with a stereo pair whose pose the network estimates ("key point" in Negahdaripour & Madjidi 2003).
-
-    Its fields are updated in place during the survey.
-    """
+    """Frame with a stereo pair whose pose the network estimates ("key point" in the paper); updated in place."""
 
     number: int  #: index of the keyframe, from 0
     row: int  #: index of its frame in the trajectories
@@ -80,16 +74,11 @@ class Keyframe:
 
 
 def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, Array]:
-    """Returns (x, y, disparity) of points and their covariance from their positions in both images of a rectified pair.
+    """Returns normalised (x, y, disparity) (n, 3) and covariance (n, 3, 3) of points matched in a rectified pair.
 
     The left column is in both x and disparity, so they are correlated. Equal rows are enforced by a Kalman update,
-    which also corrects the columns if the errors of column and row are correlated.
-
-    Args:
-        left, right, cov: (n, 2) positions in the images [px], and their covariance (n, 2, 2), the same in both [px^2].
-
-    Returns:
-        (n, 3) normalised (x, y, disparity) and (n, 3, 3) covariance.
+    which also corrects the columns if the errors of column and row are correlated. Positions (n, 2) [px]; `cov` (n, 2,
+    2) [px^2] is that in each image.
     """
     xx, xy, yy = cov[:, 0, 0] + _MIN_SIGMA_PX**2, cov[:, 0, 1], cov[:, 1, 1] + _MIN_SIGMA_PX**2
     state = np.column_stack([left, left[:, 0] - right[:, 0]])
@@ -104,8 +93,8 @@ def fuse(left: Array, right: Array, cov: Array, rig: StereoRig) -> tuple[Array, 
 def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> Array:
     """Returns the shifts (n, 3) of the results of `fuse` that shifts (n, 2) of its input positions [px] cause.
 
-    The constraint of equal rows moves each of the two rows by half their difference. It also corrects the columns by
-    regression on the rows; the regression coefficient follows from the covariance (n, 3, 3) that `fuse` returned.
+    The constraint of equal rows moves each row by half their difference, and the columns by regression on the rows; the
+    coefficient follows from the covariance (n, 3, 3) that `fuse` returned.
     """
     slope, half = fused_cov[:, 0, 1] / fused_cov[:, 1, 1], (left[:, 1] - right[:, 1]) / 2
     x, disparity = left[:, 0] - slope * half, left[:, 0] - right[:, 0] - 2 * slope * half
@@ -115,9 +104,8 @@ def fused_shift(left: Array, right: Array, fused_cov: Array, rig: StereoRig) -> 
 def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
     """Returns the ratio of the measured standard deviation of row differences to the expected one; at least 1.
 
-    Row differences of a stereo pair, minus their median (calibration errors), measure the matching noise. The ratio is
-    1.4826 times the median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors
-    of 1.17 / sqrt(n). Positions (n, 2) and their covariance are those of `fuse`.
+    Row differences minus their median (calibration errors) measure the matching noise. The ratio is 1.4826 times the
+    median of the absolute normalised ones; 1 for fewer than 30 points, or within two standard errors of 1.17 / sqrt(n).
     """
     n = len(left)
     if n < _MIN_ROW_DIFFERENCES:
@@ -128,17 +116,16 @@ def row_noise_ratio(left: Array, right: Array, cov: Array) -> float:
     return ratio if ratio > 1 + 2 * 1.17 / n**0.5 else 1.0
 
 
-def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> NDArray[np.bool_]:
+def satisfies_epipolar(left: NDArray[np.floating], right: NDArray[np.floating]) -> Mask:
     """Returns a mask (n,) of the matches (n, 2) with a row difference below 1 px and a disparity above 0.5 px."""
     return (np.abs(right[:, 1] - left[:, 1]) < _EPIPOLAR_PX) & (left[:, 0] - right[:, 0] > 0.5)
 
 
 def margin_px(patch_px: int) -> int:
-    """Returns the smallest distance from the image border that the predicted centre of a patch must have [px]."""
     return patch_px // 2 + _BORDER_PX
 
 
-def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> NDArray[np.bool_]:
+def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> Mask:
     """Returns a mask (n,) of the patches, predicted at `pixels` (n, 2), that stay inside despite matching errors.
 
     Measured positions would prefer errors that point away from the border (-0.02 px of disparity over coarse texture).
@@ -146,32 +133,24 @@ def well_inside(pixels: NDArray[np.floating], rig: StereoRig, patch_px: int) -> 
     return matching.inside(pixels, (rig.height_px, rig.width_px), margin_px(patch_px))
 
 
-def corners_with_disparity(
-    left: matching.Gray, dense_px: NDArray[np.float32], count: int, patch_px: int
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def corners_with_disparity(left: matching.Gray, dense_px: Map, settings: EstimatorSettings) -> tuple[Map, Map]:
     """Returns corners (n, 2) of the left image with known disparity, at whole pixels, and their disparities (n,)."""
-    pixels = np.round(matching.corners(matching.normalise(left), count, patch_px)).astype(np.float32)
+    corners = matching.corners(matching.normalise(left), settings.points, settings.patch_px)
+    pixels = np.round(corners).astype(np.float32)
     columns, rows = pixels.astype(int).T
     known = np.isfinite(dense_px[rows, columns])
     return pixels[known], dense_px[rows, columns][known]
 
 
 def match_stereo_points(
-    left: matching.Gray,
-    right: matching.Gray,
-    dense_px: NDArray[np.float32],
-    rig: StereoRig,
-    count: int,
-    patch_px: int,
+    left: matching.Gray, right: matching.Gray, dense_px: Map, rig: StereoRig, settings: EstimatorSettings
 ) -> StereoPoints:
-    """Matches corners of the left image in the right image, to sub-pixel accuracy.
+    """Matches corners of the left image in the right one, to sub-pixel accuracy, from an initial disparity (H, W) [px].
 
-    Args:
-        left, right: (height, width) grey levels (`matching.gray`).
-        dense_px: (height, width) initial disparity, NaN where unknown [px].
-        rig: calibration at the scale of the images, with square pixels.
+    Grey levels are those of `matching.gray`; the rig is that of the images, with square pixels.
     """
-    pixels, disparity_px = corners_with_disparity(left, dense_px, count, patch_px)
+    patch_px = settings.patch_px
+    pixels, disparity_px = corners_with_disparity(left, dense_px, settings)
     slope = patches.disparity_slope(_refined(dense_px, left, right), pixels, patch_px)
     warp = np.tile(np.eye(2), (len(pixels), 1, 1))
     warp[:, 0] -= slope
@@ -190,22 +169,21 @@ def match_stereo_points(
 
 
 def choose_binning(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> int:
-    """Returns the smallest binning [px] at which over two thirds of the corners are matched, else that with the most.
+    """Returns the smallest binning at which over two thirds of the corners are matched, else that with the most.
 
-    Over coarse texture many corners are noise: over texels of 12 pixels, 35 to 60 % are matched at full size, 88 to
-    96 % with binning by 2 or 4; over fine texture 95 to 99 % without. Larger patches alone do not help. Only binnings
-    that divide the width and the height of the images (height, width, 3) are tried.
+    Over coarse texture many corners are noise: over texels of 12 pixels, 35 to 60 % are matched at full size, 88 to 96
+    % with binning by 2 or 4; over fine texture 95 to 99 % without. Larger patches alone do not help. Only binnings that
+    divide the width and the height of the images are tried.
     """
     best, best_fraction = 1, 0.0
     for binning in BINNINGS:
         if rig.width_px % binning or rig.height_px % binning:
             break
-        scaled, n, patch_px = rig.binned(binning), settings.points, settings.patch_px
-        left_gray, right_gray = matching.gray(left, binning), matching.gray(right, binning)
+        scaled, left_gray, right_gray = rig.binned(binning), matching.gray(left, binning), matching.gray(right, binning)
         widest_px = disparity.SearchRange(scaled).max_disparity_px
         dense_px = disparity.search(matching.normalise(left_gray), matching.normalise(right_gray), widest_px)
-        pixels, _ = corners_with_disparity(left_gray, dense_px, n, patch_px)
-        points = match_stereo_points(left_gray, right_gray, dense_px, scaled, n, patch_px)
+        pixels, _ = corners_with_disparity(left_gray, dense_px, settings)
+        points = match_stereo_points(left_gray, right_gray, dense_px, scaled, settings)
         fraction = len(points.xyz) / max(len(pixels), 1)
         if fraction > _MIN_MATCHED:
             return binning
@@ -214,7 +192,7 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
     return best
 
 
-def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching.Gray) -> NDArray[np.float32]:
+def _refined(dense_px: Map, left: matching.Gray, right: matching.Gray) -> Map:
     """Returns disparities (H, W) [px] for the slopes of patches: refined ones, or the initial ones where that fails.
 
     Semi-global matching makes slopes 8 to 12 % too small over coarse texture, which biased the rotation of links.
@@ -223,7 +201,7 @@ def _refined(dense_px: NDArray[np.float32], left: matching.Gray, right: matching
     return np.where(np.isfinite(refined), refined, dense_px)
 
 
-def _local_mean(dense_px: NDArray[np.float32], side_px: int) -> NDArray[np.float32]:
+def _local_mean(dense_px: Map, side_px: int) -> Map:
     """Returns the mean (H, W) [px] of the known disparities in a square around each pixel; 0 if none is known."""
     known = np.isfinite(dense_px)
     total, count = (

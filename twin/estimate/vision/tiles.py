@@ -1,5 +1,3 @@
-"""Raster of unlimited extent in square tiles; the most recently used tiles are kept in memory, the others on disk."""
-
 from __future__ import annotations
 
 from collections import OrderedDict
@@ -7,29 +5,25 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-Layers = NDArray[np.float32]
+from twin.core.records import Map
 
 TILE_SIDE = 256
 _MAX_TILES = 64  # 50 MB with three layers; an image covers about 20 tiles
 
 
 class TiledRaster:
-    """Raster of float32 layers, with cells at any row and column, including negative ones; unwritten cells are NaN.
+    """Raster of float32 layers without limits; unwritten cells are NaN.
 
-    Args:
-        n_layers: number of values per cell.
-        folder: folder for the tiles that are moved to disk; created when needed.
-        max_tiles: maximum number of tiles in memory.
+    The `max_tiles` most recently used square tiles are in memory, the others in `folder`, which is created when needed.
     """
 
     def __init__(self, n_layers: int, folder: Path, max_tiles: int = _MAX_TILES):
         self.n_layers, self.folder, self.max_tiles = n_layers, folder, max_tiles
-        self._tiles: OrderedDict[tuple[int, int], Layers] = OrderedDict()
+        self._tiles: OrderedDict[tuple[int, int], Map] = OrderedDict()
         self._spooled: set[tuple[int, int]] = set()
 
-    def read(self, row: int, col: int, rows: int, cols: int) -> Layers:
+    def read(self, row: int, col: int, rows: int, cols: int) -> Map:
         """Returns a copy (n_layers, rows, cols) of the window whose first cell is (row, col). Raises OSError."""
         window = np.full((self.n_layers, max(rows, 0), max(cols, 0)), np.nan, np.float32)
         for key, in_tile, in_window in _overlapping_tiles(row, col, rows, cols):
@@ -37,7 +31,7 @@ class TiledRaster:
                 window[in_window] = self._tile(key)[in_tile]
         return window
 
-    def write(self, row: int, col: int, window: Layers) -> None:
+    def write(self, row: int, col: int, window: Map) -> None:
         """Writes a window (n_layers, rows, cols) whose first cell is (row, col). Raises OSError."""
         for key, in_tile, in_window in _overlapping_tiles(row, col, *window.shape[1:]):
             if self._exists(key) or not np.isnan(window[in_window]).all():
@@ -53,7 +47,7 @@ class TiledRaster:
             self._path(key).unlink(missing_ok=True)
         self._spooled.clear()
 
-    def _tile(self, key: tuple[int, int]) -> Layers:
+    def _tile(self, key: tuple[int, int]) -> Map:
         """Returns a tile (n_layers, `TILE_SIDE`, `TILE_SIDE`), not a copy; loads or creates it if not in memory."""
         if key not in self._tiles:
             if key in self._spooled:
@@ -65,7 +59,7 @@ class TiledRaster:
         self._tiles.move_to_end(key)
         return self._tiles[key]
 
-    def _spool(self, key: tuple[int, int], tile: Layers) -> None:
+    def _spool(self, key: tuple[int, int], tile: Map) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
         np.save(self._path(key), tile)
         self._spooled.add(key)

@@ -30,6 +30,8 @@ HUBER = 1.5
 _LOCKING_SIGMA_PX = 0.006
 MAX_LOCKING_PX = 3 * _LOCKING_SIGMA_PX  #: largest plausible estimate of the amplitude
 _MIN_POINTS = 12
+_ITERATIONS = 6  # Gauss-Newton iterations of `pair_motion`
+_CLOSED_FORMS = 4  # iterations of `exact_depth_motion`
 CUTOFF = 4.0  # residuals of `pair_motion` beyond this many standard deviations have zero weight
 _PRIOR_POINTS = 50  # weight of the expected covariance of the scores in `_scatter_cov`, as a number of points
 _MIN_SCALE = 0.3  # smallest factor on reported standard deviations, for noise-free data
@@ -45,61 +47,40 @@ class Motion(NamedTuple):
     #: robust standard deviation of the residuals, divided by its expected value (`pair_motion`) or in grey levels
     #: (`mosaic`); infinite for a predicted motion.
     residual: float
-    #: (4, 4) closed-form motion (Negahdaripour & Madjidi 2003, eq. 2) from which the estimation started; None if it
-    #: started from another motion.
-    closed_form: Array | None = None
-    #: offset of all disparities, estimated from the points of two stereo pairs (`pair_motion`); None if it is not
-    #: estimated.
-    disparity_offset: DisparityOffset | None = None
+    closed_form: Array | None = None  #: (4, 4) motion by eq. 2 from which the estimation started, if it did
+    disparity_offset: DisparityOffset | None = None  #: offset of all disparities, if it is estimated (`pair_motion`)
 
 
 class PairMotionSettings(NamedTuple):
-    """Stochastic model and number of iterations of `pair_motion`."""
+    """Stochastic model of `pair_motion`."""
 
     #: standard deviation of the biases of x, y and disparity, each of which is the same at all points; normalised.
     common_sigma: float = 0.0
     variance_inflation: float = 1.0  #: factor on the covariance for correlated points (`matching.variance_inflation`)
-    #: number of coordinates measured per point in pair a: 3, or 2 if the disparity in a is unknown and has a large
-    #: variance in `PairMeasurements.cov_a`.
-    n_measured: int = 3
-    iterations: int = 6  #: number of Gauss-Newton iterations
+    n_measured: int = 3  #: coordinates measured in pair a: 3, or 2 if its disparity is unknown, of large variance
     #: with this, the amplitude of pixel locking is estimated together with the motion.
     locking: PixelLocking | None = None
-    #: whether the covariance of the motion is computed from the residuals of the individual points (`_scatter_cov`),
-    #: instead of from the covariances of the measurements and a common scale.
-    measured_scatter: bool = False
 
 
 _DEFAULT_SETTINGS = PairMotionSettings()
 
 
 def closed_form_motion(x: Array, y: Array, depth: Array, flow: Array, weight: Array) -> Array:
-    """Returns the weighted least-squares twist (6,) of the camera from flow and depth, eq. (2).
-
-    Args:
-        x, y, depth: (n,) normalised image coordinates, and depth [m].
-        flow, weight: (n, 2), (n,) displacements of the normalised coordinates, and weights of the points.
-    """
+    """Returns the weighted least-squares twist (6,) of the camera from flow (n, 2) and depth (n,), eq. (2)."""
     normal, right = normal_equations(image_jacobian(x, y, depth), weight, flow)
     return np.asarray(np.linalg.solve(normal, right), np.float64)
 
 
-def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array, iterations: int = 4) -> Array | None:
-    """Estimates the motion between two stereo pairs, taking the depth from the later pair b as exact.
+def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
+    """Returns the pose (4, 4) of the later stereo pair b in the earlier one a, taking the depth from b as exact.
 
-    Iterates the closed form, eq. (2), with Huber weights that are 0 beyond five standard deviations. This is fast, but
-    depth errors bias the estimate. The disparity in the earlier pair a is not used.
-
-    Args:
-        a, b: (n, 3) normalised (x, y, disparity) of the same points in the earlier and the later pair.
-        guess: (4, 4) initial pose of b in a.
-
-    Returns:
-        (4, 4) pose of b in a, or None if there are too few points or inliers, or a point is behind camera a.
+    Iterates the closed form, eq. (2), from `guess` (4, 4), with Huber weights that are 0 beyond five standard
+    deviations. Depth errors bias the estimate. Points (n, 3) are normalised (x, y, disparity); the disparity in a is
+    not used. None if there are too few points or inliers, or a point is behind camera a.
     """
     points = np.column_stack([b[:, :2], np.ones(len(b))]) * baseline_m / b[:, 2:]
     b_from_a, weight = geometry.inverse(guess), np.zeros(len(b))
-    for _ in range(iterations if len(b) >= _MIN_POINTS else 0):
+    for _ in range(_CLOSED_FORMS if len(b) >= _MIN_POINTS else 0):
         xyz = geometry.transform(geometry.inverse(b_from_a), points)
         if np.any(xyz[:, 2] <= 0):
             return None
@@ -113,7 +94,6 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array, iter
 
 
 def _huber_weights(size: Array, sigma: float, cutoff: float) -> Array:
-    """Returns the Huber weights (n,) for residuals of magnitude `size` (n,); 0 beyond `cutoff` times `sigma`."""
     return np.minimum(1.0, HUBER * sigma / np.maximum(size, 1e-12)) * (size < cutoff * sigma)
 
 
@@ -125,23 +105,16 @@ def pair_motion(
     Each pair measures z = (x, y, disparity) with covariance C; g transfers a point from b to a. With e = z_a - g(z_b)
     and G = dg/dz_b, the cost of a point is e' (C_a + G C_b G')^-1 e, linearised at the adjusted structure (mixed
     adjustment model, Mikhail 1976; eqs. 6 and 7 of Negahdaripour & Madjidi 2003), with Huber weights that are 0 beyond
-    `CUTOFF`.
+    `CUTOFF`. `guess` (4, 4) is the initial pose of b in a.
 
-    If the amplitude of pixel locking is not plausible (`MAX_LOCKING_PX`), as over a level floor where
-    all points have nearly the same sub-pixel position, the motion is estimated without it.
-
-    Args:
-        measured: points in the earlier pair a and the later pair b.
-        guess: (4, 4) initial pose of b in a.
-
-    Returns:
-        The motion, with its residual relative to the expected standard deviation; None if too few points or inliers.
+    If the amplitude of pixel locking is not plausible (`MAX_LOCKING_PX`), as over a level floor where all points have
+    nearly the same sub-pixel position, the motion is estimated without it. None if too few points or inliers.
     """
     if len(measured.a) < _MIN_POINTS:
         return None
     a_from_b, amplitude_px, structure = guess, 0.0, measured.b.copy()
     normals = None
-    for _ in range(settings.iterations):
+    for _ in range(_ITERATIONS):
         observations = linearise(measured, structure, a_from_b, baseline_m)
         if settings.locking is not None:
             observations = _with_locking(observations, settings.locking, amplitude_px)
@@ -188,7 +161,6 @@ def _with_locking(
 def _weighted_normals(
     observations: LinearisedObservations, amplitude_px: float, settings: PairMotionSettings
 ) -> _WeightedNormals:
-    """Returns the normal equations with Huber weights and, if the pixel-locking amplitude is estimated, its prior."""
     size = observations.normalised_residual
     scale = max(float(np.median(size)) / _MEDIAN_NORMALISED[settings.n_measured], 1e-3)
     weight = _huber_weights(size, scale, CUTOFF)
@@ -203,11 +175,7 @@ def _weighted_normals(
 def _pair_cov(normals: _WeightedNormals, settings: PairMotionSettings) -> Array:
     """Returns the covariance (6, 6) of the motion due to the noise of the points and to their common biases."""
     bias_root = np.linalg.solve(normals.normal, normals.bias_jacobian) * settings.common_sigma
-    if settings.measured_scatter:
-        noise_cov = _scatter_cov(normals, settings.n_measured)
-    else:
-        noise_cov = np.linalg.inv(normals.normal) * max(normals.scale, _MIN_SCALE) ** 2
-    cov = noise_cov * settings.variance_inflation + bias_root @ bias_root.T
+    cov = _scatter_cov(normals, settings.n_measured) * settings.variance_inflation + bias_root @ bias_root.T
     return np.asarray(cov[:6, :6], np.float64)
 
 
@@ -215,8 +183,7 @@ def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -
     """Returns the offset of all disparities [focal lengths], an additional unknown of the last Gauss-Newton step.
 
     The derivative of the residual z_a - g(z_b) with respect to an offset of both disparities is u - G u, with u the
-    unit vector along the disparity (z, g and G as in `pair_motion`). None if disparity is not measured in both pairs,
-    or if the offset cannot be estimated.
+    unit vector along the disparity. None if disparity is not measured in both pairs, or the offset is not observable.
     """
     if settings.n_measured < 3:
         return None

@@ -10,7 +10,7 @@ from scipy.stats import chi2
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import StereoRig
+from twin.core.records import Map, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.observation_equations import image_jacobian
 from twin.estimate.vision.stereo import StereoPoints
@@ -27,11 +27,7 @@ _CHI2 = chi2.ppf(0.9999, 6)  # largest chi-square of the difference between a me
 
 
 def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig) -> bool:
-    """Returns whether the predicted image positions of the points may be wrong by more than a search range [px].
-
-    That is, if three times the median standard deviation of the positions, along its largest direction, exceeds it.
-    `cov` (6, 6) is that of the predicted motion, in the axes of the node.
-    """
+    """Returns whether three median standard deviations of the predicted image positions exceed a search range [px]."""
     x, y, disparity = np.ascontiguousarray(points.measured.T)
     depth_m = rig.baseline_m / np.maximum(disparity, _LEAST_DISPARITY_PX / rig.focal_px)
     jacobian = image_jacobian(x, y, depth_m) * rig.focal_px
@@ -42,8 +38,7 @@ def may_exceed(range_px: float, points: StereoPoints, cov: Array, rig: StereoRig
 def agrees(found: Array, found_cov: Array, predicted: Array, cov: Array) -> bool:
     """Returns whether a measured motion lies within the errors of itself and its prediction (chi-square, 99.99 %).
 
-    Where the texture repeats, features of the whole images may agree on a motion that is wrong by a period. `cov`, as a
-    difference of accumulated covariances, may have negative eigenvalues, which count as zero.
+    Repeated texture may shift it by a period. Negative eigenvalues of `cov`, a difference, count as zero.
     """
     error = geometry.log(geometry.inverse(predicted) @ found)
     values, axes = np.linalg.eigh((cov + cov.T) / 2)
@@ -84,8 +79,8 @@ def coarse_motion(
     return geometry.pose(geometry.so3_exp(rotation), translation)
 
 
-def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Returns positions (n, 2) [px] and descriptors (n, 128) of the SIFT features of an image (H, W)."""
+def _features(sift: cv2.SIFT, image: matching.Gray) -> tuple[Array, Map]:
+    """Returns positions (n, 2) [px] and descriptors (n, 128) of the SIFT features of an image."""
     levels = np.clip(matching.normalise(np.asarray(image, np.float32)), 0, 255).astype(np.uint8)
     found, descriptors = sift.detectAndCompute(levels, None)
     pixels = np.array([feature.pt for feature in found], np.float64).reshape(-1, 2)

@@ -12,11 +12,9 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.scenario.model import CalibrationErrorConfig, LensConfig
-
-Array = NDArray[np.float64]
 
 STEPS = 40  # maximum number of steps of Newton's method
 TOLERANCE = 1e-12  # of distorted coordinates, about 1e-9 px
@@ -33,12 +31,11 @@ class Distortion(NamedTuple):
 
 
 def true_lens(lens: LensConfig) -> Distortion:
-    """Returns the true distortion, which is the same for both lenses."""
     return Distortion(lens.k1, lens.k2, lens.k3, lens.p1, lens.p2)
 
 
 def believed_lens(lens: LensConfig, calibration: CalibrationErrorConfig) -> Distortion:
-    """Returns the calibrated distortion, used to rectify frames: the true distortion minus the calibration errors."""
+    """Returns the distortion by which frames are rectified: the true distortion minus the calibration errors."""
     return true_lens(lens)._replace(k1=lens.k1 - calibration.k1_error, k2=lens.k2 - calibration.k2_error)
 
 
@@ -47,20 +44,13 @@ def distort(normalised: Array, lens: Distortion) -> Array:
     x, y = normalised[..., 0], normalised[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))
-    return np.stack(
-        [
-            x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x * x),
-            y * radial + lens.p1 * (r2 + 2 * y * y) + 2 * lens.p2 * x * y,
-        ],
-        axis=-1,
-    )
+    across = x * radial + 2 * lens.p1 * x * y + lens.p2 * (r2 + 2 * x * x)
+    down = y * radial + lens.p1 * (r2 + 2 * y * y) + 2 * lens.p2 * x * y
+    return np.stack([across, down], axis=-1)
 
 
 def undistort(distorted: Array, lens: Distortion) -> Array:
-    """Returns the normalised coordinates (..., 2) of the rays with the distorted image coordinates (..., 2).
-
-    `distort` is inverted by Newton's method; the result is NaN where it does not converge to a radius below `fold`.
-    """
+    """Returns the coordinates (..., 2) with given distorted ones; NaN where none is found below the radius `fold`."""
     normalised = newton(
         lambda at: distort(at, lens) - distorted, lambda at, _: _jacobian(at, lens), distorted, TOLERANCE, 1e3
     )
@@ -70,8 +60,7 @@ def undistort(distorted: Array, lens: Distortion) -> Array:
 
 def fold(lens: Distortion) -> float:
     """Returns the normalised radius r of the first maximum of r (1 + k1 r^2 + k2 r^4 + k3 r^6); inf if it has none."""
-    # The derivative of r (1 + k1 r^2 + ...), divided by r^6, is a polynomial in 1 / r^2 with leading coefficient 1,
-    # so distortion coefficients of zero cause no division by zero.
+    # the derivative, divided by r^6, is a polynomial in 1 / r^2 with leading coefficient 1: no division by zero
     roots = np.roots([1.0, 3 * lens.k1, 5 * lens.k2, 7 * lens.k3])
     real = roots.real[(np.abs(roots.imag) < 1e-12) & (roots.real > 1e-12)]
     return float(1 / np.sqrt(real.max())) if real.size else np.inf
@@ -81,10 +70,9 @@ def newton(
     residual_at: Callable[[Array], Array], jacobian_at: Callable[[Array, Array], Array], start: Array,
     tolerance: float, factor: float,
 ) -> Array:  # fmt: skip
-    """Returns the points (..., 2) where a function (..., 2) is zero, by Newton's method from `start` (..., 2).
+    """Returns the points (..., 2) where a function (..., 2) is below `tolerance`, by Newton's method from `start`.
 
-    The method stops where the function is below `tolerance`; a point is NaN where it is not below `factor` times that.
-    `jacobian_at` returns the Jacobian (..., 2, 2) at points with their residuals.
+    A point is NaN where it is not below `factor` times that. `jacobian_at` gets points and residuals.
     """
     at = start
     for _ in range(STEPS):
@@ -105,7 +93,6 @@ def _solved(jacobian: Array, residual: Array) -> Array:
 
 
 def _jacobian(normalised: Array, lens: Distortion) -> Array:
-    """Returns the Jacobian (..., 2, 2) of `distort` with respect to the normalised coordinates."""
     x, y = normalised[..., 0], normalised[..., 1]
     r2 = x * x + y * y
     radial = 1 + r2 * (lens.k1 + r2 * (lens.k2 + r2 * lens.k3))

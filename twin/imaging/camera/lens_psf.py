@@ -18,16 +18,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import StereoRig
+from twin.core.records import Array, Depth, Radiance, StereoRig
 from twin.core.threads import in_row_bands
 from twin.imaging.camera.port import pinhole
 from twin.imaging.light.spectra import CENTRE_NM
 from twin.kernels import kernel
 from twin.scenario.model import LensConfig, Scenario, SensorConfig
-
-Array = NDArray[np.float64]
-Radiance = NDArray[np.float32]
-Depth = NDArray[np.float32]
 
 REACH_PX = 4  # the kernel of the MTF has 2 REACH_PX + 1 pixels along each side; `_add_across` is written for 4
 TAPS = 4  # taps of cubic interpolation
@@ -50,10 +46,7 @@ class Defocus(NamedTuple):
 
 
 def defocus_of(scenario: Scenario, rig: StereoRig) -> Defocus | None:
-    """Returns aperture and focus of the lenses; None without a sensor, or if `lens.focus_m` is 0.
-
-    The aperture is the focal length in air divided by the f-number.
-    """
+    """Returns aperture (focal length in air / f-number) and focus; None without a sensor, or if `lens.focus_m` is 0."""
     lens, sensor = scenario.lens, scenario.sensor
     if sensor is None or not lens.focus_m:
         return None
@@ -90,10 +83,7 @@ class LensPsf:
         return out
 
     def transfer(self, light: Radiance) -> Radiance:
-        """Returns the radiance (H, W, 3) after diffraction, aberrations and lateral colour, at least 0.
-
-        It is `light` itself if the lens has none of them.
-        """
+        """Returns the radiance (H, W, 3) after diffraction, aberrations and lateral colour, at least 0."""
         if self._taps is None and self._scales is None:
             return light
         rows, width = light.shape[:2]
@@ -110,24 +100,19 @@ class LensPsf:
 
 
 def _run(kernel: Callable[..., None], rows: int, *scene: Any) -> None:
-    """Runs a kernel over all rows, in parallel bands."""
     in_row_bands(lambda first, end: kernel(*scene, first, end), rows)
 
 
 def mtf(lens: LensConfig, sensor: SensorConfig | None, band: int, cycles_per_px: Array) -> Array:
-    """Returns the MTF of a lens in a band (0 red, 1 green, 2 blue) at frequencies of any shape [cycles/px].
-
-    It is that of the aberrations, times that of diffraction if `lens.diffraction` is set and there is a sensor.
-    """
+    """Returns the MTF of a lens in a band (0 red, 1 green, 2 blue) at frequencies of any shape [cycles/px]."""
     share = np.exp(-2 * (np.pi * lens.blur_px[band] * cycles_per_px) ** 2)
     return share * diffraction_mtf(cycles_per_px, CENTRE_NM[band], sensor) if lens.diffraction and sensor else share
 
 
 def _taps(lens: LensConfig, sensor: SensorConfig | None) -> tuple[NDArray[np.float32], NDArray[np.float32]] | None:
-    """Returns the point spread functions of the bands as sums of products of a kernel along columns and one along rows.
+    """Returns the point spread functions as sums of products of a kernel along columns and one along rows.
 
-    The result is two arrays (3, terms, REACH_PX + 1), the kernels along columns and those along rows, of the bands R,
-    G, B; kernels are symmetric and stored from the centre outwards. The result is None if the lens does not blur.
+    The result is two arrays (3, terms, REACH_PX + 1) of symmetric kernels from the centre outwards; None: no blur.
     """
     if not lens.diffraction and not any(lens.blur_px):
         return None
@@ -151,11 +136,7 @@ def _kernel(lens: LensConfig, sensor: SensorConfig | None, band: int) -> Array:
 
 
 def _separable(kernel: Array) -> list[tuple[float, Array]]:
-    """Returns the eigenvalues of largest magnitude, and their eigenvectors, of a symmetric kernel.
-
-    The sum of the outer products of the eigenvectors with themselves, times the eigenvalues, has a transform within
-    `MTF_ERROR` of that of the kernel. The eigenvalues are then scaled so that all elements of this sum add up to 1.
-    """
+    """Returns eigenvalues and eigenvectors whose outer products add up to a kernel within `MTF_ERROR`, of sum 1."""
     values, vectors = np.linalg.eigh(kernel)
     order, n = np.argsort(-np.abs(values)), 1
     while True:
@@ -166,19 +147,12 @@ def _separable(kernel: Array) -> list[tuple[float, Array]]:
         n += 1
 
 
-class _Magnification(NamedTuple):
-    """Lateral colour: the images of the red and the blue band are magnified relative to the green one."""
+def _magnification(lens: LensConfig, rig: StereoRig) -> tuple[NDArray[Any], ...]:
+    """Returns the interpolation that magnifies the red and the blue band relative to the green one (lateral colour).
 
-    # (k, 4) a row for each run of neighbouring pixels whose first tap has the same offset from the pixel: band, first
-    # column, end column (exclusive), and this offset
-    runs: NDArray[np.int64]
-    across: NDArray[np.float32]  # (3, TAPS, W) weights along the rows, for each band
-    lines: NDArray[np.int64]  # (3, H) offset of the first tap of each row from the row
-    down: NDArray[np.float32]  # (3, H, TAPS) weights along the columns
-
-
-def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
-    """Returns the interpolation that magnifies the red and the blue band relative to the green one (lateral colour)."""
+    Runs of pixels whose first tap has the same offset, (k, 4) band, first column, end column, offset; weights (3, TAPS,
+    W) along the rows; the offset (3, H) of the first tap of each row; weights (3, H, TAPS).
+    """
     red, blue = lens.lateral_colour
     scales = 1 + np.array([red, 0.0, blue])
     first, across = _taps_of(rig.width_px, rig.cx_px, scales)
@@ -188,7 +162,7 @@ def _magnification(lens: LensConfig, rig: StereoRig) -> _Magnification:
         ends = np.append(starts[1:], rig.width_px)
         runs.append(np.column_stack([np.full(len(starts), band), starts, ends, taps[starts]]))
     across = np.ascontiguousarray(across.swapaxes(1, 2))
-    return _Magnification(np.concatenate(runs), across, *_taps_of(rig.height_px, rig.cy_px, scales))
+    return (np.concatenate(runs), across, *_taps_of(rig.height_px, rig.cy_px, scales))
 
 
 def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -204,7 +178,6 @@ def _taps_of(n: int, middle_px: float, scales: Array) -> tuple[NDArray[np.int64]
 
 @kernel
 def _split_rows(light, bands, first, end):
-    """Fills rows `first` to `end` - 1 of `bands` (H, 3, W) from `light` (H, 3 W), where R, G, B alternate."""
     for v in range(first, end):
         row, red, green, blue = light[v], bands[v, 0], bands[v, 1], bands[v, 2]
         for u in range(red.size):
@@ -213,7 +186,6 @@ def _split_rows(light, bands, first, end):
 
 @kernel
 def _join_rows(bands, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) from `bands` (H, 3, W)."""
     for v in range(first, end):
         _join_row(bands[v, 0], bands[v, 1], bands[v, 2], out[v])
 
@@ -248,14 +220,12 @@ def _convolve(light, down, across, out, first, end):
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _weigh_line(values, weight, out):
-    """Fills `out` (n,) with `values` (n,) times a weight."""
     for k in range(out.size):
         out[k] = weight * values[k]
 
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _add_pairs(before, after, weight, earlier, later, other_weight, out):
-    """Adds two pairs of filter taps to `out` (n,): the sum of each pair of values (n,), times its weight."""
     for k in range(out.size):
         out[k] += weight * (before[k] + after[k]) + other_weight * (earlier[k] + later[k])
 
@@ -276,7 +246,6 @@ def _add_across(wide, weights, out, is_first):
 
 @kernel
 def _magnify(light, runs, across, lines, down, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with the magnified bands of `light` (H, 3, W)."""
     rows, _, width = light.shape
     pad = max(-runs[:, 3].min(), runs[:, 3].max() + TAPS - 1, 0)
     wide, filled = np.empty((3, width + 2 * pad), np.float32), np.empty((3, width), np.float32)
@@ -299,14 +268,12 @@ def _magnify(light, runs, across, lines, down, out, first, end):
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _weighted_sum(a, b, c, d, of_a, of_b, of_c, of_d, out):
-    """Fills `out` (n,) with the weighted sum of four arrays (n,)."""
     for k in range(out.size):
         out[k] = of_a * a[k] + of_b * b[k] + of_c * c[k] + of_d * d[k]
 
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
-    """Fills `out` (n,) with sums of TAPS consecutive `values` (n + TAPS - 1,), weighted by the arrays `of_...` (n,)."""
     second, third, fourth = values[1:], values[2:], values[3:]
     for k in range(out.size):
         left = of_first[k] * values[k] + of_second[k] * second[k]
@@ -315,7 +282,7 @@ def _weigh_across(values, of_first, of_second, of_third, of_fourth, out):
 
 @kernel
 def _defocus(light, near, scale, focus, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus."""
+    """Fills rows of `out` (H, 3 W) with `light` (H, 3 W), blurred by the disc of defocus."""
     rows, width = near.shape
     wide = np.empty(3 * width, np.float32)
     for v in range(first, end):
@@ -334,10 +301,9 @@ def _defocus(light, near, scale, focus, out, first, end):
 
 @kernel
 def _defocus_row(above, here, below, diameter, out):
-    """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel that has the moments of a disc.
+    """Blurs a row (3 W,), except its ends, with the 3 x 3 kernel of the moments of a disc of `diameter` (3 W,) [px].
 
-    A disc of diameter c has the variance c^2 / 16 along each axis and the fourth moment <x^2 y^2> = c^4 / 384.
-    `diameter` (3 W,) [px] has the diameter for each band of each pixel; those above `SMALL_PX` count as `SMALL_PX`.
+    A disc of diameter c, here at most `SMALL_PX`, has the variance c^2 / 16 along each axis and <x^2 y^2> = c^4 / 384.
     """
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]

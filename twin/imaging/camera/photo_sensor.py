@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import Exposure, Image, StereoRig
+from twin.core.records import Array, Exposure, Image, Radiance, StereoRig
 from twin.core.threads import in_row_bands
 from twin.imaging.camera.photons import electrons_per_cd, vignetting
-from twin.imaging.camera.pixels import PixelResponse, Raw, read_out
-from twin.imaging.camera.sensor import Array, AutoExposure, ExposureSetting, PlainSensor, Radiance
+from twin.imaging.camera.pixels import Raw, read_out
+from twin.imaging.camera.sensor import AutoExposure, ExposureSetting, PlainSensor
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.camera.tone import linear_of, tone
 from twin.imaging.camera.white_balance import WhiteBalance
@@ -25,8 +25,7 @@ BLACK_SHARE = 1 / 64  # black level as a fraction of the number of levels, so th
 class PhotoSensor:
     """Physical sensor of both cameras, with auto-exposure that increases first the exposure time, then the gain.
 
-    Auto-exposure meters the radiance, not the image, so it does not oscillate if an image saturates. `raw_rig` has the
-    size and focal length of the raw images; None = the rectified rig.
+    It meters the radiance, so it does not oscillate if an image saturates. `raw_rig`: None = the rectified rig.
     """
 
     def __init__(self, scenario: Scenario, sensor: SensorConfig, raw_rig: StereoRig | None = None):
@@ -47,7 +46,6 @@ class PhotoSensor:
 
     @property
     def setting(self) -> ExposureSetting | None:
-        """Returns the exposure of the next frame; None before the first frame is metered."""
         gain = self._exposure.next_gain
         return None if gain is None else self._setting(gain, self._white.next_factors)
 
@@ -55,49 +53,40 @@ class PhotoSensor:
         """Returns this frame's exposure, and meters `light` (H, W, 3); the first frame is metered on itself."""
         mean = _weighted_mean(light, self._vignetting)
         white = self._white.factors(mean, self._exposure.share)
-        return self._setting(self._exposure.gain_for(float((mean * self._white.relative(white)).max())), white)
+        brightest = float((mean * (white / self._white.of_white_light)).max())
+        return self._setting(self._exposure.gain_for(brightest), white)
 
     def _setting(self, gain: float, white: Array) -> ExposureSetting:
-        """Returns the exposure with the given gain [1 / (cd/m2)] and white balance (3,)."""
         product_s = gain / self._signal_per_s
         exposure_s = min(max(product_s, self._shortest_s), self._longest_s)
         amplification = min(max(product_s / exposure_s, 1.0), self._most_gain)
-        balance = None if self._white.is_of_white_light else (white[0], white[1], white[2])
-        return ExposureSetting(gain, exposure_s, amplification, balance)
+        return ExposureSetting(gain, exposure_s, amplification, (white[0], white[1], white[2]))
 
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
-        """Returns the motion of a camera during its exposure; None if it has no effect on the image.
-
-        The read-out time of the result is that of the `n_rows` of the rendered image, margin included. `twist` (6,) is
-        the [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-        """
+        """Returns the motion of a camera with a twist (6,) in its own axes, for `n_rows` rendered; None: no effect."""
         row_ratio = (n_rows - 1) / (self._vignetting.shape[0] - 1)  # rendered rows per row of the sensor
         readout_s = row_ratio * self._sensor.readout_ms / 1000
         exposure_s = setting.exposure_s if self._sensor.motion_blur else 0.0
         return ExposureMotion(twist, exposure_s, readout_s) if twist.any() and (readout_s or exposure_s) else None
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
-        """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
         return self.develop(self.raw(light, setting, rng), setting.white)
 
     def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
         """Returns the linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]."""
-        white = np.ones(3) if setting.white is None else self._white.relative(np.array(setting.white)) * np.ones(3)
-        red, green, blue = (setting.gain * white).tolist()
+        white = self._white.of_white_light if setting.white is None else np.array(setting.white)
+        red, green, blue = (setting.gain * (white / self._white.of_white_light)).tolist()
         return red, green, blue
 
     def raw(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Raw:
         """Returns raw digital numbers: (H, W) with a Bayer filter, else (H, W, 3); without noise if `rng` is None."""
         electrons, gain = self._electrons_per_cd_s * setting.exposure_s, self._dn_per_e * setting.analogue_gain
         noise = self._sensor.full_well_e, self._sensor.read_noise_e
-        response = PixelResponse(electrons, *noise, gain, self._black_dn, self._top_dn)
+        response = np.array([*electrons, *noise, gain, self._black_dn, self._top_dn], np.float32)
         return read_out(light, self._vignetting, response, self._sensor.bayer, rng)
 
     def develop(self, raw: Raw, white: tuple[float, float, float] | None = None) -> Image:
-        """Returns the 8-bit RGB image (H, W, 3) of raw digital numbers, (H, W) with a Bayer filter, else (H, W, 3).
-
-        The black level is subtracted, white balance (None = that of white light) and tone curve are applied.
-        """
+        """Returns the 8-bit RGB image (H, W, 3) of raw digital numbers; `white` None = the balance of white light."""
         toned = np.empty(raw.shape, np.uint8)
         tones = self._tone_table(self._white.of_white_light if white is None else np.array(white))
         bands = raw.reshape(*raw.shape[:2], -1), tones, toned.reshape(*raw.shape[:2], -1)
@@ -114,7 +103,6 @@ class PhotoSensor:
         return np.clip(255 * tone(white[:, None] * signal, self._sensor.tone_curve) + 0.5, 0, 255).astype(np.uint8)
 
 
-#: Sensor model that both cameras share.
 Sensor: TypeAlias = PlainSensor | PhotoSensor
 
 
@@ -125,7 +113,6 @@ def sensor_of(scenario: Scenario, raw_rig: StereoRig | None = None) -> Sensor:
 
 @kernel(fastmath={"contract", "reassoc"})
 def _weighted_mean(light, weights):
-    """Returns the mean (3,) of `light` (H, W, 3) times `weights` (H, W) over all pixels, for each band."""
     total = np.zeros(3)
     for v in range(weights.shape[0]):
         row, shares = light[v].reshape(-1), weights[v]
@@ -140,7 +127,6 @@ def _weighted_mean(light, weights):
 
 @kernel
 def _tone(raw, tones, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` with the 8-bit values of `raw` (H, W, 1 or 3), from the tone table."""
     _, width, bands = raw.shape
     for v in range(first, end):
         for u in range(width):

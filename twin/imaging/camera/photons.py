@@ -18,11 +18,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import StereoRig
+from twin.core.records import Array, StereoRig
 from twin.imaging.light.spectra import NM, sensitivity
 from twin.scenario.model import SensorConfig
-
-Array = NDArray[np.float64]
 
 PLANCK_J_S, LIGHT_M_S = 6.62607015e-34, 299792458.0
 LUMENS_PER_WATT = 683.0
@@ -30,10 +28,7 @@ LUMINOUS_EFFICIENCY_NM = 106.857  # integral of V over wavelength
 
 
 def photons_per_lux() -> Array:
-    """Returns the photons of white light per lux, square metre and second in the bands R, G, B (3,) [1/(lx m2 s)].
-
-    Each photon is weighted with the sensitivity of the band at its wavelength, relative to the largest sensitivity.
-    """
+    """Returns the photons of white light, weighted with the sensitivity of R, G, B (3,) [1/(lx m2 s)]."""
     watts_per_nm = 1 / (LUMENS_PER_WATT * LUMINOUS_EFFICIENCY_NM)  # per square metre
     return watts_per_nm * (sensitivity() * NM).sum(1) * 1e-9 / (PLANCK_J_S * LIGHT_M_S)  # in steps of 1 nm
 

@@ -6,8 +6,6 @@ noise), clipped to the largest digital number. Dark current and non-uniformity a
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,38 +19,26 @@ FEW_ELECTRONS = 10  # below this mean: exact Poisson numbers; above: normal numb
 MOST_ELECTRONS = 80  # largest number that `_poisson` returns; for means below 10, the probability of more is negligible
 
 
-class PixelResponse(NamedTuple):
-    """Response of the pixels in one exposure."""
-
-    electrons_per_cd: NDArray[np.float64]  # (3,) expected number of electrons on the axis at 1 cd/m2, for R, G, B
-    full_well_e: float  # full-well capacity [e-]
-    read_noise_e: float  # standard deviation of the read noise [e-]
-    dn_per_e: float  # digital numbers per electron, K of EMVA 1288
-    black_dn: float  # black level, as a digital number
-    top_dn: float  # largest digital number
-
-
 def read_out(
-    light: NDArray[np.float32], vignetting: NDArray[np.float32], response: PixelResponse, bayer: bool,
+    light: NDArray[np.float32], vignetting: NDArray[np.float32], response: NDArray[np.float32], bayer: bool,
     rng: np.random.Generator | None,
 ) -> Raw:  # fmt: skip
     """Returns raw digital numbers: (H, W) with a Bayer filter (R G / G B from the top left), else (H, W, 3).
 
-    `light` (H, W, 3) is in photometric units [cd/m2], `vignetting` (H, W) relative to the axis. Of the random stream,
-    one number is drawn per image; None = no noise.
+    `light` (H, W, 3) is in cd/m2, `vignetting` (H, W) relative to the axis. `response` (8,): electrons of R, G, B on
+    the axis at 1 cd/m2, full well [e-], read noise [e-], digital numbers per electron (K), black level, largest number.
+    `rng` gives one number per image; None = no noise.
     """
     height, width = vignetting.shape
     out = np.empty((height, width, 1 if bayer else 3), np.uint16)
     seed = np.uint64(0) if rng is None else seed_of(rng)
-    parameters = np.array([*response.electrons_per_cd, *response[1:]], np.float32)
     random = normal_numbers(), seed, rng is not None
-    in_row_bands(lambda first, end: _read_out(light, vignetting, parameters, *random, out, first, end), height)
+    in_row_bands(lambda first, end: _read_out(light, vignetting, response, *random, out, first, end), height)
     return out[..., 0] if bayer else out
 
 
 @kernel
 def _read_out(light, vignetting, response, normal, seed, noisy, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, W, 1 or 3) with digital numbers, see `read_out`."""
     width, bands = out.shape[1:]
     n, few = width * bands, np.float32(FEW_ELECTRONS)
     expected, shot, read = np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.float32)
@@ -97,7 +83,7 @@ def _normal_to_poisson(expected, shot):
 
 @kernel
 def _poisson(expected, uniform):
-    """Returns a Poisson-distributed number of electrons of mean `expected`, by inversion, from 32 random bits."""
+    """Returns a Poisson-distributed number of mean `expected`, by inversion, from 32 random bits."""
     uniform = (np.float64(uniform) + 0.5) * 2.0**-32
     probability = np.exp(-np.float64(expected))
     below, count = probability, 0
@@ -110,7 +96,6 @@ def _poisson(expected, uniform):
 
 @kernel
 def _digitise(electrons, noise, response, out):
-    """Fills `out` (n,) with the digital numbers of `electrons` plus read noise; `noise` is standard normal."""
     full_well, read_noise, dn_per_e, black, top = response[3], response[4], response[5], response[6], response[7]
     half, zero = np.float32(0.5), np.float32(0.0)
     for k in range(out.size):

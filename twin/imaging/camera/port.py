@@ -11,12 +11,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.imaging.camera.lens import newton
 from twin.scenario.model import PortConfig
-
-Array = NDArray[np.float64]
 
 STEP, TOLERANCE = 1e-6, 1e-11  # Newton's method: finite difference and tolerance of X / Z
 SMALL_RAD = 1e-4  # paraxial angle; its cube is negligible
@@ -42,8 +40,7 @@ def pinhole(port: PortConfig) -> Pinhole:
 def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
     """Returns the origin on the outer face [m] and the unit direction in water, both (..., 3), of rays (..., 2) in air.
 
-    Both are NaN where a ray misses the port, the direction also at total reflection. Without a port, rays start at the
-    entrance pupil.
+    Both are NaN where a ray misses the port, the direction also at total reflection. Without port: from the pupil.
     """
     ray = np.concatenate([normalised, np.ones_like(normalised[..., :1])], axis=-1)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -58,10 +55,7 @@ def water_rays(port: PortConfig, normalised: Array) -> tuple[Array, Array]:
 
 
 def air_coordinates(port: PortConfig, points_m: Array) -> Array:
-    """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN where none is found.
-
-    `water_rays` is inverted by Newton's method from the equivalent pinhole, which is monotonic for a flat pane.
-    """
+    """Returns the normalised coordinates (..., 2) in air of the rays to points (..., 3) [m]; NaN if none is found."""
     normalised = points_m[..., :2] / points_m[..., 2:]
     if port.kind == "none":
         return normalised
@@ -92,7 +86,7 @@ def refract(ray: Array, normal: Array, ratio: float) -> Array:
 
 
 def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the plane `depth_m` outside the inner face of a pane."""
+    """Returns intersections and normals (..., 3) with the plane `depth_m` outside the inner face of a pane."""
     tilt = np.deg2rad(port.tilt_deg)
     normal = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
     along = ray @ normal
@@ -101,7 +95,7 @@ def _hit_pane(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tup
 
 
 def _hit_dome(port: PortConfig, start: Array, ray: Array, depth_m: float) -> tuple[Array, Array]:
-    """Returns intersections and normals (..., 3) of rays with the sphere `depth_m` outside the inner face of a dome."""
+    """Returns intersections and normals (..., 3) with the sphere `depth_m` outside the inner face of a dome."""
     radius_m, centre = port.radius_m + depth_m, np.array(port.offset_m)
     from_centre = start - centre
     along = (from_centre * ray).sum(axis=-1)

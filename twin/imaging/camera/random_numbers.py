@@ -22,7 +22,6 @@ def normal_numbers() -> NDArray[np.float32]:
 
 
 def seed_of(rng: np.random.Generator) -> np.uint64:
-    """Returns a seed for the random numbers of one image, sampled from `rng`."""
     return rng.integers(1 << 64, dtype=np.uint64)
 
 

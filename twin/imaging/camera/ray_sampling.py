@@ -11,15 +11,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
+from twin.core.records import Array, Depth, Radiance
 from twin.core.threads import in_row_bands
-from twin.imaging.camera.resample import Positions, Radiance, spline_row, unpack
+from twin.imaging.camera.resample import Positions, spline_row, unpack
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
-Depth = NDArray[np.float32]
 
 INTERSECTION_STEPS = 4  # maximum; each multiplies the error by the parallax times the slope of the floor
 INTERSECTION_PX = 1e-2  # the iteration ends when a step is shorter; the remaining error is a few percent of that step
@@ -38,16 +35,11 @@ def sample_rays(
     light: Radiance, depth: Depth, positions: Positions, parallax_px_m: Positions | None = None,
     motion: RowMotion | None = None,
 ) -> Radiance:  # fmt: skip
-    """Returns the radiance (h, w, 3) where the rays of pixels intersect the floor.
+    """Returns the radiance (h, w, 3) where the rays of pixels meet the floor, from an image (H, W, 3) and depth [m].
 
     A ray that crosses the plane of depth zero at distance p [m] from the camera centre is imaged f p / z away from its
-    vanishing point, z being the depth there; 1 / z, linear on a plane, is interpolated bilinearly.
-
-    Args:
-        light: (H, W, 3) radiance; beyond its border, the values of the nearest border pixel are repeated.
-        depth: (H, W) depth [m]; inf where there is no floor.
-        positions: (h, w, 2) vanishing points of the rays [px].
-        parallax_px_m: (h, w, 2) product f p, in columns and rows [px m]; None = 0.
+    vanishing point, a position (h, w, 2) [px], z being the depth there; 1 / z, linear on a plane, is interpolated
+    bilinearly. The parallax (h, w, 2) is f p in columns and rows [px m]; None = 0. Border pixels are repeated.
     """
     out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
     moves = None if motion is None else (np.ascontiguousarray(motion.twist, np.float64), *motion[1:])
@@ -58,7 +50,6 @@ def sample_rays(
 
 @kernel
 def _sample_rays(source, near, positions, parallax, motion, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (h, w, 3) from `source` (H, 3 W); `near` is the inverse depth."""
     n = out.shape[1]
     rays, cells, weights = np.empty((8, n), np.float32), np.empty(n, np.int32), np.empty((8, n), np.float32)
     for v in range(first, end):
@@ -73,8 +64,7 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
 def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
     """Fills rows 0 and 1 of `rays` (8, w) with the columns and rows where the rays of row v intersect the floor.
 
-    Rows 2 and 3 get the vanishing points, 4 and 5 the parallax, 6 the inverse depth, from which the next row starts
-    unless `is_first`.
+    Rows 2 and 3 get the vanishing points, 4 and 5 the parallax, 6 the inverse depth, where the next row starts.
     """
     rows, cols = near.shape
     x, y, base_x, base_y, slope_x, slope_y = rays[0], rays[1], rays[2], rays[3], rays[4], rays[5]
@@ -104,7 +94,6 @@ def _hit_row(near, positions, parallax, motion, v, is_first, rays, cells):
 
 @kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _move(pose, focal, cx, cy, rays):
-    """Turns and shifts the rays of a row (8, w), see `_hit_row`, by a pose (4, 4)."""
     base_x, base_y, slope_x, slope_y = rays[2], rays[3], rays[4], rays[5]
     a, b, c, p = np.float32(pose[0, 0]), np.float32(pose[0, 1]), np.float32(pose[0, 2]), focal * np.float32(pose[0, 3])
     d, e, f, q = np.float32(pose[1, 0]), np.float32(pose[1, 1]), np.float32(pose[1, 2]), focal * np.float32(pose[1, 3])
@@ -134,11 +123,7 @@ def _locate(base_x, base_y, slope_x, slope_y, inverse, rows, cols, part_x, part_
 
 @kernel(forceinline=True, error_model="numpy", fastmath={"contract"})
 def _look_up(near, cols, cells, part_x, part_y, slope_x, slope_y, inverse):
-    """Replaces `inverse` by the inverse depth at the positions of the rays.
-
-    Returns the number of rays whose position this changes by more than `INTERSECTION_PX`; a sum of integers, unlike a
-    largest value, lets the compiler vectorize the loop.
-    """
+    """Replaces `inverse` by the inverse depth at the rays; returns how many move by more than `INTERSECTION_PX`."""
     n_moved, limit = 0, np.float32(INTERSECTION_PX)
     for u in range(cells.size):
         k, s, t = np.uint32(cells[u]), part_x[u], part_y[u]

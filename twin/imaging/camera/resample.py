@@ -16,7 +16,6 @@ from twin.core.threads import in_row_bands
 from twin.imaging.light.vector_math import sum_of_pixels
 from twin.kernels import kernel
 
-Radiance = NDArray[np.float32]
 Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
 
 REACH_PX = 2  # support of the spline to each side
@@ -38,7 +37,6 @@ def interpolate(image: Image, positions: Positions) -> Image:
 
 @kernel
 def _fill_from(source, positions, out, first, end):
-    """Fills rows `first` to `end` - 1 of 8-bit `out` (h, w, 3) with rounded and clipped values of a spline (H, 3 W)."""
     n, least, most = out.shape[1], np.float32(0.0), np.float32(255.0)
     x, y, row = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(3 * n, np.float32)
     weights, cells = np.empty((8, n), np.float32), np.empty(n, np.int32)
@@ -52,7 +50,6 @@ def _fill_from(source, positions, out, first, end):
 
 @kernel
 def unpack(pairs, x, y):
-    """Copies columns and rows, which alternate in `pairs` (2 w,), to x and y (w,)."""
     for u in range(x.size):
         x[u], y[u] = pairs[2 * u], pairs[2 * u + 1]
 
@@ -83,7 +80,6 @@ def sum_row(source, x, y, weights, cells, out):
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _spline_weights(at, before, here, after, last):
-    """Computes the B-spline weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
     for u in range(at.size):
         before[u], here[u], after[u], last[u] = bspline_weights(at[u] - np.floor(at[u]))
 
@@ -117,17 +113,13 @@ def _sum_at_border(source, x, y, weights, u, out):
 
 @kernel
 def _filter_columns(image, first, end):
-    """Replaces columns `first` to `end` - 1 of an image (H, n) by cubic B-spline coefficients; borders are mirrored.
-
-    The filter 6 / (1 - p z^-1) is followed by -p / (1 - p z), with p the pole (Unser et al. 1993).
-    """
+    """Replaces columns of an image by B-spline coefficients: the filter 6 / (1 - p z^-1), then -p / (1 - p z)."""
     for start in range(first, end, BLOCK):
         _filter_block(image, start, min(start + BLOCK, end))
 
 
 @kernel
 def _filter_block(image, first, end):
-    """Filters columns `first` to `end` - 1 of an image, see `_filter_columns`."""
     pole, rows = np.float32(POLE), image.shape[0]
     for k in range(first, end):
         total, power = image[0, k], np.float32(1.0)
@@ -150,10 +142,10 @@ def _filter_block(image, first, end):
 
 @kernel(fastmath={"contract"})
 def _filter_rows(wide, image, first, end):
-    """Fills rows `first` to `end` - 1 of an image (H, 3 W) with the coefficients of rows that are mirrored by TAPS.
+    """Fills rows of an image (H, 3 W) with the coefficients of rows that are mirrored by TAPS.
 
-    The two recursive filters have the impulse response -6 p / (1 - p^2) p^|n|, which is symmetric and is summed up to
-    |n| = `TAPS`; a convolution is faster along the rows, where a recursion has to wait for the previous pixel.
+    The two filters have the symmetric impulse response -6 p / (1 - p^2) p^|n|, summed up to |n| = `TAPS`; along rows, a
+    convolution is faster than a recursion, which has to wait for the previous pixel.
     """
     pole = np.float32(POLE)
     middle_weight = np.float32(-6.0) * pole / (np.float32(1.0) - pole * pole)

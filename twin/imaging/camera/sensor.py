@@ -1,7 +1,4 @@
-"""Plain sensor model in fractions of full scale: auto-exposure, shot noise, read noise, saturation, 8-bit output.
-
-It is used for scenarios without a section [sensor]. Its gain is unlimited and its exposure time is zero.
-"""
+"""Plain sensor model in fractions of full scale for scenarios without [sensor]: unlimited gain, zero exposure time."""
 
 from __future__ import annotations
 
@@ -9,17 +6,13 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.core.records import Exposure, Image
+from twin.core.records import Array, Exposure, Image, Radiance
 from twin.core.threads import in_row_bands
 from twin.imaging.camera.random_numbers import NORMAL_MASK, normal_numbers, random_bits, seed_of
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.kernels import kernel
 from twin.scenario.model import ImagingConfig, Scenario
-
-Array = NDArray[np.float64]
-Radiance = NDArray[np.float32]
 
 EXPOSURE_LAG_S = 0.5  # time constant of the auto-exposure
 
@@ -29,9 +22,8 @@ DARK_CD_M2 = 1e-6  # lower limit of the metered radiance
 class AutoExposure:
     """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest band reaches `gray_level`.
 
-    The mean of all bands would let the least absorbed one saturate. The gain follows from the previous frames, that of
-    the first frame from itself. `lag_s` is a time constant, 0 = no lag; `limits` are the smallest and largest gain [1 /
-    (cd/m2)]; `share` is the fraction by which log gain approaches its target per frame.
+    The mean of all bands would let the least absorbed one saturate. `lag_s` is a time constant, 0 = no lag; `limits`
+    are those of the gain [1 / (cd/m2)]; `share` is the fraction by which log gain approaches its target per frame.
     """
 
     def __init__(
@@ -44,7 +36,6 @@ class AutoExposure:
 
     @property
     def next_gain(self) -> float | None:
-        """Returns the gain of the next frame [1 / (cd/m2)]; None before the first frame is metered."""
         return None if self._log_gain is None else float(np.exp(self._log_gain))
 
     def gain(self, radiance: Radiance) -> float:
@@ -52,10 +43,7 @@ class AutoExposure:
         return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
 
     def gain_for(self, brightest: float) -> float:
-        """Returns the gain of this frame [1 / (cd/m2)], given the mean radiance of its brightest band [cd/m2].
-
-        Except for the first frame, this mean affects only the gain of later frames.
-        """
+        """Returns the gain of this frame, given the mean radiance of its brightest band, which affects later frames."""
         least, most = self._limits
         wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
         metered = float(np.log(wanted))
@@ -65,10 +53,7 @@ class AutoExposure:
 
 
 class ExposureSetting(NamedTuple):
-    """Exposure of one frame."""
-
-    # linear image signal per unit of radiance on the optical axis, with the white balance for white light [1 /
-    # (cd/m2)]; a signal of 1 saturates
+    # linear signal per unit of radiance on the optical axis in white light [1 / (cd/m2)]; a signal of 1 saturates
     gain: float
     exposure_s: float = 0.0  # exposure time; 0 for the plain sensor
     analogue_gain: float = 1.0  # amplification before digitization
@@ -77,7 +62,7 @@ class ExposureSetting(NamedTuple):
 
 
 class PlainSensor:
-    """Sensor of both cameras with zero exposure time, unlimited gain and the noise of `[imaging]`."""
+    """Sensor of both cameras with the noise of `[imaging]`."""
 
     def __init__(self, scenario: Scenario):
         self._imaging = scenario.imaging
@@ -85,7 +70,7 @@ class PlainSensor:
 
     @property
     def setting(self) -> ExposureSetting | None:
-        """Returns the exposure of the next frame; None before the first frame is metered."""
+        """Exposure of the next frame; None before the first frame is metered."""
         gain = self._exposure.next_gain
         return None if gain is None else ExposureSetting(gain)
 
@@ -94,31 +79,26 @@ class PlainSensor:
         return ExposureSetting(self._exposure.gain(light))
 
     def motion(self, twist: Array, setting: ExposureSetting, n_rows: int) -> ExposureMotion | None:
-        """Returns None: the exposure time is zero."""
         return None
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
-        """Returns the 8-bit image (H, W, 3) of a radiance image; without noise if `rng` is None."""
-        if rng is not None:
-            return expose(light, setting.gain, self._imaging, rng)
-        noiseless = self._imaging.model_copy(update={"noise_sd": 0.0, "shot_noise": 0.0})
-        return expose(light, setting.gain, noiseless, np.random.default_rng(0))
+        return expose(light, setting.gain, self._imaging, rng)
 
     def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
-        """Returns the signal of R, G and B per unit of radiance [1 / (cd/m2)]."""
         return setting.gain, setting.gain, setting.gain
 
 
-def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator) -> Image:
-    """Returns the noisy 8-bit image (H, W, 3) of a radiance image [cd/m2].
+def expose(radiance: Radiance, gain: float, imaging: ImagingConfig, rng: np.random.Generator | None) -> Image:
+    """Returns the 8-bit image (H, W, 3) of a radiance image [cd/m2], with noise unless `rng` is None.
 
-    With signals as fractions of full scale, `gain` per cd/m2, the noise variance is noise_sd^2 + shot_noise^2 * signal.
+    As fractions of full scale, the signal is `gain` per cd/m2, the noise variance noise_sd^2 + shot_noise^2 * signal.
     """
     image = np.empty(radiance.shape, np.uint8)
     rows = len(radiance)
     light, filled = np.ascontiguousarray(radiance).reshape(rows, -1), image.reshape(rows, -1)
-    numbers = np.float32(gain), np.float32(imaging.noise_sd**2), np.float32(imaging.shot_noise**2)
-    seed, normal = seed_of(rng), normal_numbers()
+    noise = (0.0, 0.0) if rng is None else (imaging.noise_sd**2, imaging.shot_noise**2)
+    numbers = np.float32(gain), np.float32(noise[0]), np.float32(noise[1])
+    seed, normal = np.uint64(0) if rng is None else seed_of(rng), normal_numbers()
     in_row_bands(lambda first, end: _digitise(light, *numbers, seed, normal, filled, first, end), rows)
     return image
 
@@ -138,7 +118,6 @@ def _mean(light):
 
 @kernel
 def _digitise(light, gain, read_variance, shot_variance, seed, normal, image, first, end):
-    """Fills rows `first` to `end` - 1 of `image` (H, 3 W) with noisy 8-bit values."""
     n = light.shape[1]
     n_words = (n + 3) // 4
     full, half, zero = np.float32(255.0), np.float32(0.5), np.float32(0.0)

@@ -18,57 +18,33 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core.interpolation import catmull_rom_weights
+from twin.core.records import Array, Depth, Radiance
 from twin.core.threads import in_row_bands
 from twin.imaging.camera.resample import sum_row
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
-Radiance = NDArray[np.float32]
-Depth = NDArray[np.float32]
 
 SHORT_PX = 2.8  # largest column and row extent of a path for the 3 x 3 kernel; at sqrt(8) px its weights are equal
 
 
 class ExposureMotion(NamedTuple):
-    """Motion of a camera during one exposure."""
-
     twist: Array  # (6,) [angular, linear] velocity of the camera in its own axes [rad/s, m/s]
     exposure_s: float  # exposure time of each row; 0 = no motion blur
     readout_s: float  # time from the first row of the rendered image to the last; 0 = global shutter
-    # whether the rolling shutter is applied where the raw image is sampled from the rendered one
-    # (`true_cameras.TrueCameras.sample`), so that the image is resampled only once
-    rolls_later: bool = False
+    rolls_later: bool = False  # the shutter is applied by `TrueCameras.sample`: the image is resampled only once
 
 
 def integrate(light: Radiance, depth: Depth, focal_px: float, motion: ExposureMotion) -> Radiance:
-    """Returns the radiance (H, W, 3) recorded by a moving camera: shutter (unless `motion.rolls_later`) and blur.
-
-    `light` is the radiance at mid-exposure in the rendered pinhole image, `depth` (H, W) that of the floor [m].
-    """
+    """Returns the radiance (H, W, 3) recorded by a moving camera from that at mid-exposure: shutter and blur."""
     if motion.readout_s and not motion.rolls_later:
-        light = apply_rolling_shutter(light, depth, focal_px, motion.twist, motion.readout_s)
+        light = _moved(_apply_rolling_shutter, light, depth, focal_px, motion.twist, motion.readout_s)
     if motion.exposure_s:
-        light = blur_by_motion(light, depth, focal_px, motion.twist, motion.exposure_s)
+        light = _moved(_blur_by_motion, light, depth, focal_px, motion.twist, motion.exposure_s)
     return light
 
 
-def blur_by_motion(light: Radiance, depth: Depth, focal_px: float, twist: Array, exposure_s: float) -> Radiance:
-    """Returns the radiance (H, W, 3) with motion blur; points at inf move by rotation alone.
-
-    `twist` (6,) is the [angular, linear] velocity of the camera in its own axes [rad/s, m/s].
-    """
-    return _by_rows(_blur_by_motion, light, depth, focal_px, twist, exposure_s)
-
-
-def apply_rolling_shutter(light: Radiance, depth: Depth, focal_px: float, twist: Array, readout_s: float) -> Radiance:
-    """Returns the radiance (H, W, 3) that a camera with a rolling shutter records."""
-    return _by_rows(_apply_rolling_shutter, light, depth, focal_px, twist, readout_s)
-
-
-def _by_rows(
+def _moved(
     kernel: Callable[..., None], light: Radiance, depth: Depth, focal_px: float, twist: Array, time_s: float
 ) -> Radiance:
     out = np.empty_like(light)
@@ -88,7 +64,6 @@ def _flow(x, y, near, scale, twist):
 
 @kernel(error_model="numpy")
 def _blur_by_motion(light, depth, focal, twist, exposure_s, out, first, end):
-    """Computes rows `first` to `end` - 1 of `out` (H, W, 3), the radiance with motion blur."""
     height, width = depth.shape
     flat = light.reshape(-1, 3)
     values, filled = light.reshape(height, 3 * width), out.reshape(height, 3 * width)
@@ -131,7 +106,6 @@ def _blur_weights(depth, x, y, scale, twist, weights):
 
 @kernel
 def _repeat_for_bands(values, out):
-    """Fills `out` (3 W,) with each of the `values` (W,) three times, for R, G, B."""
     for u in range(values.size):
         value = values[u]
         out[3 * u], out[3 * u + 1], out[3 * u + 2] = value, value, value
@@ -139,7 +113,7 @@ def _repeat_for_bands(values, out):
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _blur_row(above, here, below, weights, out):
-    """Blurs a row (3 W,), except its first and last pixel, with the 3 x 3 kernel of `_blur_weights`, here (4, 3 W)."""
+    """Blurs a row (3 W,), except its first and last pixel, with the kernel of `_blur_weights`, here (4, 3 W)."""
     before, middle, after = slice(0, -6), slice(3, -3), slice(6, None)
     a0, a1, a2 = above[before], above[middle], above[after]
     b0, b1, b2 = here[before], here[middle], here[after]
@@ -158,8 +132,7 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
     """Writes to `out` the mean radiance over a straight path centred on pixel (a, b), from an odd number of samples.
 
     The path extends by `length` along the first axis and by `aside`, not longer, along the second [px]; samples are a
-    pixel apart along the first and interpolated along the second. The weight of the two ends gives the variance
-    length^2 / 12.
+    pixel apart along the first. The weight of the two ends gives the variance length^2 / 12.
     """
     m = int(np.ceil(np.float32(0.5) * (np.sqrt(np.float32(1.0) + length * length) - np.float32(1.0))))
     here = flat[a * stride_a + b * stride_b]
@@ -188,7 +161,6 @@ def _average_along_path(flat, length, aside, a, b, size_a, size_b, stride_a, str
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, end):
-    """Fills rows `first` to `end` - 1 of `out` (H, W, 3), the radiance recorded with a rolling shutter."""
     height, width = depth.shape
     zero, half = np.float32(0.0), np.float32(0.5)
     right, low = np.float32(width - 1), np.float32(height - 1)
@@ -214,6 +186,5 @@ def _apply_rolling_shutter(light, depth, focal, twist, readout_s, out, first, en
 
 @kernel(forceinline=True, fastmath={"contract"})
 def _cubic_weights(at, before, here, after, last):
-    """Computes the Catmull-Rom weights (w,) of the pixels floor(at) - 1 to floor(at) + 2 at the positions `at` (w,)."""
     for u in range(at.size):
         before[u], here[u], after[u], last[u] = catmull_rom_weights(at[u] - np.floor(at[u]))

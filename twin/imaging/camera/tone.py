@@ -10,9 +10,9 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
+
 ToneCurve = Literal["linear", "srgb", "log"]
 
 LOG_STOPS = 6  # range of the logarithmic curve, in factors of two
@@ -20,10 +20,7 @@ SRGB_LINEAR, SRGB_SLOPE, SRGB_OFFSET, SRGB_GAMMA = 0.0031308, 12.92, 0.055, 2.4
 
 
 def tone(signal: Array, curve: ToneCurve) -> Array:
-    """Returns the image level of a linear signal of any shape.
-
-    The curve "linear" returns the signal unchanged; the other curves clip it to 0 to 1 first.
-    """
+    """Returns the image level of a linear signal of any shape; all curves but "linear" clip it to 0 to 1 first."""
     if curve == "linear":
         return signal
     clipped = np.clip(signal, 0.0, 1.0)

@@ -1,8 +1,8 @@
 """Geometry of the true cameras: maps rendered images to raw images, and raw images to rectified frames.
 
-The floor is rendered for two parallel pinhole cameras in water, with a margin where necessary. Each raw pixel has its
-own ray through lens and port and gets the radiance where this ray meets the rendered floor; the raw image is rectified
-with the believed calibration. If both true cameras equal the believed ones, the rendered image is used unchanged.
+The floor is rendered for two parallel pinhole cameras in water. Each raw pixel has its own ray through lens and port
+and gets the radiance where this ray meets the rendered floor; the raw image is rectified with the believed calibration.
+If both true cameras equal the believed ones, the rendered image is used unchanged.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import Image, StereoRig
+from twin.core.records import Array, Depth, Image, Radiance, StereoRig
 from twin.errors import TwinError
 from twin.imaging.camera import lens as lenses
 from twin.imaging.camera import port as ports
@@ -25,10 +25,6 @@ from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
 from twin.imaging.camera.resample import Positions
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.scenario.model import CalibrationErrorConfig, PortConfig, Scenario
-
-Array = NDArray[np.float64]
-Radiance = NDArray[np.float32]
-Depth = NDArray[np.float32]
 
 NEAREST_M = 0.3  # smallest depth of the floor for which the rendered margin suffices
 MARGIN_STEP_PX = 8  # margins are multiples of this; two of them add a multiple of 16 to the width or height
@@ -47,10 +43,7 @@ class CameraModel(NamedTuple):
     believed_from_camera: Array
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Returns origins [m] and unit directions (..., 3) of the rays of pixels (..., 2) in water, in believed axes.
-
-        The direction is NaN for a pixel without a ray, e.g. if the ray is totally reflected at the port.
-        """
+        """Returns origins [m] and directions (..., 3) in water, in believed axes, of pixels (..., 2); NaN if none."""
         air = lenses.undistort((pixels - self.principal_px) / self.focal_px, self.lens)
         if self.port.kind == "none":
             air = air / self.pinhole.focal_ratio
@@ -59,10 +52,7 @@ class CameraModel(NamedTuple):
         return origin @ self.believed_from_camera.T, direction @ self.believed_from_camera.T
 
     def pixels(self, points_m: Array) -> Array:
-        """Returns the pixels (..., 2) of points (..., 3) [m] in front of the believed camera, in its axes; NaN if none.
-
-        A point has none without a ray through the port, or too far off the axis for the distortion model.
-        """
+        """Returns the pixels (..., 2) of points (..., 3) [m] in front of the believed camera; NaN if there is none."""
         points_m = points_m @ self.believed_from_camera + [0.0, 0.0, self.pinhole.centre_m]
         air = ports.air_coordinates(self.port, points_m)
         if self.port.kind == "none":
@@ -73,38 +63,27 @@ class CameraModel(NamedTuple):
 
 
 class SamplingMap(NamedTuple):
-    """Positions in the rendered image at which the pixels of a raw image (h, w) are sampled."""
-
     positions: Positions  # (h, w, 2) position for each raw pixel if its ray meets the floor at infinity [px]
-    # (h, w, 2) parallax times depth [px m]: if the ray meets the floor at depth z, the position is `positions` +
-    # `parallax_px_m` / z. None if it is zero for all pixels.
+    # (h, w, 2) of a ray that meets the floor at depth z, the position is `positions` + `parallax_px_m` / z; None = 0
     parallax_px_m: Positions | None
 
 
 @dataclass(frozen=True)
 class TrueCameras:
-    """Geometry of the true stereo camera: maps rendered images to raw images, and raw images to rectified frames."""
-
     # calibration used for rendering: the believed rig with the true baseline, and images enlarged by the margin
     rendered_rig: StereoRig
     margin_px: tuple[int, int]  # (columns, rows) by which the rendered image extends beyond the frame on each side
     raw_rig: StereoRig  # calibration of the raw images: their size, the focal length of the lens, the true baseline
-    # for the left and the right camera, position in the rendered image of each raw pixel; None if the rendered images
-    # are used as raw images
+    # of the left and the right camera; None if the rendered images are used as raw images
     sampling: tuple[SamplingMap, SamplingMap] | None
-    # (H, W, 2) position in the raw image of each pixel of the rectified frame [px]; None if the raw images are used as
-    # frames
+    # (H, W, 2) position in the raw image of each pixel of the frame [px]; None if raw images are used as frames
     rectification: Positions | None
     models: tuple[CameraModel, CameraModel]  # models of the true left and right camera
     believed: CameraModel  # camera model that is used to rectify the images of both cameras
     rectified_depth_m: float  # depth of the points for which the rectification is computed
 
     def sample(self, light: Radiance, depth: Depth, camera: int, motion: ExposureMotion | None = None) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right), from the rendered image.
-
-        `light` (H, W, 3) and `depth` (H, W) [m] are rendered; the rolling shutter of `motion` is applied if `sampling`
-        is not None.
-        """
+        """Returns the radiance (h, w, 3) at the raw pixels of a camera (0 left, 1 right), from the rendered image."""
         if self.sampling is None:
             return light
         positions, parallax = self.sampling[camera]
@@ -115,11 +94,11 @@ class TrueCameras:
         return sample_rays(light, depth, positions, parallax, rows)
 
     def rectify(self, raw: Image) -> Image:
-        """Returns the frame: the raw image of either camera, rectified with the believed calibration."""
+        """Returns the frame of either camera: its raw image, rectified with the believed calibration."""
         return raw if self.rectification is None else resample.interpolate(raw, self.rectification)
 
     def crop(self, rendered: NDArray[Any]) -> NDArray[Any]:
-        """Returns a rendered image without its margin, i.e. with the size of the frame."""
+        """Returns a rendered image without its margin."""
         (x, y), (height, width) = self.margin_px, rendered.shape[:2]
         return np.ascontiguousarray(rendered[y : height - y, x : width - x]) if x or y else rendered
 
@@ -138,9 +117,8 @@ class TrueCameras:
 def make_true_cameras(scenario: Scenario) -> TrueCameras:
     """Returns the true cameras of a scenario.
 
-    Raises:
-        TwinError: the lens is outside its dome, the port transmits no rays to part of the image, the distortion folds
-            the image back onto itself, or the field of view is too wide.
+    Raises TwinError where the lens is outside its dome, the port transmits no rays to part of the image, the distortion
+    folds the image back onto itself, or the field of view is too wide.
     """
     believed_rig, calibration = scenario.believed_rig(), scenario.calibration_error
     _check_port(scenario.port)
@@ -170,7 +148,6 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
 
 
 def _models(scenario: Scenario) -> tuple[tuple[CameraModel, CameraModel], CameraModel]:
-    """Returns the models of the true left and right camera, and the one by which the images of both are rectified."""
     calibration, port, rig = scenario.calibration_error, scenario.port, scenario.believed_rig()
     pinhole, principal_px = ports.pinhole(port), np.array([rig.cx_px, rig.cy_px])
     focal_px, lens = rig.focal_px / pinhole.focal_ratio, lenses.true_lens(scenario.lens)
@@ -187,17 +164,13 @@ def _models(scenario: Scenario) -> tuple[tuple[CameraModel, CameraModel], Camera
 
 
 def right_rotation(calibration: CalibrationErrorConfig) -> Array:
-    """Returns the rotation error (3, 3) of the right camera, from its true axes to the believed ones.
-
-    It is R_y(yaw) R_x(pitch) R_z(roll), with x right, y down, z forward.
-    """
+    """Returns R_y(yaw) R_x(pitch) R_z(roll) (3, 3) of the right camera, from its true axes to the believed ones."""
     roll, pitch, yaw = np.deg2rad([calibration.right_roll_deg, calibration.right_pitch_deg, calibration.right_yaw_deg])
     x, y, z = np.eye(3)
     return geometry.so3_exp(yaw * y) @ geometry.so3_exp(pitch * x) @ geometry.so3_exp(roll * z)
 
 
 def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    """Returns whether the true and the believed cameras are the same pinhole camera without a port."""
     same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
@@ -228,12 +201,10 @@ def _rendered_rays(camera: CameraModel, pixels: Array, rig: StereoRig) -> tuple[
 
 
 def _enlarged(rig: StereoRig, border: NDArray[np.int64]) -> StereoRig:
-    """Returns the rig with a border of (columns, rows) on each side of its images."""
     return replace(rig, width_px=rig.width_px + 2 * int(border[0]), height_px=rig.height_px + 2 * int(border[1]))
 
 
 def _or_none(parallax: Array) -> Positions | None:
-    """Returns the parallax in single precision; None if it is zero for all pixels."""
     return parallax.astype(np.float32) if np.abs(parallax).max() > 1e-9 else None
 
 
@@ -264,9 +235,6 @@ def _margin(rays: list[tuple[Array, Array]], rig: StereoRig) -> NDArray[np.int64
 
 
 def _check_port(port: PortConfig) -> None:
-    """Raises TwinError if the entrance pupil of the lens is outside the dome."""
     if port.kind == "dome" and np.linalg.norm(port.offset_m) >= port.radius_m:
-        raise TwinError(
-            "port.offset_m", f"{np.linalg.norm(port.offset_m):g} m: the lens is outside its dome",
-            f"shorter than port.radius_m, {port.radius_m:g} m",
-        )  # fmt: skip
+        reason = f"{np.linalg.norm(port.offset_m):g} m: the lens is outside its dome"
+        raise TwinError("port.offset_m", reason, f"shorter than port.radius_m, {port.radius_m:g} m")

@@ -2,38 +2,31 @@
 
 The factors of a preset are inverse to the electrons of a white surface in white light, a black body, or white light
 after the path exp(-2 Kd altitude) to the floor and back. Grey world makes the means of the bands equal (Buchsbaum
-1980), with the lag of the auto-exposure. Factors are at least 1, so that a saturated pixel is white, and at most
-`MOST`.
+1980), with the lag of the auto-exposure. Factors are at least 1, so that a saturated pixel is white.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.imaging.light.illumination import water_to_floor_and_back
 from twin.imaging.light.lamps import colour
 from twin.imaging.light.water import downwelling_per_m
 from twin.scenario.model import Scenario
 
-Array = NDArray[np.float64]
-
 MOST = 16.0  # largest factor
 
 
 class WhiteBalance:
-    """White balance of both cameras, from electrons (3,) in a pixel at 1 cd/m2 on any scale.
-
-    `of_white_light` (3,) are the factors for white light, `is_of_white_light` whether they are used.
-    """
+    """White balance of both cameras, from electrons (3,) in a pixel at 1 cd/m2 on any scale."""
 
     def __init__(self, scenario: Scenario, electrons_per_cd: Array):
         assert scenario.sensor is not None
         self._mode, self._electrons = scenario.sensor.white_balance, electrons_per_cd
-        self.is_of_white_light = self._mode == "white_light"
         self.of_white_light = electrons_per_cd.max() / electrons_per_cd
         self._log_grey: Array | None = None
-        self._fixed = self.of_white_light if self.is_of_white_light else self._preset(scenario)
+        self._fixed = self.of_white_light if self._mode == "white_light" else self._preset(scenario)
 
     def factors(self, mean: Array, share: float) -> Array:
         """Returns the factors (3,) of this frame; its `mean` radiance (3,) affects later frames (grey world)."""
@@ -46,12 +39,8 @@ class WhiteBalance:
 
     @property
     def next_factors(self) -> Array:
-        """Returns the factors (3,) of the next frame; with grey world, a frame must have been measured."""
+        """Factors (3,) of the next frame; with grey world, a frame must have been measured."""
         return self._fixed if self._log_grey is None else np.exp(self._log_grey)
-
-    def relative(self, factors: Array) -> Array | float:
-        """Returns the factors (3,) relative to those for white light; 1 if they are equal."""
-        return 1.0 if self.is_of_white_light else factors / self.of_white_light
 
     def _preset(self, scenario: Scenario) -> Array:
         """Returns the constant factors (3,) of a scenario; with grey world, they are not used."""
@@ -68,5 +57,5 @@ class WhiteBalance:
 
 
 def _limited(electrons: Array) -> Array:
-    """Returns the factors (3,) that make electrons (3,) equal; they are 1 or more, and at most `MOST`."""
+    """Returns the factors (3,), from 1 to `MOST`, that make electrons (3,) equal."""
     return np.minimum(electrons.max() / electrons, MOST)

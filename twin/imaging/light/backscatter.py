@@ -1,8 +1,7 @@
 """Backscatter: light of lamps and daylight that the water scatters into the camera, between camera and floor.
 
 The light of a lamp (`lamp_light`), scattered with the coefficient b p(angle), is blurred on its way to the camera like
-the light of the floor (`spread.camera_mixture`), on the coarse grid of the table; with single scattering it is
-attenuated by a + b instead.
+the light of the floor (`spread.camera_mixture`); with single scattering it is attenuated by a + b instead.
 """
 
 from __future__ import annotations
@@ -10,16 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.core.records import StereoRig
+from twin.core.records import Array, StereoRig
 from twin.imaging.light.forward_scatter import WIDEST_TAN, level_sigma_px, level_weights
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.phase_function import phase_at
 from twin.imaging.light.shading import RANGE_SCALE_M
 from twin.imaging.light.water import Medium
-
-Array = NDArray[np.float64]
 
 #: Rows and columns of the grid of pixels for wide beams, and for beams that fall to half intensity within `NARROW_DEG`.
 GRID, NARROW_GRID, NARROW_DEG = (16, 20), (48, 64), 25.0
@@ -29,13 +25,16 @@ MARGIN = 6  # rows and columns of the grid outside each side of the image, whose
 
 
 def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Array) -> Array:
-    """Returns the backscatter (..., n, 3) per metre of range at the camera, without its blur on the way [cd/m3].
+    """Returns the backscatter (..., n, 3) per metre along rays (..., 3), without its blur on the way [cd/m3].
 
-    With multiple scattering it is that of the lamps alone, see `daylight.DaylightVeil`. `ray` (..., 3) is the unit
-    viewing direction in the axes of the camera, `range_m` (..., n) the distances along it.
+    With multiple scattering it is that of the lamps alone.
     """
     points = ray[..., None, :] * range_m[..., None]
-    total = lamps.scattered_once_per_m(points, ray) * np.exp(-water.camera_loss_per_m * range_m[..., None])
+    total = np.zeros(points.shape)
+    for lamp in range(len(lamps.sources.intensity_cd)):
+        lux, from_lamp = lamps.lux(lamp, points)
+        total += lux * phase_at(water.scatterers, -(from_lamp @ ray[..., None])[..., 0])
+    total = total * water.scattering_per_m * np.exp(-water.camera_loss_per_m * range_m[..., None])
     if water.multiple:
         return total
     loss = np.exp(-lamps.sources.daylight.camera_loss_per_m * range_m[..., None])
@@ -43,7 +42,6 @@ def backscatter_per_m(lamps: LampLight, water: Medium, ray: Array, range_m: Arra
 
 
 def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> Array:
-    """Returns the daylight (..., n, 3) scattered into rays, per metre of path [cd/m3]."""
     day = lamps.sources.daylight
     phase = phase_at(water.scatterers, -ray[..., 2])
     light = day.illuminance_lx * np.exp(-day.attenuation_per_m * points[..., 2:])
@@ -53,8 +51,7 @@ def _of_daylight(lamps: LampLight, water: Medium, ray: Array, points: Array) -> 
 def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
     """Returns the backscatter (rows, cols, RANGES + 1, 3) between the camera and each range [cd/m2], on a coarse grid.
 
-    With multiple scattering it is that of the lamps alone. The table is empty, (0, 0, 0, 3), if the water does not
-    scatter. See `grid_of` for the grid and `table_range_m` for the ranges.
+    With multiple scattering it is that of the lamps alone. (0, 0, 0, 3) if the water does not scatter.
     """
     if not water.scattering_per_m.any():
         return np.zeros((0, 0, 0, 3))
@@ -62,7 +59,8 @@ def backscatter_table(rig: StereoRig, water: Medium, lamps: LampLight) -> Array:
     grid = grid_of(lamps.sources.beam)
     if water.multiple and not len(lamps.sources.beam):
         return np.zeros((*grid, RANGES + 1, 3))
-    down_px, across_px = (_grid_px(n, size, margin) for n, size in zip(grid, _size(rig), strict=True))
+    down_px = _places_px(grid[0], rig.height_px - 1.0, margin)
+    across_px = _places_px(grid[1], rig.width_px - 1.0, margin)
     rows, cols = len(down_px), len(across_px)
     ray = _rays(rig, down_px, across_px)
     # Midpoints of even steps of x = r / (r + scale), which reaches infinite range at x = 1; dr/dx = scale / (1 - x)^2.
@@ -85,11 +83,10 @@ def grid_of(beams: Sequence[Array]) -> tuple[int, int]:
 
 def grid_rays(rig: StereoRig, grid: tuple[int, int]) -> Array:
     """Returns the unit directions (rows, cols, 3) of a pixel grid that spans the image, in the axes of the camera."""
-    return _rays(rig, *(_grid_px(n, size, 0) for n, size in zip(grid, _size(rig), strict=True)))
+    return _rays(rig, _places_px(grid[0], rig.height_px - 1.0, 0), _places_px(grid[1], rig.width_px - 1.0, 0))
 
 
 def _rays(rig: StereoRig, down_px: Array, across_px: Array) -> Array:
-    """Returns the unit directions (rows, cols, 3) of the pixels of a grid, in the axes of the camera."""
     u, v = np.meshgrid(across_px, down_px)
     ray = np.stack([(u - rig.cx_px) / rig.focal_px, (v - rig.cy_px) / rig.focal_px, np.ones_like(u)], -1)
     return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
@@ -116,11 +113,7 @@ def _spread(steps: Array, range_m: Array, grid_px: tuple[Array, Array], rig: Ste
     return found
 
 
-def _size(rig: StereoRig) -> tuple[float, float]:
-    return rig.height_px - 1.0, rig.width_px - 1.0
-
-
-def _grid_px(n: int, size_px: float, margin: int) -> Array:
+def _places_px(n: int, size_px: float, margin: int) -> Array:
     """Returns n evenly spaced positions from 0 to `size_px`, and `margin` positions outside of each end [px]."""
     outside = size_px * (np.arange(1.0, margin + 1) / max(margin, 1)) ** 2
     return np.concatenate([-outside[::-1], np.linspace(0.0, size_px, n), size_px + outside])

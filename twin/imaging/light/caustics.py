@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import j0
 
+from twin.core.geometry import Array
 from twin.imaging.light.illumination import Illumination
-from twin.imaging.light.phase_function import PhaseTable, table_of
+from twin.imaging.light.phase_function import BandWater, table_of
 from twin.imaging.light.water import Medium
 from twin.imaging.light.waves import angular_frequency, slope_density, slope_variance
 from twin.kernels import kernel
 from twin.scenario.model import SEA_WATER_INDEX
-
-Array = NDArray[np.float64]
 
 CELLS = 256  # number of cells per side of the tile, a power of two
 TILE_DEPTHS = 1.5  # side of the tile in units of the depth
@@ -34,17 +33,14 @@ _HEIGHTS, _ANGLES, _WAVE_NUMBERS = 24, 512, 80  # numbers of nodes of `scatterin
 
 
 class Caustics:
-    """Caustics of one survey: a time-dependent pattern, computed on the reference plane.
-
-    The wind blows from west to east. The phases of the waves are random, their amplitudes are not. `tile_m` is the side
-    of the tile.
-    """
+    """Time-dependent caustics on the reference plane, from waves of random phases (not amplitudes) that run east."""
 
     def __init__(self, illumination: Illumination, wind_mps: float, seed: int):
         water, daylight = illumination
         depth_m = daylight.reference_depth_m
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
         self.tile_m = TILE_DEPTHS * depth_m
+        self.cells_per_m = CELLS / self.tile_m
         kx, ky = _wave_numbers(self.tile_m)
         k = np.hypot(kx, ky)
         shortest = RESOLVED * np.pi * CELLS / self.tile_m
@@ -63,19 +59,10 @@ class Caustics:
         self._cached: tuple[float, NDArray[np.float32]] | None = None
         self._computing = threading.Lock()
 
-    @property
-    def cells_per_m(self) -> float:
-        """Number of cells of the pattern per metre."""
-        return CELLS / self.tile_m
-
-    def pattern(self, time_s: float) -> NDArray[np.float32]:
-        """Returns the illuminance (CELLS, CELLS) divided by its mean; row 0 = south, column 0 = west."""
-        return self.closed_pattern(time_s)[:-1, :-1]
-
     def closed_pattern(self, time_s: float) -> NDArray[np.float32]:
-        """Returns `pattern` with its first row and its first column repeated at the end: (CELLS + 1, CELLS + 1).
+        """Returns the illuminance divided by its mean, (CELLS + 1, CELLS + 1); row 0 = south, column 0 = west.
 
-        The latest pattern is cached, because both cameras use it; they may do so at the same time.
+        The first row and column are repeated at the end. Both cameras use the cached result, even at the same time.
         """
         with self._computing:
             if self._cached is None or self._cached[0] != time_s:
@@ -83,11 +70,7 @@ class Caustics:
             return self._cached[1]
 
     def slopes(self, time_s: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Returns the slopes of the resolved waves towards east and towards north, each (CELLS, CELLS).
-
-        Their common sign is arbitrary: because the phases of the waves are random, it does not affect the statistics of
-        the pattern.
-        """
+        """Returns the slopes towards east and north, (CELLS, CELLS) each; their common sign is arbitrary."""
         turns = self._turns_per_s * time_s
         turns -= np.floor(turns)
         turns *= 2 * np.pi
@@ -99,7 +82,6 @@ class Caustics:
         return both[..., 0], both[..., 1]
 
     def _compute(self, time_s: float) -> NDArray[np.float32]:
-        """Returns the result of `closed_pattern`, computed without its cache."""
         light = np.zeros((CELLS, CELLS), np.float32)
         _trace_rays(*self.slopes(time_s), self._cells_per_slope, light)
         spectrum = np.asarray(cv2.dft(light), np.float32)
@@ -116,25 +98,23 @@ class Caustics:
         kx, ky = _wave_numbers(self.tile_m)
         along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
         rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
-        green = float(water.absorption_per_m[1]), float(water.scattering_per_m[1])
-        phase = table_of(water.scatterers[1])
-        return rough * scattering_blur(np.hypot(kx, ky), depth_m, green, phase)
+        return rough * scattering_blur(np.hypot(kx, ky), depth_m, water.bands[1])
 
 
-def scattering_blur(k: Array, depth_m: float, per_m: tuple[float, float], phase: PhaseTable) -> Array:
+def scattering_blur(k: Array, depth_m: float, water: BandWater) -> Array:
     """Returns the modulation transfer function of the irradiance at a depth below a narrow vertical beam.
 
     Light scattered by the angle t at the height h above the plane meets it at h tan(t) from the beam. With any number
     of scattering events (Wells 1973), the transform is exp(b (F(k) - F(0))), F(k) being the integral over h from 0 to
-    the depth and over downward directions of p(t) exp(-a h (1 / cos(t) - 1)) J0(k h tan(t)), k the wave numbers [rad/m]
-    and `per_m` = (a, b).
+    the depth and over downward directions of p(t) exp(-a h (1 / cos(t) - 1)) J0(k h tan(t)).
     """
-    absorption, scattering = per_m
+    absorption, scattering, scatterer = water
     if scattering * depth_m == 0:
         return np.ones_like(k)
-    every = (len(phase.cumulative) - 1) // _ANGLES
+    cumulative = table_of(scatterer).cumulative
+    every = (len(cumulative) - 1) // _ANGLES
     middle = (np.arange(_ANGLES) + 0.5) / _ANGLES
-    angle, share = 2 * np.arcsin(middle**2), np.diff(phase.cumulative[::every])
+    angle, share = 2 * np.arcsin(middle**2), np.diff(cumulative[::every])
     angle, share = angle[angle < np.pi / 2], share[angle < np.pi / 2]
     node, weight = np.polynomial.legendre.leggauss(_HEIGHTS)
     height = depth_m * (node[:, None] + 1) / 2
@@ -153,8 +133,7 @@ def _wave_numbers(tile_m: float) -> tuple[Array, Array]:
 def _packed(transfer: Array) -> Array:
     """Returns the factors (CELLS, CELLS) of the numbers in a spectrum of `cv2.dft` of a real image.
 
-    OpenCV stores the real and the imaginary part of a coefficient in consecutive columns 2 k - 1 and 2 k, or in such
-    rows in the first and the last column, whose coefficients are symmetric.
+    OpenCV stores both parts of a coefficient in columns 2 k - 1 and 2 k or, in the first and last column, in such rows.
     """
     index = np.arange(CELLS)
     half = (index + 1) // 2
@@ -164,9 +143,9 @@ def _packed(transfer: Array) -> Array:
 
 @kernel(error_model="numpy")
 def _add_waves(east, north, cosine, sine, spectrum):
-    """Adds waves to the spectrum of a complex image: real part slope towards east, imaginary part slope towards north.
+    """Adds waves to the spectrum of a complex image: slope towards east + i slope towards north.
 
-    Both slopes are real: the coefficient of a wave number determines that of the opposite wave number.
+    Both are real: the coefficient of a wave number determines that of the opposite wave number.
     """
     n, half = spectrum.shape[0], spectrum.shape[1] // 2
     for i in range(n):

@@ -1,7 +1,6 @@
 """Daylight on floors of any slope, and its backscatter in the lines of sight of a camera, from the light field.
 
-The tables are computed once per scenario, those of the backscatter at the planned depth. Light that floor and water
-send back to the floor is neglected: 8 % on a floor of albedo 0.5 in water of Jerlov type III.
+Light that floor and water send back is neglected: 8 % for albedo 0.5 in water of Jerlov type III.
 """
 
 from __future__ import annotations
@@ -12,20 +11,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.imaging.light.illumination import Daylight
-from twin.imaging.light.light_field import SLOPE_MODES, BandOptics, LightField
-from twin.imaging.light.phase_function import Scatterer, table_of
-from twin.imaging.light.spread import Absorbed
+from twin.imaging.light.light_field import SLOPE_MODES, LightField
+from twin.imaging.light.phase_function import BandWater
 from twin.imaging.light.sun_sky import SunSky
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 MODES = 8  # terms of the azimuth series of the upwelling light; the mean error of the series is below 1 %
 VIEW_STEPS, LARGEST_VIEW_DEG = 24, 86.0  # number of angles between line of sight and straight down, and the largest one
 FLOOR_STEPS, FLOOR_SCALE_M = 96, 2.0  # steps of h / (h + scale), with h the vertical distance of the floor; scale
 FIT_DEPTHS = 9  # number of depths, from the cameras to below the reference plane, at which light is computed
+#: Rows and columns of the terms of a quadratic form in (n, 1), in the order of the argument `sky` of `shading.shade`.
+_FIRST, _SECOND = np.array([[0, 1, 2, 0, 0, 1, 0, 1, 2, 3], [0, 1, 2, 1, 2, 2, 3, 3, 3, 3]])
 LEAST_LX = 1e-12  # lower limit of the illuminance by all light but the beam, per lux at the surface
 
 
@@ -47,17 +46,24 @@ class FloorDaylight(NamedTuple):
     reference_depth_m: float  # depth below the surface at which `rest_lx` applies
     fitted_m: tuple[float, float]  # lowest and highest d of the fit
 
+    def in_camera(self, from_camera: Array) -> tuple[NDArray[np.float32], ...]:
+        """Returns the first five parts of the argument `sky` of `shading.shade`; see `optics.WaterSurface`."""
+        to_sun, form = np.empty(3, np.float32), np.empty((len(self.rest_lx), len(_FIRST)), np.float32)
+        _turn_to_camera(world_axes(from_camera), self.to_sun, self.rest_lx, to_sun, form)
+        beam = np.stack([self.beam_lx, self.beam_per_m], 1).astype(np.float32)
+        fitted = np.array([self.reference_depth_m, *self.fitted_m], np.float32)
+        return to_sun, beam, form, np.ascontiguousarray(self.rest_per_m, np.float32), fitted
+
 
 def floor_daylight(daylight: Daylight) -> FloorDaylight:
-    """Returns the daylight on the floor.
+    """Returns the daylight on the floor. With multiple scattering, the beam is scattered into diffuse light.
 
-    Without multiple scattering, beam and diffuse light decrease at the rate of the diffuse attenuation; without a
-    surface they are constant. With it, the beam is scattered into diffuse light.
+    Without it, beam and diffuse light decrease at the rate of the diffuse attenuation, 0 without a surface.
     """
     source, water, east_north = daylight.source, daylight.water, _turn(daylight.source)
     beam, deep = daylight.surface_lx * source.beam_lx, daylight.reference_depth_m
     if not (deep and water.multiple and daylight.surface_lx.any()):
-        clear = _field(Absorbed(0.0, 0.0, Scatterer("petzold")), source, 1)
+        clear = _field(BandWater(0.0, 0.0), source, 1)
         form = east_north @ clear.slope_form(0.0, 1e-6) @ east_north.T
         fade = -daylight.attenuation_per_m
         rest_lx = (daylight.surface_lx * np.exp(fade * deep))[:, None, None] * form
@@ -65,17 +71,19 @@ def floor_daylight(daylight: Daylight) -> FloorDaylight:
         return FloorDaylight(np.array(source.to_sun), beam, -fade, rest_lx, rest_per_m, deep, (0.0, 0.0))
     fields = [_field(band, source, SLOPE_MODES) for band in water.bands]
     depths = np.linspace(daylight.camera_depth_m, deep + max(1.0, (deep - daylight.camera_depth_m) / 4), FIT_DEPTHS)
-    forms, changes = zip(*(_rest_of(field, deep, depths) for field in fields), strict=True)
+    forms, changes = zip(*(_rest_of(band, source, deep, tuple(depths)) for band in water.bands), strict=True)
     turned = daylight.surface_lx[:, None, None] * (east_north @ np.array(forms) @ east_north.T)
     per_m = np.array([field.beam_per_m for field in fields])
     fitted = float(depths[0] - deep), float(depths[-1] - deep)
     return FloorDaylight(np.array(source.to_sun), beam, per_m, turned, np.array(changes), deep, fitted)
 
 
-def _rest_of(field: LightField, deep_m: float, depths_m: Array) -> tuple[Array, Array]:
+@lru_cache(maxsize=64)
+def _rest_of(band: BandWater, source: SunSky, deep_m: float, depths_m: tuple[float, ...]) -> tuple[Array, Array]:
     """Returns the illuminance of the floor by all light except the beam of the sun, in one band."""
+    field = _field(band, source, SLOPE_MODES)
     light = np.log([max(field.illuminance(z, z)[1], LEAST_LX) for z in depths_m])
-    square, slope, level = np.polyfit(depths_m - deep_m, light, 2)
+    square, slope, level = np.polyfit(np.array(depths_m) - deep_m, light, 2)
     form = field.slope_form(deep_m, deep_m)
     return form * np.exp(level) / max(field.illuminance(deep_m, deep_m)[1], LEAST_LX), np.array([slope, square])
 
@@ -95,21 +103,15 @@ class DaylightVeil:
         self._loss = loss if daylight.reference_depth_m else np.zeros(3)
 
     def radiance(self, ray: Array, depth_m: float) -> NDArray[np.float32]:
-        """Returns the radiance (..., ranges, 3) [cd/m2] along lines of sight, in front of a black floor at each range.
+        """Returns the radiance (..., ranges, 3) [cd/m2] along unit directions, east, north, up, above a black floor.
 
-        Args:
-            ray: (..., 3) unit directions, east, north, up; at most `LARGEST_VIEW_DEG` from straight down.
-            depth_m: depth of the camera; the tabulated radiance is scaled with the attenuation of the illuminance.
+        At another depth of the camera, the tabulated radiance is scaled with the attenuation of the illuminance.
         """
         dark = np.zeros((*ray.shape[:-1], self._terms.shape[-1] // 4, 4), np.float32)
         return self.added_to(dark, ray, depth_m)[..., :3]
 
     def added_to(self, light: NDArray[np.float32], ray: Array, depth_m: float) -> NDArray[np.float32]:
-        """Returns the sum (..., ranges, 4) of other light and of the radiance of the veil for R, G, B, and a zero.
-
-        Args:
-            light: (..., ranges, 4) other light for R, G, B, and a zero [cd/m2].
-        """
+        """Returns the sum (..., ranges, 4) of the radiance and of other light, each R, G, B and a zero [cd/m2]."""
         out, size = np.empty_like(light), self._terms.shape[-1]
         fade = np.zeros(4, np.float32)
         fade[:3] = np.exp(-self._loss * (depth_m - self._depth_m))
@@ -120,7 +122,6 @@ class DaylightVeil:
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _add_veil(terms, ray, towards_sun, fade, light, out):
-    """Fills `out` with the sum of `light` and the radiance of the veil, see `DaylightVeil.added_to`."""
     views, modes, size = terms.shape
     per_rad = np.rad2deg(1.0) * (views - 1) / LARGEST_VIEW_DEG
     faded = np.empty(size, np.float32)
@@ -161,7 +162,6 @@ def _veil_terms(depth_m: float, water: Medium, source: SunSky, range_m: Array) -
 
 
 def _local_attenuation(field: LightField, depth_m: float) -> float:
-    """Returns the attenuation coefficient of the illuminance at `depth_m` in water of infinite depth [1/m]."""
     above, below = (sum(field.illuminance(z, np.inf)) for z in (max(depth_m - 0.25, 0.0), depth_m + 0.25))
     return float(np.log(above / below) / (depth_m + 0.25 - max(depth_m - 0.25, 0.0)))
 
@@ -176,47 +176,8 @@ def _turn(source: SunSky) -> Array:
     return out
 
 
-@lru_cache(maxsize=64)
-def _field(band: Absorbed, source: SunSky, modes: int) -> LightField:
-    """Returns the light field of a band, with `modes` terms of its Fourier series in azimuth; the result is cached."""
-    optics = BandOptics(band.absorption_per_m, band.scattering_per_m, table_of(band.scatterer))
-    return LightField(optics, source, modes)
-
-
-_NO_CAUSTICS = np.zeros((0, 0), np.float32)
-#: Rows and columns of the terms of a quadratic form in (n, 1), in the order of the argument `sky` of `shading.shade`.
-_FIRST, _SECOND = np.array([[0, 1, 2, 0, 0, 1, 0, 1, 2, 3], [0, 1, 2, 1, 2, 2, 3, 3, 3, 3]])
-
-
-class Sky:
-    """Daylight on the floor, which `in_camera` returns in the axes of a camera.
-
-    Args:
-        loss_per_m: (2, 3) attenuation with range from the camera of the light of lamps and of daylight [1/m].
-    """
-
-    def __init__(self, daylight: FloorDaylight, loss_per_m: Array):
-        self._to_sun, self._rest_lx = daylight.to_sun, daylight.rest_lx
-        self._beam = np.stack([daylight.beam_lx, daylight.beam_per_m], 1).astype(np.float32)
-        self._change = np.ascontiguousarray(daylight.rest_per_m, np.float32)
-        self._fitted = np.array([daylight.reference_depth_m, *daylight.fitted_m], np.float32)
-        self._loss_per_m = np.ascontiguousarray(loss_per_m, np.float32)
-
-    def in_camera(
-        self, from_camera: Array, caustics: NDArray[np.float32] | None, day_loss_per_m: Array | None = None
-    ) -> tuple:
-        """Returns the argument `sky` of `shading.shade`.
-
-        Args:
-            day_loss_per_m: (3,) attenuation of daylight with range from the camera [1/m]; None = that of `loss_per_m`.
-        """
-        to_sun, form = np.empty(3, np.float32), np.empty((len(self._rest_lx), len(_FIRST)), np.float32)
-        _turn_to_camera(world_axes(from_camera), self._to_sun, self._rest_lx, to_sun, form)
-        loss = self._loss_per_m
-        if day_loss_per_m is not None:
-            loss = np.stack([loss[0], day_loss_per_m.astype(np.float32)])
-        lines = _NO_CAUSTICS if caustics is None else caustics
-        return to_sun, self._beam, form, self._change, self._fitted, loss, lines, from_camera.astype(np.float32)
+#: Light field of a band, with the number of terms of its Fourier series in azimuth.
+_field = lru_cache(maxsize=64)(LightField)
 
 
 @kernel(error_model="numpy")
@@ -232,7 +193,6 @@ def world_axes(from_camera):
 
 @kernel(error_model="numpy")
 def _turn_to_camera(axes, to_sun, rest_lx, sun, form):
-    """Fills `sun` (3,) with the direction to the sun, `form` (3, 10) with the quadratic form of `rest_lx`."""
     turn, half = np.eye(4), np.empty((4, 4))
     turn[:3, :3] = axes
     for i in range(3):

@@ -16,17 +16,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import StereoRig
+from twin.core.records import Array, Depth, Radiance, StereoRig
 from twin.core.threads import in_row_bands
+from twin.imaging.light.phase_function import BandWater
 from twin.imaging.light.shading import FAR_M, RANGE_SCALE_M
-from twin.imaging.light.spread import NODES_M, Absorbed, camera_mixture, over_path
+from twin.imaging.light.spread import NODES_M, camera_mixture, over_path
 from twin.imaging.light.vector_math import sum_of_entries
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 
-Array = NDArray[np.float64]
-Radiance: TypeAlias = NDArray[np.float32]
-Depth: TypeAlias = NDArray[np.float32]
 #: Fractional row index of the table `ForwardScatter.kept`, for each pixel.
 Place: TypeAlias = NDArray[np.float32]
 
@@ -69,7 +67,7 @@ class ForwardScatter:
         unscattered = np.exp(-water.scattering_per_m * range_m[:, None])
         weights = level_weights(water.bands, rig.focal_px, levels, range_m)
         self._core = weights[0]
-        self._tables = _tables(weights[1:], _moved(weights[1:], rig.focal_px))
+        self._tables = _tables(weights[1:], rig.focal_px)
         self.kept = np.zeros((SHARE_STEPS + 1, 4), np.float32)
         self.kept[:, :3] = unscattered + weights[0]
         v, u = (np.arange(0.0, n, PLANE_STEP_PX) - (n - 1) / 2 for n in (rig.height_px, rig.width_px))
@@ -93,10 +91,8 @@ class ForwardScatter:
     def add(self, floor: Radiance, place: Place, around: tuple[Radiance, Place], light: Radiance) -> None:
         """Adds the blurred light of the floor, without the core of the kernel (see `kept`), to `light` in place.
 
-        Args:
-            floor: (H, W, 3) light of the floor, attenuated by absorption alone [cd/m2].
-            place: fractional row of `kept` for every second pixel in both directions, see `place_of`.
-            around: light and fractional row of the surroundings; their pixels inside the image are overwritten.
+        `floor` (H, W, 3) is attenuated by absorption alone [cd/m2], `place` the fractional row of `kept` for every
+        second pixel in both directions, `around` both for the surroundings, overwritten inside the image.
         """
         grid = self.surroundings
         images: list[Radiance] = [np.asarray(cv2.pyrDown(floor), np.float32)]
@@ -123,17 +119,13 @@ class ForwardScatter:
         in_row_bands(lambda first, end: _add_upsampled(*finest, first, end), len(light))
 
     def spread(self, floor: Radiance, range_m: Array, around: tuple[Radiance, Place]) -> Radiance:
-        """Returns all light (H, W, 3) of the floor scattered between floor and camera [cd/m2], see `add`; a range of
-        inf is valid.
-        """
+        """Returns all light (H, W, 3) of the floor scattered between floor and camera [cd/m2], see `add`."""
         light = (floor * self.core(range_m)).astype(np.float32)
         self.add(floor, np.ascontiguousarray(place_of(range_m)[::2, ::2]), around, light)
         return light
 
     def core(self, range_m: Array) -> Array:
-        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel; a range of inf is
-        valid.
-        """
+        """Returns the share (H, W, 3) of the floor's light that is scattered by less than a pixel."""
         place, rows = place_of(range_m), np.arange(SHARE_STEPS + 1)
         return np.stack([np.interp(place, rows, of_band) for of_band in self._core.T], axis=-1)
 
@@ -145,24 +137,18 @@ def place_of(range_m: Array) -> Place:
 
 
 def level_sigma_px(level: int) -> float:
-    """Returns the standard deviation of the blur of a pyramid level [px].
-
-    Each step of downsampling and of upsampling adds the variance of its filter.
-    """
+    """Returns the standard deviation of the blur of a pyramid level [px], the sum of the variances of its filters."""
     return float(np.sqrt(2 * (4.0**level - 1) / 3))
 
 
 @lru_cache(maxsize=64)
-def level_weights_of(bands: tuple[Absorbed, ...], focal_px: float, levels: int) -> Array:
-    """Returns the weights (levels + 1, 3, nodes) of the pyramid levels in the kernel of the blur at `NODES_M`.
-
-    Level 0 is light scattered by less than a pixel.
-    """
+def level_weights_of(bands: tuple[BandWater, ...], focal_px: float, levels: int) -> Array:
+    """Returns the weights (levels + 1, 3, nodes) of the levels of the kernel at `NODES_M`; level 0: below a pixel."""
     sigmas = tuple(level_sigma_px(level) / focal_px for level in range(levels + 1))
     return np.array([camera_mixture(band, NODES_M, sigmas).T for band in bands]).swapaxes(0, 1)
 
 
-def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, range_m: Array) -> Array:
+def level_weights(bands: tuple[BandWater, ...], focal_px: float, levels: int, range_m: Array) -> Array:
     """Returns the weights (levels + 1, n, 3) of the levels of the kernel of scattered light at ranges (n,) [m]."""
     nodes = level_weights_of(bands, focal_px, levels)
     rows = [
@@ -173,14 +159,12 @@ def level_weights(bands: tuple[Absorbed, ...], focal_px: float, levels: int, ran
 
 
 def n_px_at(n_px: int, level: int) -> int:
-    """Returns the number of pixels of a side of an image at a level of its pyramid."""
     for _ in range(level):
         n_px = (n_px + 1) // 2
     return n_px
 
 
 def _surroundings(rig: StereoRig) -> Surroundings:
-    """Returns the coarse grid that covers an image and the floor around it."""
     level = max(round(np.log2(SURROUNDINGS_STEP_TAN * rig.focal_px)), 1)
     side = 2.0**level
     half = max(rig.width_px, rig.height_px) / 2 / side
@@ -198,22 +182,17 @@ def _plane_terms(x: NDArray[np.floating], y: NDArray[np.floating]) -> Array:
     return np.column_stack([np.ones(across.size), across.ravel(), down.ravel()]).astype(np.float64)
 
 
-def _moved(weights: Array, focal_px: float) -> Array:
-    """Returns the change (levels, n, 3) of the weights if all light of each narrow level moves to the next wider one.
+def _tables(weights: Array, focal_px: float) -> NDArray[np.float32]:
+    """Returns the tables (levels, n, 8) of `_weigh`: the weights (levels, n, 3) and a zero, their changes and a zero.
 
-    Narrow levels are those whose blur has a standard deviation of at most `WIDENED_TAN` focal lengths; the last level
-    does not count as narrow.
+    Changes are those if all light of narrow levels (up to `WIDENED_TAN` focal lengths, not the last) moves to the next.
     """
     leaves = np.array([level_sigma_px(k + 1) <= WIDENED_TAN * focal_px for k in range(len(weights))])
     leaves[-1] = False
     leaving = weights * leaves[:, None, None]
-    return np.concatenate([np.zeros_like(weights[:1]), leaving[:-1]]) - leaving
-
-
-def _tables(weights: Array, moved: Array) -> NDArray[np.float32]:
-    """Returns the weights (levels, n, 3) and their changes (levels, n, 3) as the tables (levels, n, 8) of `_weigh`."""
     tables = np.zeros((*weights.shape[:2], 8), np.float32)
-    tables[..., :3], tables[..., 4:7] = weights, moved
+    tables[..., :3] = weights
+    tables[..., 4:7] = np.concatenate([np.zeros_like(weights[:1]), leaving[:-1]]) - leaving
     return tables
 
 
@@ -230,7 +209,6 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
 
 @kernel(error_model="numpy")
 def _fit_plane(depth, fit, terms, range_per_depth, plane, place):
-    """Fills `plane` and `place` with the results of `ForwardScatter.plane`."""
     one, two, three, k = 0.0, 0.0, 0.0, 0
     for v in range(0, depth.shape[0], PLANE_STEP_PX):
         for u in range(0, depth.shape[1], PLANE_STEP_PX):
@@ -271,10 +249,9 @@ def _weigh(image, place, table, widening, wider):
 
 @kernel(error_model="numpy", fastmath={"contract"})
 def _add_upsampled(small, light, first, end):
-    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows `first` to `end` - 1 of `light` (H, 3 W).
+    """Adds an image, upsampled to twice its size as by `cv2.pyrUp`, to rows of `light` (H, 3 W).
 
-    Along each axis, the filter of the even pixels is (1, 6, 1) / 8 and that of the odd pixels (1, 1) / 2. Rows before
-    the first one are mirrored, and the last row is repeated. The same holds for columns.
+    The filters are (1, 6, 1) / 8 and (1, 1) / 2; rows and columns before the first are mirrored, the last is repeated.
     """
     last, width = small.shape[0] - 1, light.shape[1] // 3
     cols = small.shape[1] // 3

@@ -5,14 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.imaging.light.sun_sky import SunSky, direction_to_sun
 from twin.imaging.light.water import Medium, downwelling_per_m, medium
 from twin.scenario.model import Scenario, SunConfig
-
-Array = NDArray[np.float64]
 
 
 class Daylight(NamedTuple):
@@ -43,9 +41,7 @@ def illumination_of(scenario: Scenario) -> Illumination:
     lamps and for the blur, the slant path from the surface to the reference plane for daylight. The loss of daylight
     between floor and camera makes the transmission of the whole path exact.
 
-    Raises:
-        TwinError: the water is invalid (see `medium`), the planned altitude is not below the surface, or caustics are
-            requested without a surface.
+    Raises TwinError where the water is invalid (see `medium`), or as `daylight_at`.
     """
     altitude_m, sun, scattering = scenario.plan.altitude_m, scenario.sun, scenario.imaging.scattering
     water = water_to_floor_and_back(scenario)
@@ -59,16 +55,12 @@ def illumination_of(scenario: Scenario) -> Illumination:
 
 
 def water_to_floor_and_back(scenario: Scenario) -> Medium:
-    """Returns the optical properties of the water on a path from the planned altitude to the floor and back.
-
-    The light is that of LED lamps; without lamps of an intensity above 0, it is daylight.
-    """
+    """Returns the water for the path from planned altitude to floor and back, for LED lamps or else daylight."""
     light = "led" if any(lamp.intensity_cd for lamp in scenario.lamps) else "daylight"
     return medium(scenario.water, scenario.imaging.scattering, path_m=2 * scenario.plan.altitude_m, light=light)
 
 
 def _source(sun: SunConfig) -> SunSky:
-    """Returns sun and sky just below the surface."""
     return SunSky(direction_to_sun(sun.elevation_deg, sun.azimuth_deg), sun.sky_share)
 
 
@@ -77,11 +69,7 @@ def daylight_at(
 ) -> Daylight:
     """Returns the daylight for cameras at `altitude_m` above the reference plane, attenuated by the water above them.
 
-    Args:
-        absorption_from_floor_per_m: (3,) absorption coefficient between floor and camera; None: that of `water`.
-
-    Raises:
-        TwinError: the altitude is not below the surface, or caustics are requested without a surface.
+    Raises TwinError where the altitude is not below the surface, or caustics are requested without a surface.
     """
     surface_lx = np.full(3, sun.illuminance_lx)
     source = _source(sun)
@@ -92,9 +80,8 @@ def daylight_at(
             raise TwinError("sun.caustics", f"{sun.caustics:g}: there is no surface", "0, or set sun.depth_m")
         return Daylight(surface_lx, surface_lx, np.zeros(3), 0.0, 0.0, 0.0, *of_water)
     if altitude_m >= sun.depth_m:
-        raise TwinError(
-            "sun.depth_m", f"{sun.depth_m:g}: the cameras are above the surface", f"more than {altitude_m:g}"
-        )
+        reason = f"{sun.depth_m:g}: the cameras are above the surface"
+        raise TwinError("sun.depth_m", reason, f"more than {altitude_m:g}")
     per_m, camera_depth_m = downwelling_per_m(water, source.mean_cosine), sun.depth_m - altitude_m
     illuminance_lx = sun.illuminance_lx * np.exp(-per_m * camera_depth_m)
     return Daylight(surface_lx, illuminance_lx, per_m, sun.depth_m, camera_depth_m, sun.caustics, *of_water)

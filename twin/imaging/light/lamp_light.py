@@ -5,8 +5,7 @@ A lamp of intensity I(theta) causes, at the distance d on a plane perpendicular 
     (I(theta) exp(-c d) + S(theta, d)) / d^2,
 
 with c the attenuation and S = exp(-a d) times the beam convolved with the kernel of `spread.lamp_mixture`; S is 0 with
-single scattering. Light that floor and water send back to the floor is neglected, and so are shadows in scattered
-light.
+single scattering. Light that floor and water send back and shadows in scattered light are neglected.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.imaging.light.lamps import LightSources, beam_share
-from twin.imaging.light.phase_function import phase_at
+from twin.imaging.light.phase_function import BandWater
 from twin.imaging.light.shading import RANGE_SCALE_M
-from twin.imaging.light.spread import LAMP_SIGMA_RAD, NODES_M, Absorbed, Receiver, lamp_mixture, over_path, ring_shares
+from twin.imaging.light.spread import LAMP_SIGMA_RAD, NODES_M, Receiver, lamp_mixture, over_path, ring_shares
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 
-Array = NDArray[np.float64]
 Beam: TypeAlias = tuple[tuple[float, ...], ...]
 
 LAMP_RADIUS_M = 0.03  # shortest distance to a lamp: the radius of its housing
@@ -34,16 +33,12 @@ RINGS, AZIMUTHS = 120, 24  # rings around the straight path, and directions on o
 
 
 class LampLight:
-    """Light of the lamps on particles in the water, at points in the axes of one camera.
-
-    See `floor_tables` for their light on the floor.
-    """
+    """Light of the lamps on particles in the water, in the axes of one camera."""
 
     def __init__(self, sources: LightSources, water: Medium):
         self.sources, self._water = sources, water
-        self._tables = (
-            [_light(beam, water, "particle")[1] for beam in sources.beam] if water.scatters_repeatedly else None
-        )
+        soft = water.scatters_repeatedly
+        self._tables = [_light(beam, water, "particle")[1] for beam in sources.beam] if soft else None
 
     def lux(self, lamp: int, points: Array) -> tuple[Array, Array]:
         """Returns the light (..., 3) of a lamp on particles for R, G, B [lx], and unit directions (..., 3) from it.
@@ -65,29 +60,15 @@ class LampLight:
         share = beam_share(from_lamp @ axis, sources.beam[lamp])[..., None]
         return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
 
-    def scattered_once_per_m(self, points: Array, ray: Array) -> Array:
-        """Returns the light (..., n, 3) scattered into a ray to the camera, before its loss on the way [cd/m3].
 
-        Args:
-            points: (..., n, 3) points of the ray in the axes of the camera [m].
-            ray: (..., 3) unit direction from the camera.
-        """
-        total = np.zeros(points.shape)
-        for lamp in range(len(self.sources.intensity_cd)):
-            lux, from_lamp = self.lux(lamp, points)
-            lux *= phase_at(self._water.scatterers, -(from_lamp @ ray[..., None])[..., 0])
-            total += lux
-        return total * self._water.scattering_per_m
-
-
-def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32] | None:
+def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32]:
     """Returns the light of each lamp on a floor (lamps, 2, n, m, 4), relative to `LightSources.intensity_cd`.
 
     Axes: lamp; scattered light S, then all light, I exp(-c d) + S; even steps of sqrt(1 - cos(angle)) and of d / (d +
-    RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. None in water without multiple scattering, and without lamps.
+    RANGE_SCALE_M), each from 0 to 1; R, G, B, 0. Empty in water without multiple scattering, and without lamps.
     """
     if not (water.scatters_repeatedly and len(sources.beam)):
-        return None
+        return np.zeros((0, 2, 0, 0, 4), np.float32)
     return with_a_zero(np.array([_light(beam, water, "floor") for beam in sources.beam]))
 
 
@@ -100,21 +81,16 @@ def _light(beam: Array, water: Medium, receiver: Receiver) -> tuple[Array, Array
     """Returns S and I exp(-c d) + S, the scattered light and all light of a lamp, relative to its `intensity_cd`."""
     at = np.linspace(0, SOFT_STEPS, ANGLE_STEPS + 1)
     low = np.minimum(at.astype(int), SOFT_STEPS - 1)
-    coarse = _softened(beam, water, receiver)
+    coarse = _softened(tuple(map(tuple, beam.tolist())), water.bands, receiver)
     soft = coarse[low] + (at - low)[:, None, None] * (coarse[low + 1] - coarse[low])
     share, every = beam_share(1 - np.linspace(0.0, 1.0, ANGLE_STEPS + 1) ** 2, beam), soft.copy()
     every[:, :-1] += share[:, None, None] * np.exp(-water.attenuation_per_m * _path_m()[:, None])
     return soft, every
 
 
-def _softened(beam: Array, water: Medium, receiver: Receiver) -> Array:
-    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp with a given beam table (m, 2)."""
-    return _softened_of(tuple(map(tuple, beam.tolist())), water.bands, receiver)
-
-
 @lru_cache(maxsize=64)
-def _softened_of(beam: Beam, bands: tuple[Absorbed, ...], receiver: Receiver) -> Array:
-    """Returns the result of `_softened`; the arguments are hashable, for the cache."""
+def _softened(beam: Beam, bands: tuple[BandWater, ...], receiver: Receiver) -> Array:
+    """Returns the scattered light S (SOFT_STEPS + 1, PATH_STEPS + 1, 3) of a lamp; the arguments are hashable."""
     rings, path_m = _on_rings(beam), _path_m()
     out = np.zeros((SOFT_STEPS + 1, PATH_STEPS + 1, 3))
     for k, band in enumerate(bands):
@@ -145,7 +121,6 @@ def _on_rings(beam: Beam) -> Array:
 
 @kernel(error_model="numpy", fastmath={"arcp", "contract"})
 def _from_table(points, position, axis, strength, table, lux, from_lamp):
-    """Fills `lux` (n, 3) and `from_lamp` (n, 3) for points (n, 3), see `LampLight.lux`."""
     rows, cols = table.shape[0] - 1, table.shape[1] - 1
     for k in range(points.shape[0]):
         x, y, z = points[k, 0] - position[0], points[k, 1] - position[1], points[k, 2] - position[2]

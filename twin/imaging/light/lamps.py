@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import StereoRig
+from twin.core.records import Array, StereoRig
 from twin.errors import TwinError
 from twin.imaging.light.illumination import Daylight
 from twin.imaging.light.spectra import NM, band_weights
 from twin.scenario.model import LampConfig
-
-Array = NDArray[np.float64]
 
 #: Measured beam of an LED lamp: angle from the axis [deg], intensity relative to the axis (Song et al. 2021).
 LED_BEAM = (
@@ -43,35 +40,23 @@ class LightSources(NamedTuple):
 def light_sources_in_camera(
     rig: StereoRig, lamps: Sequence[LampConfig], daylight: Daylight, camera: int
 ) -> LightSources:
-    """Returns the lamps, which are fixed to the body, in the axes of a camera, with the daylight.
-
-    Args:
-        camera: 0 left, 1 right.
-
-    Raises:
-        TwinError: the angles of a beam table do not start at 0, or do not increase.
-    """
+    """Returns lamps in axes of a camera (0 left, 1 right) and daylight; TwinError unless beam angles rise from 0."""
     camera_from_body = geometry.inverse(rig.body_from_camera @ (rig.left_from_right if camera else np.eye(4)))
     position = np.array([lamp.position_m for lamp in lamps]).reshape(-1, 3)
-    axis = np.array([_beam_axis(lamp) for lamp in lamps]).reshape(-1, 3)
-    return LightSources(
-        geometry.transform(camera_from_body, position),
-        axis @ camera_from_body[:3, :3].T,
-        np.array([lamp.intensity_cd for lamp in lamps]),
-        np.array([colour(lamp.colour_temperature_k) for lamp in lamps]).reshape(-1, 3),
-        tuple(_beam(k, lamp) for k, lamp in enumerate(lamps)),
-        daylight,
-    )
+    axis = np.array([_beam_axis(lamp) for lamp in lamps]).reshape(-1, 3) @ camera_from_body[:3, :3].T
+    intensity = np.array([lamp.intensity_cd for lamp in lamps])
+    colours = np.array([colour(lamp.colour_temperature_k) for lamp in lamps]).reshape(-1, 3)
+    beams = tuple(_beam(k, lamp) for k, lamp in enumerate(lamps))
+    return LightSources(geometry.transform(camera_from_body, position), axis, intensity, colours, beams, daylight)
 
 
 def _beam_axis(lamp: LampConfig) -> Array:
-    """Returns the beam axis (3,), a unit vector in body axes: down, tilted towards the bow and panned towards port."""
+    """Returns the unit vector (3,) of the beam in body axes: down, tilted towards the bow and panned towards port."""
     tilt, pan = np.deg2rad([lamp.tilt_deg, lamp.pan_deg])
     return np.array([np.sin(tilt), np.cos(tilt) * np.sin(pan), -np.cos(tilt) * np.cos(pan)])
 
 
 def _beam(number: int, lamp: LampConfig) -> Array:
-    """Returns the beam table (m, 2) of a lamp. Raises TwinError if its angles do not start at 0 or do not increase."""
     table = np.array(lamp.beam or LED_BEAM)
     if table[0, 0] != 0 or not (np.diff(table[:, 0]) > 0).all():
         raise TwinError(f"lamps.{number}.beam", "angles do not increase from 0", "as in [[0, 1], [30, 0.7], [60, 0]]")

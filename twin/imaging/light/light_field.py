@@ -15,16 +15,15 @@ line of sight uses the phase function itself (Nakajima & Tanaka 1988, ibid. 40, 
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import eval_legendre, factorial, lpmv, poch
 
-from twin.imaging.light.phase_function import PhaseTable
+from twin.core.geometry import Array
+from twin.imaging.light.phase_function import BandWater, PhaseTable, table_of
 from twin.imaging.light.sun_sky import CRITICAL_COSINE, SunSky, sky_radiance
-
-Array = NDArray[np.float64]
 
 ORDERS = 32  # number L of Legendre moments
 NODES = 11, 9  # quadrature nodes outside the cone of the sky, and within it
@@ -35,28 +34,11 @@ LEAST_ABSORPTION = 1e-6  # per unit of scattering: without absorption two eigenv
 _SLOPES = np.deg2rad(np.linspace(0.0, STEEPEST_DEG, 16)), np.deg2rad(np.linspace(0.0, 180.0, 13))
 
 
-class BandOptics(NamedTuple):
-    """Optical properties of the water in one colour band."""
-
-    absorption_per_m: float  # absorption coefficient a [1/m]
-    scattering_per_m: float  # scattering coefficient b [1/m]
-    phase: PhaseTable  # table of the phase function
-
-
-class _Scaled(NamedTuple):
-    """Water without the forward peak: attenuation and scattering coefficients, and the remaining moments (ORDERS,)."""
-
-    attenuation_per_m: float
-    scattering_per_m: float
-    moments: Array
-
-
 class _Mode(NamedTuple):
     """Solutions of one term of the series in azimuth."""
 
     decay_per_m: Array  # (n,) eigenvalues
-    # (n, n) downwelling and upwelling parts of the decaying eigenvectors, as columns; the growing ones have these parts
-    # exchanged
+    # (n, n) parts of the decaying eigenvectors, as columns; the growing ones have these parts exchanged
     down: Array
     up: Array
     beam_down: Array  # (n,) particular solution at depth 0
@@ -71,30 +53,29 @@ def legendre_moments(phase: PhaseTable, orders: int) -> Array:
     P_l is the Legendre polynomial of degree l, and mu the cosine of the scattering angle. The integral is computed by
     the midpoint rule over the cells of the table.
     """
-    cells = len(phase.density_per_sr)
+    share = np.diff(phase.cumulative)
+    return np.array([share @ values for values in _polynomials(len(share), orders)])
+
+
+@cache
+def _polynomials(cells: int, orders: int) -> Array:
+    """Returns the Legendre polynomials (orders + 1, cells) in the middle of the cells of a phase table."""
     edges = np.linspace(0.0, 1.0, cells + 1) ** 4
     middle = 1 - (edges[1:] + edges[:-1])
-    share = np.diff(phase.cumulative)
-    return np.array([share @ eval_legendre(order, middle) for order in range(orders + 1)])
+    return np.array([eval_legendre(order, middle) for order in range(orders + 1)])
 
 
 class LightField:
-    """Radiance of daylight in water over a black floor, for 1 lx just below the surface, in `modes` terms of azimuth.
+    """Radiance of daylight in water over a black floor, for 1 lx below the surface, in `modes` terms of azimuth."""
 
-    One term is used for a sun at the zenith or without a beam.
-    """
-
-    def __init__(self, water: BandOptics, daylight: SunSky, modes: int):
+    def __init__(self, water: BandWater, daylight: SunSky, modes: int):
         self._water, self._daylight = water, daylight
         self._scaled = _without_peak(water)
+        #: attenuation of the beam with depth [1/m]; light scattered within the forward peak counts as beam
+        self.beam_per_m = self._scaled[0] / daylight.sun_cosine
         self._cosine, self._weight = _quadrature()
         count = modes if daylight.sun_cosine < 1 - 1e-9 and daylight.sky_share < 1 else 1
         self._modes = [self._mode(m) for m in range(count)]
-
-    @property
-    def beam_per_m(self) -> float:
-        """Attenuation of the sun's beam with depth [1/m]; light scattered within the forward peak counts as beam."""
-        return self._scaled.attenuation_per_m / self._daylight.sun_cosine
 
     def scattered(self, depth_m: float, floor_m: float) -> tuple[Array, Array]:
         """Returns the downwelling and the upwelling radiance without the beam, (modes, nodes) each [cd/m2]."""
@@ -136,7 +117,6 @@ class LightField:
         return np.array([self._veil_of(m, mode, depth_m, cosine, floor_m) for m, mode in enumerate(self._modes)])
 
     def _mode(self, m: int) -> _Mode:
-        """Returns the solutions for term m of the cosine series in azimuth, m from 0."""
         c, b, chi = self._scaled
         mu, weight, order = self._cosine, self._weight, np.arange(m, ORDERS, dtype=np.float64)
         root = np.sqrt(2 * order + 1)[:, None]
@@ -172,10 +152,7 @@ class LightField:
         return np.asarray(np.linalg.solve(system, given[..., None])[..., 0], np.float64)
 
     def _at(self, mode: _Mode, floor_m: Array, depth_m: float) -> tuple[Array, Array]:
-        """Returns the downwelling and the upwelling radiance of one term of the azimuth series, each (floors, nodes).
-
-        The radiance is that at the depth `depth_m`, without the beam of the sun.
-        """
+        """Returns down- and upwelling radiance, (floors, nodes) each, of one term without the beam at a depth."""
         n, weights = mode.decay_per_m.size, self._coefficients(mode, floor_m)
         decaying = weights[:, :n] * np.exp(-mode.decay_per_m * depth_m)
         growing = weights[:, n:] * np.exp(-mode.decay_per_m * (floor_m[:, None] - depth_m))
@@ -184,16 +161,10 @@ class LightField:
         return down, decaying @ mode.up.T + growing @ mode.down.T + beam * mode.beam_up
 
     def _veil_of(self, m: int, mode: _Mode, depth_m: float, cosine: Array, floor_m: Array) -> Array:
-        """Returns term m (views, floors) of `veil`: the light scattered into the lines of sight, integrated over depth.
-
-        `mode` has the solutions of this term; the other arguments are those of `veil`.
-        """
+        """Returns term m (views, floors) of `veil`: light scattered into the lines of sight, integrated over depth."""
         c, b, chi = self._scaled
-        n, weights, order = (
-            mode.decay_per_m.size,
-            self._coefficients(mode, floor_m),
-            np.arange(m, ORDERS, dtype=np.float64),
-        )
+        n, order = mode.decay_per_m.size, np.arange(m, ORDERS, dtype=np.float64)
+        weights = self._coefficients(mode, floor_m)
         to_view = np.sqrt(2 * order + 1)[:, None] * _legendre(order[:, None], m, cosine)
         parity = (-1.0) ** (order - m)
         back = b / 2 * (to_view.T * (chi[m:] * parity)) @ mode.kernel * self._weight  # (views, nodes)
@@ -217,27 +188,27 @@ class LightField:
         mu0 = self._daylight.sun_cosine
         sines = np.sqrt(1 - cosine**2) * np.sqrt(1 - mu0**2)
         angle = np.arccos(np.clip(-cosine[:, None] * mu0 + sines[:, None] * np.cos(azimuth), -1.0, 1.0))
-        density = self._water.phase.density_per_sr
+        density = table_of(self._water.scatterer).density_per_sr
         cell = np.sqrt(np.sin(angle / 2)) * len(density)
         values = np.interp(cell, np.arange(len(density)) + 0.5, density)
         term = (2 - (m == 0)) * (values * np.cos(m * azimuth)).mean(1)
         return self._water.scattering_per_m * self._daylight.beam_lx * term
 
 
-def _without_peak(water: BandOptics) -> _Scaled:
-    """Returns the water without the forward peak of its phase function, a narrow Gaussian (delta-M+).
+def _without_peak(water: BandWater) -> tuple[float, float, Array]:
+    """Returns attenuation, scattering and moments (ORDERS,) without the forward peak, a narrow Gaussian (delta-M+).
 
     The peak has the moments f exp(-l^2 / (2 s^2)), with f and s such that the remaining moments reach 0 with slope 0 at
     l = `ORDERS`; another slope (delta-M) makes the radiance oscillate by up to 6 %.
     """
-    chi, b = legendre_moments(water.phase, ORDERS + 1), water.scattering_per_m
+    chi, b = legendre_moments(table_of(water.scatterer), ORDERS + 1), water.scattering_per_m
     peak = np.zeros(ORDERS)
     if chi[ORDERS] > LEAST_PEAK and chi[ORDERS + 1] > 0:
         per_order2 = max(np.log(chi[ORDERS] / chi[ORDERS + 1]), 0.0) / (2 * ORDERS + 1)
         peak = chi[ORDERS] * np.exp(per_order2 * (ORDERS**2 - np.arange(ORDERS) ** 2))
     b_rest = (1 - peak[0]) * b
     a = max(water.absorption_per_m, LEAST_ABSORPTION * b, 1e-9)
-    return _Scaled(a + b_rest, b_rest, (chi[:ORDERS] - peak) / (1 - peak[0]))
+    return a + b_rest, b_rest, (chi[:ORDERS] - peak) / (1 - peak[0])
 
 
 def _quadrature() -> tuple[Array, Array]:
@@ -256,11 +227,7 @@ def _legendre(order: Array | int, m: int, cosine: Array) -> Array:
 
 
 def _cosine_moment(order: int) -> float:
-    """Returns the Legendre moment of Lambert's cosine for order 1 or an even order.
-
-    These are 2 pi / 3 for order 1, and pi, pi / 4, -pi / 24, ... for the orders 0, 2, 4, ...; the moments of the other
-    odd orders are 0.
-    """
+    """Returns the Legendre moment of Lambert's cosine: 2 pi / 3 for order 1, pi, pi / 4, -pi / 24 ... for even ones."""
     if order == 1:
         return 2 * np.pi / 3
     half = order // 2

@@ -1,8 +1,4 @@
-"""Phase functions of sea water: molecular, Petzold's average particle, Fournier-Forand, Henyey-Greenstein, mixtures.
-
-A phase function p(angle) is the share of the scattered light per unit of solid angle [1/sr]; it integrates to 1 over
-the sphere. `tabulate` returns a table of it, for fast evaluation and random sampling.
-"""
+"""Phase functions of sea water: the share of scattered light per unit of solid angle [1/sr], which integrates to 1."""
 
 from __future__ import annotations
 
@@ -11,13 +7,10 @@ from functools import lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-#: Phase function [1/sr] of the scattering angle [rad], for angles of any shape.
-PhaseFunction = Callable[[Array], Array]
+from twin.core.geometry import Array
 
-CELLS = 4096  # number of cells of a table of `tabulate`
+CELLS = 4096  # number of cells of a table
 _GAUSS = np.polynomial.legendre.leggauss(6)
 MOLECULAR_PER_M, MOLECULAR_NM, MOLECULAR_EXPONENT = 0.00288, 500.0, 4.32  # see `molecular_scattering_per_m`
 
@@ -43,27 +36,13 @@ PETZOLD_INTEGRAL = 0.997385
 
 
 class PhaseTable(NamedTuple):
-    """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4), narrow where it is steep.
-
-    The Monte Carlo reference evaluates and samples this piecewise constant function.
-    """
+    """A phase function, constant in n cells of equal width in ((1 - cos(angle)) / 2)^(1/4), narrow where steep."""
 
     density_per_sr: Array  # (n,) mean of the phase function over each cell
     cumulative: Array  # (n + 1,) share of the scattered light whose scattering angle is below each cell boundary
     cumulative_angle: Array  # (n + 1,) integral of density times angle up to each boundary, divided by `angle_integral`
     angle_integral: float  # integral of density times angle from 0 to pi [rad^2/sr]
-
-    @property
-    def mean_cosine(self) -> float:
-        """Mean cosine g of the scattering angle."""
-        cosine = 1 - 2 * np.linspace(0.0, 1.0, len(self.cumulative)) ** 4
-        return float((np.diff(self.cumulative) * (cosine[1:] + cosine[:-1]) / 2).sum())
-
-    @property
-    def beyond(self) -> Array:
-        """Integral (n + 1,) of the density over the angle, from each cell boundary to pi [rad/sr]."""
-        angle = 2 * np.arcsin(np.linspace(0.0, 1.0, len(self.cumulative)) ** 2)
-        return np.concatenate([np.cumsum((self.density_per_sr * np.diff(angle))[::-1])[::-1], [0.0]])
+    beyond: Array  # (n + 1,) integral of the density over the angle, from each cell boundary to pi [rad/sr]
 
 
 ParticleFunction = Literal["petzold", "fournier_forand", "henyey_greenstein"]
@@ -78,6 +57,14 @@ class Scatterer(NamedTuple):
     parameters: tuple[float, ...] = ()
 
 
+class BandWater(NamedTuple):
+    """Optical properties of the water in one colour band."""
+
+    absorption_per_m: float  # absorption coefficient a [1/m]
+    scattering_per_m: float  # scattering coefficient b [1/m]
+    scatterer: Scatterer = Scatterer()  # molecules and particles that scatter the light
+
+
 def molecular(angle: Array) -> Array:
     """Returns the phase function of pure sea water [1/sr] (Morel 1974; Mobley 1994, eq. 3.30)."""
     return 3 / (4 * np.pi * (3 + 0.835)) * (1 + 0.835 * np.cos(angle) ** 2)
@@ -89,10 +76,7 @@ def molecular_scattering_per_m(wavelength_nm: Array) -> Array:
 
 
 def petzold(angle: Array) -> Array:
-    """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`.
-
-    It is normalised over the sphere, and extrapolated below the first angle with the slope of the first interval.
-    """
+    """Returns the phase function of Petzold's average particle [1/sr]: log-log interpolation of the table `PETZOLD`."""
     log_angle, log_density = np.log(np.deg2rad([row[0] for row in PETZOLD])), np.log([row[1] for row in PETZOLD])
     wanted = np.log(np.maximum(angle, 1e-12))
     slope = (log_density[1] - log_density[0]) / (log_angle[1] - log_angle[0])
@@ -100,80 +84,58 @@ def petzold(angle: Array) -> Array:
     return np.exp(np.interp(wanted, log_angle, log_density) + below) / PETZOLD_INTEGRAL
 
 
-def henyey_greenstein(mean_cosine: float) -> PhaseFunction:
+def henyey_greenstein(angle: Array, mean_cosine: float) -> Array:
     """Returns the phase function of Henyey & Greenstein (1941) with the mean cosine g, -1 < g < 1."""
     g = mean_cosine
-
-    def density(angle: Array) -> Array:
-        # (1 - g)^2 + 4 g sin^2(angle / 2) is 1 + g^2 - 2 g cos(angle) without cancellation
-        return (1 - g**2) / (4 * np.pi * ((1 - g) ** 2 + 4 * g * np.sin(angle / 2) ** 2) ** 1.5)
-
-    return density
+    # (1 - g)^2 + 4 g sin^2(angle / 2) is 1 + g^2 - 2 g cos(angle) without cancellation
+    return (1 - g**2) / (4 * np.pi * ((1 - g) ** 2 + 4 * g * np.sin(angle / 2) ** 2) ** 1.5)
 
 
-def fournier_forand(index: float, slope: float) -> PhaseFunction:
+def fournier_forand(angle: Array, index: float, slope: float) -> Array:
     """Returns the phase function of Fournier & Forand (1994), in the form of Mobley et al. (2002, Appl. Opt. 41, 1035).
 
     `index` of the particles relative to water is above 1, `slope` of the size distribution from 3 to 5.
     """
-    nu = (3 - slope) / 2
-
-    def delta(sine2: Array | float) -> Array:
-        return np.asarray(4 / (3 * (index - 1) ** 2) * sine2)
-
-    def density(angle: Array) -> Array:
-        sine2 = np.maximum(np.sin(angle / 2) ** 2, 1e-16)
-        d = delta(sine2)
-        d = np.where(np.abs(d - 1) < 1e-4, 1 + 1e-4, d)  # the formula is 0/0 at d = 1, where p is smooth
-        power, end = d**nu, delta(1.0)
-        forward = nu * (1 - d) - (1 - power) + (d * (1 - power) - nu * (1 - d)) / sine2
-        backward = (1 - end**nu) / (16 * np.pi * (end - 1) * end**nu) * (3 * np.cos(angle) ** 2 - 1)
-        return forward / (4 * np.pi * (1 - d) ** 2 * power) + backward
-
-    return density
+    nu, end = (3 - slope) / 2, np.asarray(4 / (3 * (index - 1) ** 2))
+    sine2 = np.maximum(np.sin(angle / 2) ** 2, 1e-16)
+    d = end * sine2
+    d = np.where(np.abs(d - 1) < 1e-4, 1 + 1e-4, d)  # the formula is 0/0 at d = 1, where p is smooth
+    power = d**nu
+    forward = nu * (1 - d) - (1 - power) + (d * (1 - power) - nu * (1 - d)) / sine2
+    backward = (1 - end**nu) / (16 * np.pi * (end - 1) * end**nu) * (3 * np.cos(angle) ** 2 - 1)
+    return forward / (4 * np.pi * (1 - d) ** 2 * power) + backward
 
 
-def mixture(particles: PhaseFunction, molecular_share: float) -> PhaseFunction:
-    """Returns the phase function of water whose molecules cause the share `molecular_share` of its scattering."""
-    return lambda angle: molecular_share * molecular(angle) + (1 - molecular_share) * particles(angle)
+_OF_PARTICLES: dict[ParticleFunction, Callable[..., Array]] = {
+    "petzold": petzold, "fournier_forand": fournier_forand, "henyey_greenstein": henyey_greenstein
+}  # fmt: skip
 
 
-def tabulate(phase: PhaseFunction) -> PhaseTable:
+def phase_of(scatterer: Scatterer, angle: Array) -> Array:
+    """Returns the phase function [1/sr] of molecules and particles at scattering angles of any shape [rad]."""
+    share, particles = scatterer.molecular_share, _OF_PARTICLES[scatterer.particles]
+    return share * molecular(angle) + (1 - share) * particles(angle, *scatterer.parameters)
+
+
+@lru_cache(maxsize=64)
+def table_of(scatterer: Scatterer) -> PhaseTable:
     """Returns the table of a phase function, normalised to an integral of 1 over the sphere."""
     edges = np.linspace(0.0, 1.0, CELLS + 1)
     angle = 2 * np.arcsin(edges**2)
     middle, half = (edges[1:] + edges[:-1]) / 2, (edges[1:] - edges[:-1]) / 2
     x = middle[:, None] + half[:, None] * _GAUSS[0]
-    light = phase(2 * np.arcsin(x**2)) * 16 * np.pi * x**3  # d(solid angle) = 16 pi x^3 dx
+    light = phase_of(scatterer, 2 * np.arcsin(x**2)) * 16 * np.pi * x**3  # d(solid angle) = 16 pi x^3 dx
     share = (light * _GAUSS[1]).sum(1) * half
     share /= share.sum()
     density = share / (4 * np.pi * np.diff(edges**4))
     cumulative = np.concatenate([[0.0], np.cumsum(share)])
     weighted = np.concatenate([[0.0], np.cumsum(density * np.diff(angle**2) / 2)])
-    return PhaseTable(density, cumulative / cumulative[-1], weighted / weighted[-1], float(weighted[-1]))
-
-
-def phase_of(scatterer: Scatterer) -> PhaseFunction:
-    """Returns the phase function of the mixture of molecules and particles in one band."""
-    particles: PhaseFunction = petzold
-    if scatterer.particles == "fournier_forand":
-        particles = fournier_forand(*scatterer.parameters)
-    elif scatterer.particles == "henyey_greenstein":
-        particles = henyey_greenstein(*scatterer.parameters)
-    return mixture(particles, scatterer.molecular_share)
-
-
-@lru_cache(maxsize=64)
-def table_of(scatterer: Scatterer) -> PhaseTable:
-    """Returns the table of the phase function of the mixture of molecules and particles in one band, from a cache."""
-    return tabulate(phase_of(scatterer))
+    beyond = np.concatenate([np.cumsum((density * np.diff(angle))[::-1])[::-1], [0.0]])
+    return PhaseTable(density, cumulative / cumulative[-1], weighted / weighted[-1], float(weighted[-1]), beyond)
 
 
 def phase_at(scatterers: tuple[Scatterer, ...], cosine: Array) -> Array:
-    """Returns the phase function (..., n) [1/sr] of each of n scatterers at cosines (...) of the scattering angle.
-
-    It is linear in ((1 - cosine) / 2)^(1/4) between the centres of the cells of the tables.
-    """
+    """Returns the phase function (..., n) [1/sr] of n scatterers at cosines (...), by interpolation of the tables."""
     table = _densities(scatterers)
     at = np.sqrt(np.sqrt(np.maximum((1 - cosine) / 2, 0.0))) * CELLS - 0.5
     at = np.clip(at, 0.0, CELLS - 1.001)
@@ -184,5 +146,4 @@ def phase_at(scatterers: tuple[Scatterer, ...], cosine: Array) -> Array:
 
 @lru_cache(maxsize=64)
 def _densities(scatterers: tuple[Scatterer, ...]) -> Array:
-    """Returns the densities (cells, n) of the tables of n scatterers."""
     return np.stack([table_of(scatterer).density_per_sr for scatterer in scatterers], axis=-1)

@@ -14,8 +14,7 @@ from twin.kernels import kernel
 
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
 RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
-#: Columns and rows, relative to the centre of a pixel, at which it samples the facets of the floor [px]. No two samples
-#: have the same column or the same row.
+#: Columns and rows, each different, relative to the centre of a pixel, at which it samples the facets [px].
 SAMPLES = np.array([(-7, -7), (-5, -1), (-3, 5), (-1, -5), (1, 1), (3, 7), (5, -3), (7, 3)], np.float32) / 16
 
 _FAST = {"contract", "arcp", "nsz", "reassoc"}  # without "ninf": infinite depths must stay valid
@@ -37,20 +36,18 @@ def shade(
         depth: (H, W) depth along the optical axis [m]; inf where there is no floor.
         lamps: (n, 10) position [m], beam axis, intensity [cd] and colour of each lamp, in the axes of the camera.
         beams: (n, m) relative intensity, at even steps of sqrt(1 - cos(angle)) from 0 to 1.
-        soft: (n, 2, k, l, 4) `lamp_light.floor_tables`; empty with single scattering.
+        soft: (n, 2, k, l, 4) `lamp_light.floor_tables`.
         lamp_loss: (3,) attenuation of the unscattered light of lamps on its way to the floor [1/m].
         scatter_table: (rows, cols, ranges, 4) backscatter on a coarse pixel grid, at even steps of r / (r + scale).
         sky: direction to the sun (3,) in the axes of the camera; beam (3, 2) [lx], [1/m], all other daylight (3, 10)
             [lx] and its change with depth (3, 2), as in `daylight.FloorDaylight`, with the quadratic form as xx, yy,
             zz, 2 xy, 2 xz, 2 yz, 2 x, 2 y, 2 z, 1; its reference depth and limits of the fit (3,) [m]; loss with range
-            (2, 3) of lamp light and daylight [1/m]; caustics (m + 1, m + 1) or empty; (3, 4) map from camera axes to
-            column and row of the caustics and depth [m].
-        facets: triangles of the floor (`facets.FacetView`); without normals = normals from the depth.
-        lit: (n, H, W), or (n + 1, H, W) with the sun: 0 where the light is blocked, else 1; empty = no shadows.
+            (2, 3) of lamp light and daylight [1/m]; caustics (m + 1, m + 1); (3, 4) map from camera axes to column and
+            row of the caustics and depth [m].
+        facets, lit, material, objects: see `optics.SceneView`.
         out: (H, W, 3) image, filled with the light of the floor that reaches the camera.
         other: (H, W, 3) image for the backscatter and the share `kept` of the floor; empty: backscatter goes to `out`.
-        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale), or
-            empty.
+        kept: (m, 4) share of the light of the floor that arrives without blur, at even steps of r / (r + scale).
         place: filled with the fractional row of `kept` for every second pixel of every second row.
     """
     height, width = depth.shape
@@ -197,7 +194,6 @@ def _unpacked(stored):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _turned(turn, vector):
-    """Returns the product of a matrix (3, 3) and a vector (x, y, z)."""
     x, y, z = vector
     return (
         turn[0, 0] * x + turn[0, 1] * y + turn[0, 2] * z,
@@ -208,7 +204,6 @@ def _turned(turn, vector):
 
 @kernel(forceinline=True, error_model="numpy")
 def _take_normals(objects, v, normal):
-    """Replaces the unit normals (3, W) of row v by those of the objects, in the pixels that show objects."""
     normals, labels = objects
     for u in range(labels.shape[1]):
         if labels[v, u]:
@@ -313,7 +308,6 @@ def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _attenuate(per_m, range_m, light):
-    """Attenuates `light` (3, W) on the path from the floor to the camera, with the coefficients `per_m` (3,) [1/m]."""
     for c in range(3):
         by_range = -np.float32(LOG2_E) * per_m[c]
         for u in range(range_m.size):
@@ -401,7 +395,7 @@ def _interpolate_rows(table, row, out):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _interpolate_backscatter(table, range_m, lookup, backscatter):
-    """Fills `backscatter` (3, W) for a row of pixels by bilinear interpolation of `table` in column and range."""
+    """Fills `backscatter` (3, W) for a row of pixels by interpolation of `table` in column and range."""
     cols, ranges, _ = table.shape
     one, scale = np.float32(1.0), np.float32(RANGE_SCALE_M)
     n_cols, per_px = np.float32(cols - 1), one / np.float32(range_m.size - 1)
@@ -437,10 +431,9 @@ def _reflect(albedo, light, backscatter, out):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _join(floor, v, kept, place, range_m, backscatter, lookup, out):
-    """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept` of the floor's light (W, 3).
+    """Fills `out` (W, 3), row v of an image, with the backscatter plus the share `kept`, if any, of the floor's light.
 
-    If `kept` is empty, the light of the floor is not added. Otherwise, if v is even, the function also fills row v / 2
-    of `place` with the fractional row of `kept` for every second pixel.
+    If v is even, it also fills row v / 2 of `place` with the fractional row of `kept` for every second pixel.
     """
     of_row, shown = out.reshape(-1), floor.reshape(-1)
     if kept.shape[0] == 0:

@@ -8,21 +8,17 @@ completed by region growing.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
 from twin.core.height_field import rises
-from twin.core.records import StereoRig
+from twin.core.records import Array, Depth, StereoRig
 from twin.core.threads import in_row_bands
 from twin.imaging.light.illumination import Daylight
-from twin.imaging.light.optics import Depth, Lit
+from twin.imaging.light.optics import Lit
 from twin.imaging.scene.facets import Heights
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
 
 BLOCK_CELLS = 8  # side of a block of cells; the highest point of each block is stored
 STRIDE_PX = 8  # spacing along rows and columns of the pixels that are tested besides those around shadows
@@ -31,36 +27,22 @@ SUN_M = 1e5  # distance from the camera of a lamp that stands for the sun: rays 
 BIAS_M = 1e-4  # the floor must be this much higher than a ray to occlude it, as depth is in single precision
 
 
-class _Grid(NamedTuple):
-    """Floor heights prepared for ray casting."""
-
-    height_m: NDArray[np.float32]  # (ny, nx) heights of the grid nodes; row 0 = south, column 0 = west
-    cell_top_m: NDArray[np.float32]  # (ny - 1, nx - 1) height of the highest corner of each cell
-    block_top_m: NDArray[np.float32]  # (rows, cols) height of the highest node of each block of cells
-    west_m: float  # position of the first node
-    south_m: float
-    spacing_m: float  # distance between neighbouring nodes
-
-
 class Shadows:
-    """Shadow casting: determines which pixels each lamp and the sun illuminate.
+    """Shadow casting by the floor on the light of each lamp and the sun.
 
-    Lamps (lamps, 3) are in the axes of the left and right camera, `to_sun` (3,) in those of the floor; None = no
-    shadow.
+    Lamps (n, 3) are in the axes of both cameras, `to_sun` (3,) in those of the floor; None = no shadow.
     """
 
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None = None):
         height = np.ascontiguousarray(floor.height_m, np.float32)
-        self._grid = _Grid(height, *_tops(height), floor.west_m, floor.south_m, floor.spacing_m)
+        # heights of the nodes, highest heights of each cell and of each block of cells; first node, spacing [m]
+        self._grid = height, *_tops(height), floor.west_m, floor.south_m, floor.spacing_m
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
         """Returns masks (lamps, H, W), and one of the sun if it casts shadows: 0 where the floor occludes the light.
 
-        Args:
-            depth: (H, W) float32 depth along the optical axis [m]; inf where there is no floor.
-            world_from_camera: (4, 4) pose of this camera, 0 left or 1 right.
-            label: (H, W) not 0 where the pixel shows an object above the floor; None: all show the floor.
+        `label` (H, W) is not 0 where the pixel shows an object above the floor; None: all show the floor.
         """
         lamps = geometry.transform(world_from_camera, self._lamps[camera])
         if self._to_sun is not None:
@@ -74,10 +56,7 @@ class Shadows:
 
 
 def direction_to_casting_sun(daylight: Daylight) -> Array | None:
-    """Returns the unit direction (3,) to the sun under water, in world axes; None without daylight.
-
-    It is also None for a sun at the zenith, which is assumed to cast no shadow.
-    """
+    """Returns the direction (3,) to the sun under water, in world axes; None without daylight, and at the zenith."""
     slanted = daylight.surface_lx.any() and daylight.source.sun_cosine < 1
     return np.array(daylight.source.to_sun) if slanted else None
 
@@ -91,7 +70,7 @@ def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.
 
 @kernel(error_model="numpy")
 def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
-    """Marks the pixels of rows `first` to `end` - 1 in `out` (lamps, H, W)."""
+    """Marks the pixels of rows of `out` (lamps, H, W)."""
     height, _, _, west, south, spacing = grid
     width, cols = depth.shape[1], height.shape[1]
     points, parts, cells = np.empty((3, width)), np.empty((2, width)), np.empty(width, np.int32)
@@ -112,7 +91,6 @@ def _test_facing(grid, depth, focal, pose, lamps, label, out, first, end):
 
 @kernel(error_model="numpy")
 def _find_floor(here, y, focal, pose, there, east, north, up):
-    """Fills the positions in the world of the points that the pixels of a row show."""
     a, b, c = pose[0, 0], pose[0, 1] * y + pose[0, 2], pose[0, 3]
     d, e, f = pose[1, 0], pose[1, 1] * y + pose[1, 2], pose[1, 3]
     g, h, i = pose[2, 0], pose[2, 1] * y + pose[2, 2], pose[2, 3]
@@ -198,7 +176,6 @@ def _any_dark(row):
 
 @kernel(error_model="numpy", inline="always")
 def _point_of(depth, focal, pose, v, u):
-    """Returns the point of the floor in pixel (v, u) in the world [m]."""
     z = np.float64(depth[v, u])
     scale = z / focal
     x, y = (u - 0.5 * (depth.shape[1] - 1)) * scale, (v - 0.5 * (depth.shape[0] - 1)) * scale

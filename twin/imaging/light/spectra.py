@@ -15,16 +15,14 @@ from __future__ import annotations
 import importlib
 import warnings
 from functools import cache
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import WaterConfig
 from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
-
-Array = NDArray[np.float64]
 
 #: Wavelengths of all spectra [nm], in steps of 1 nm.
 NM: Array = np.arange(400.0, 701.0)
@@ -56,11 +54,7 @@ def effective_per_m(per_m: Array, weights: Array, path_m: float = 0.0) -> Array:
 
 
 def jerlov_package() -> Any:
-    """Returns the package `jerlov`, imported at the first call, because clear water does not need it.
-
-    Raises:
-        TwinError: the package is not installed.
-    """
+    """Returns the package `jerlov`, imported on demand, as clear water does not need it; TwinError if missing."""
     try:
         return importlib.import_module("jerlov")
     except ModuleNotFoundError:
@@ -69,8 +63,7 @@ def jerlov_package() -> Any:
 
 Light = Literal["led", "daylight"]
 
-#: Relative power of CIE illuminant LED-B5, a phosphor-converted blue LED of 6598 K, from 400 to 700 nm in steps of 5 nm
-#: (CIE 015:2018, table 12).
+#: Relative power of CIE illuminant LED-B5 (blue with phosphor, 6598 K), 400 to 700 nm by 5 nm (CIE 015:2018, table 12).
 LED_B5 = (
     0.07, 0.16, 0.35, 0.78, 1.67, 3.3, 5.94, 9.92, 16.15, 25.15, 32.34, 31.18,
     23.46, 16.39, 12.08, 9.08, 7.21, 6.48, 6.49, 7.05, 8.1, 9.45, 10.88, 12.22,
@@ -83,11 +76,7 @@ LED_B5 = (
 
 @cache
 def spectrum_of(light: Light) -> Array:
-    """Returns the relative power (n,) at `NM` of CIE illuminant LED-B5 ("led") or D65 ("daylight").
-
-    Raises:
-        TwinError: the package `jerlov`, which has the table of D65, is not installed.
-    """
+    """Returns the relative power (n,) at `NM` of CIE illuminant LED-B5 ("led") or D65 ("daylight")."""
     nm, power = (np.arange(400.0, 701.0, 5.0), LED_B5) if light == "led" else jerlov_package().d65()
     spectrum = np.interp(NM, nm, power)
     spectrum.setflags(write=False)
@@ -98,19 +87,11 @@ _CLEARER, _MURKIER = "1C", "7C"  # types between which missing absorption is int
 _COMPARED_NM = 550.0  # wavelength at which the scattering of the sources is compared
 
 
-class WaterSpectrum(NamedTuple):
-    """Optical properties of one water at the wavelengths `NM`."""
-
-    absorption_per_m: Array  # (n,) absorption coefficient a [1/m]
-    scattering_per_m: Array  # (n,) scattering coefficient b [1/m]
-
-
 @cache
-def water_spectrum(water_type: str, source: WaterSourceName = "solonenko2015") -> WaterSpectrum:
-    """Returns absorption and scattering of a Jerlov type.
+def water_spectrum(water_type: str, source: WaterSourceName = "solonenko2015") -> tuple[Array, Array]:
+    """Returns absorption and scattering of a Jerlov type at the wavelengths `NM`, (n,) each [1/m].
 
-    Raises:
-        TwinError: the source is unknown or does not have this type, or the package `jerlov` is not installed.
+    Raises TwinError where the source is unknown or does not have this type, or the package `jerlov` is not installed.
     """
     if source not in WATER_SOURCES:
         raise TwinError("water.source", f"{source}: unknown", ", ".join(WATER_SOURCES))
@@ -126,7 +107,7 @@ def water_spectrum(water_type: str, source: WaterSourceName = "solonenko2015") -
     absorption = np.interp(NM, nm, absorption)
     for values in (absorption, scattering):
         values.setflags(write=False)
-    return WaterSpectrum(absorption, scattering)
+    return absorption, scattering
 
 
 def _filled(values: Array, clearer: Array, murkier: Array) -> Array:
@@ -154,5 +135,4 @@ def provenance_of(water: WaterConfig) -> str:
 
 
 def _scattering_at(nm: float, water_type: str, source: WaterSourceName) -> float:
-    """Returns the scattering coefficient of a water type at one wavelength [1/m]."""
-    return float(np.interp(nm, NM, water_spectrum(water_type, source).scattering_per_m))
+    return float(np.interp(nm, NM, water_spectrum(water_type, source)[1]))

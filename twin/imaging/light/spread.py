@@ -18,21 +18,21 @@ and absorption on the excess path.
 from __future__ import annotations
 
 from functools import cache, lru_cache
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.special import j1
 
-from twin.imaging.light.phase_function import Scatterer, phase_at
+from twin.core.geometry import Array
+from twin.imaging.light.phase_function import BandWater, Scatterer, phase_at
 
-Array = NDArray[np.float64]
 #: Receiver of lamp light: a floor, whose response is the cosine, or a particle, whose response is 1 in all directions.
 Receiver = Literal["floor", "particle"]
 
 ANGLES = 140  # number of cells of the scattering angle, even in its logarithm
 LEAST_RAD, MOST_TAN = 1e-5, 20.0  # outer edge of the innermost ring; that of a camera's outermost ring, as a tangent
+_MOST_TURNED = np.pi / 2 * 0.999  # largest scattering angle of a ray of the camera
 STEPS = 24  # number of positions of a scattering along a ray of the camera
 MAX_GROWTH = 1.0  # upper limit of b d (K - 1), the logarithm of the transform relative to exp(-a d)
 WEIGHT_OF_TOTAL = 10.0  # weight of the integral of the kernel in the fit of a mixture
@@ -42,32 +42,17 @@ NODES_M = tuple(np.geomspace(0.05, 30.0, 22).tolist())
 LAMP_SIGMA_RAD = 2.0 ** np.arange(-12.0, 0.5)
 
 
-class Absorbed(NamedTuple):
-    """Optical properties of the water in one band, for the kernels of scattered light."""
-
-    absorption_per_m: float  # absorption coefficient a [1/m]
-    scattering_per_m: float  # scattering coefficient b [1/m]
-    scatterer: Scatterer  # molecules and particles that scatter the light
-
-
 @lru_cache(maxsize=64)  # limited, as the surveys of a study may have many waters
-def lamp_mixture(water: Absorbed, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
-    """Returns the kernel of scattered light of a lamp, relative to exp(-a d), at distances (n,) [m].
-
-    The result is the weights (n, m) of normalised Gaussians of standard deviations `LAMP_SIGMA_RAD`, in the angle at
-    the lamp.
-    """
+def lamp_mixture(water: BandWater, distances_m: tuple[float, ...], receiver: Receiver) -> Array:
+    """Returns a lamp's kernel, relative to exp(-a d): weights (n, m) of Gaussians of `LAMP_SIGMA_RAD`."""
     rings = _rings(np.pi)
     once = np.array([_lamp_rings(water, d, receiver) for d in distances_m])
     return _mixtures(once, rings, water.scattering_per_m * np.array(distances_m), LAMP_SIGMA_RAD)
 
 
 @lru_cache(maxsize=64)
-def camera_mixture(water: Absorbed, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
-    """Returns the kernel of light scattered between floor and camera, relative to exp(-a r), at ranges (n,) [m].
-
-    The result is the weights (n, m) of normalised Gaussians of standard deviations `sigmas` (tangents; 0 is no blur).
-    """
+def camera_mixture(water: BandWater, ranges_m: tuple[float, ...], sigmas: tuple[float, ...]) -> Array:
+    """Returns a camera's kernel, relative to exp(-a r): weights (n, m) of Gaussians of given tangents; 0 = no blur."""
     once = np.array([_camera_rings(water, r) for r in ranges_m])
     return _mixtures(once, _rings(MOST_TAN), water.scattering_per_m * np.array(ranges_m), np.array(sigmas))
 
@@ -81,8 +66,7 @@ def ring_shares(edges: Array, sigmas: Array) -> Array:
 def over_path(share: Array, scattering_per_m: float, path_m: Array) -> Array:
     """Returns values (..., m) at path lengths (m,) [m], interpolated from `share` (..., nodes) at `NODES_M`.
 
-    The quantity that is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d),
-    with b the scattering coefficient and d the path length.
+    What is interpolated is the value divided by the fraction of light that is scattered, 1 - exp(-b d).
     """
     of_scattered = share / -np.expm1(-scattering_per_m * np.array(NODES_M))
     at = np.interp(np.log(np.maximum(path_m, 1e-9)), np.log(NODES_M), np.arange(len(NODES_M)))
@@ -103,6 +87,12 @@ def _middle(edges: Array) -> Array:
     return np.concatenate([[edges[1] / 2], np.sqrt(edges[1:-1] * edges[2:])])
 
 
+@lru_cache(maxsize=64)
+def _phase_on_rings(scatterer: Scatterer, most: float) -> Array:
+    """Returns the phase function (ANGLES,) in the middle of each of the rings of `_rings`."""
+    return phase_at((scatterer,), np.cos(_middle(_rings(most))))[:, 0]
+
+
 @cache
 def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
     """Returns two tables (ANGLES, ANGLES) over the scattering angle t and the angle beta at the lamp.
@@ -120,21 +110,17 @@ def _lamp_geometry(receiver: Receiver) -> tuple[Array, Array]:
     return response * inside, np.maximum(excess, 0.0)
 
 
-def _lamp_rings(water: Absorbed, distance_m: float, receiver: Receiver) -> Array:
-    """Returns the light (ANGLES,) scattered once in each ring of the angle at the lamp, divided by b d exp(-a d).
-
-    d is the distance from the lamp, a and b are absorption and scattering coefficient of the water.
-    """
+def _lamp_rings(water: BandWater, distance_m: float, receiver: Receiver) -> Array:
+    """Returns the light (ANGLES,) scattered once in each ring of the angle at the lamp, divided by b d exp(-a d)."""
     width, excess = _lamp_geometry(receiver)
-    edges = _rings(np.pi)
-    density = phase_at((water.scatterer,), np.cos(_middle(edges)))[:, 0] * np.diff(edges)
+    density = _phase_on_rings(water.scatterer, np.pi) * np.diff(_rings(np.pi))
     return 2 * np.pi * density @ (width * np.exp(-water.absorption_per_m * distance_m * excess))
 
 
 @cache
 def _camera_geometry() -> tuple[Array, Array, Array]:
     """Returns the geometry of light that is scattered by the angle t at the fraction u of a ray of the camera."""
-    edges = _rings(np.pi / 2 * 0.999)
+    edges = _rings(_MOST_TURNED)
     t = _middle(edges)
     u = (np.arange(STEPS) + 0.5)[:, None] / STEPS
     tangent = (1 - u) * np.tan(t)
@@ -144,20 +130,18 @@ def _camera_geometry() -> tuple[Array, Array, Array]:
     return ring, excess, solid
 
 
-def _camera_rings(water: Absorbed, range_m: float) -> Array:
+def _camera_rings(water: BandWater, range_m: float) -> Array:
     """Returns the light (ANGLES,) scattered once between floor and camera, divided by b r exp(-a r)."""
     ring, excess, solid = _camera_geometry()
-    density = phase_at((water.scatterer,), np.cos(_middle(_rings(np.pi / 2 * 0.999))))[:, 0] * solid
+    density = _phase_on_rings(water.scatterer, _MOST_TURNED) * solid
     light = density / STEPS * np.exp(-water.absorption_per_m * range_m * excess)
     return np.asarray(np.bincount(ring.ravel(), light.ravel(), ANGLES), np.float64)
 
 
 def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Array:
-    """Returns the weights (n, m) of the Gaussians for light that is scattered at least once.
-
-    The transform of that light, exp(-t) (exp(t K) - 1), is fitted by Gaussians with weights of 0 or more.
-    """
-    k = _frequencies(float(sigmas[sigmas > 0].min()), float(sigmas.max()))
+    """Returns the weights (n, m) >= 0 of Gaussians fitted to exp(-t) (exp(t K) - 1), light scattered at least once."""
+    least, most = sigmas[sigmas > 0].min(), sigmas.max()
+    k = np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])  # frequencies
     transform = once @ _ring_transforms(k, edges).T
     t = thickness[:, None]
     # exp(-t) (exp(t K) - 1); without the limit, light near a lamp would grow without bound in very turbid water
@@ -168,18 +152,12 @@ def _mixtures(once: Array, edges: Array, thickness: Array, sigmas: Array) -> Arr
 
 
 def _fit(basis: Array, wanted: Array) -> Array:
-    """Returns the non-negative weights (m,) of the Gaussians that fit the transform `wanted` of a kernel."""
     total = wanted[0]
     if total <= 0:
         return np.zeros(basis.shape[1])
     rows = wanted / total
     rows[0] *= WEIGHT_OF_TOTAL
     return nnls(basis, rows, maxiter=100 * basis.shape[1])[0] * total
-
-
-def _frequencies(least: float, most: float) -> Array:
-    """Returns the frequencies (41,) at which mixtures are fitted: 0, and 40 values from 0.2 / most to 3 / least."""
-    return np.concatenate([[0.0], np.geomspace(0.2 / most, 3 / least, 40)])
 
 
 def _ring_transforms(k: Array, edges: Array) -> Array:

@@ -9,11 +9,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.scenario.model import SEA_WATER_INDEX
-
-Array = NDArray[np.float64]
 
 CRITICAL_COSINE = float(np.sqrt(1 - 1 / SEA_WATER_INDEX**2))  # cosine of the edge of the cone in which the sky appears
 
@@ -26,7 +24,6 @@ class SunSky(NamedTuple):
 
     @property
     def sun_cosine(self) -> float:
-        """Cosine of the refracted sun's zenith angle, mu0."""
         return self.to_sun[2]
 
     @property
@@ -41,10 +38,7 @@ class SunSky(NamedTuple):
 
 
 def direction_to_sun(elevation_deg: float, azimuth_deg: float) -> tuple[float, float, float]:
-    """Returns the unit direction (east, north, up) to the sun under water, given its elevation and azimuth in air.
-
-    The azimuth is counter-clockwise from x (east).
-    """
+    """Returns the direction (east, north, up) to the sun under water; azimuths are counter-clockwise from x (east)."""
     sine = np.cos(np.deg2rad(elevation_deg)) / SEA_WATER_INDEX if elevation_deg < 90 else 0.0
     east, north = sine * np.cos(np.deg2rad(azimuth_deg)), sine * np.sin(np.deg2rad(azimuth_deg))
     return float(east), float(north), float(np.sqrt(1 - sine**2))

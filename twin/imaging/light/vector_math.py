@@ -1,7 +1,7 @@
 """Vectorized arithmetic of the compiled loops: powers of two, and weighted sums of neighbouring colours.
 
-The compiler does not vectorize across the bands of a colour, and reads tables element by element. These intrinsics emit
-the vector operations themselves: for 4 x 4 pixels of an image, and for entries of a table of R, G, B and a zero.
+The compiler does not vectorize across the bands of a colour; these intrinsics emit the vector operations themselves,
+for 4 x 4 pixels of an image, and for entries of a table of R, G, B and a zero.
 """
 
 from __future__ import annotations
@@ -22,8 +22,7 @@ LEAST = -126.0  # exponent of the smallest normal number in single precision; sm
 def two_to(t):
     """Returns 2^t for t from -126 to 127 with a relative error of 2e-7, exactly 1 at 0; a smaller t counts as -126.
 
-    2^t = 2^n 2^f with n an integer and |f| <= 1/2: 2^f - 1 is computed by a minimax polynomial, 2^n by setting the
-    exponent bits of a float32.
+    2^t = 2^n 2^f with |f| <= 1/2: 2^f - 1 is a minimax polynomial, 2^n sets the exponent bits of a float32.
     """
     one, t = np.float32(1.0), max(t, np.float32(LEAST))
     n = np.floor(t + np.float32(0.5))
@@ -77,11 +76,7 @@ def sum_of_pixels(typingctx, image, start, stride, weights, at):
 
 @intrinsic
 def sum_of_entries(typingctx, table, places, weights):
-    """Returns the three weighted sums (R, G, B) of entries of a float32 table; no bounds are checked.
-
-    Args:
-        weights: tuple of their weights, float32.
-    """
+    """Returns the three sums (R, G, B) of entries of a float32 table, weighted by a tuple; no bounds are checked."""
     result = types.UniTuple(types.float32, _BANDS)
 
     def emit(context, builder, sig, args):
@@ -97,14 +92,12 @@ def sum_of_entries(typingctx, table, places, weights):
 
 
 def _load(builder, values, place, vector):
-    """Returns the LLVM code that loads a vector of consecutive values, the first with the index `place`."""
     loaded = builder.load(builder.bitcast(builder.gep(values, [place]), vector.as_pointer()))
     loaded.align = 4
     return loaded
 
 
 def _repeated(builder, number, vector):
-    """Returns the LLVM code for a vector whose elements all equal a number."""
     first = builder.insert_element(ir.Constant(vector, ir.Undefined), number, _INDEX(0))
     zeros = ir.Constant(ir.VectorType(_INDEX, vector.count), [0] * vector.count)
     return builder.shuffle_vector(first, ir.Constant(vector, ir.Undefined), zeros)
@@ -117,5 +110,4 @@ def _add(builder, total, value, weight):
 
 
 def _bands(builder, vector):
-    """Returns the LLVM code for the first three elements of a vector: R, G and B."""
     return [builder.extract_element(vector, _INDEX(band)) for band in range(_BANDS)]

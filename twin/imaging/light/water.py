@@ -7,18 +7,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.core.user_files import reading
 from twin.errors import TwinError
-from twin.imaging.light.phase_function import Scatterer, molecular_scattering_per_m
+from twin.imaging.light.phase_function import BandWater, Scatterer, molecular_scattering_per_m
 from twin.imaging.light.spectra import CENTRE_NM, NM, Light, band_weights, effective_per_m, spectrum_of, water_spectrum
-from twin.imaging.light.spread import Absorbed
 from twin.scenario.model import ScatteringModel, WaterConfig
 
-Array = NDArray[np.float64]
-
-#: Largest size of a spectrum file.
 MAX_SPECTRUM_BYTES = 10_000_000
 
 
@@ -27,7 +23,6 @@ class Medium(NamedTuple):
 
     absorption_per_m: Array  # (3,) absorption coefficient a [1/m]
     scattering_per_m: Array  # (3,) scattering coefficient b [1/m]
-    # for each band, phase function of the particles and molecular share of b
     scatterers: tuple[Scatterer, ...] = (Scatterer(),) * 3
     # whether multiple scattering is modelled; else all light that is scattered from its path is lost
     multiple: bool = True
@@ -44,14 +39,12 @@ class Medium(NamedTuple):
 
     @property
     def scatters_repeatedly(self) -> bool:
-        """Whether the water scatters, and multiple scattering is modelled."""
         return self.multiple and bool(self.scattering_per_m.any())
 
     @property
-    def bands(self) -> tuple[Absorbed, ...]:
-        """Properties of each band, as hashable records."""
+    def bands(self) -> tuple[BandWater, ...]:
         rows = zip(self.absorption_per_m.tolist(), self.scattering_per_m.tolist(), self.scatterers, strict=True)
-        return tuple(Absorbed(*row) for row in rows)
+        return tuple(BandWater(*row) for row in rows)
 
 
 def medium(
@@ -59,13 +52,8 @@ def medium(
 ) -> Medium:
     """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
 
-    Args:
-        scattering: `imaging.scattering`; with "none", the water does not scatter.
-        path_m: path of the light for the effective absorption [m]; 0: mean absorption of the band.
-
-    Raises:
-        TwinError: absorption or scattering is missing or given twice, the spectrum cannot be read (`read_spectrum`), or
-            there is no spectrum of the water type or the light.
+    `path_m` is the path of the light for the effective absorption; 0: mean absorption of the band. Raises TwinError
+    where absorption or scattering is missing or given twice, or there is no valid spectrum of water or light.
     """
     absorption, per_m = _coefficients(water, path_m, light)
     per_m = per_m * (water.turbidity if scattering != "none" else 0.0)
@@ -73,10 +61,7 @@ def medium(
 
 
 def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, ...]:
-    """Returns the phase function of the particles and the molecular share of each band, given b (3,) [1/m].
-
-    With the phase function "sea", molecules scatter like pure sea water (Morel 1974), particles the rest.
-    """
+    """Returns what scatters each band for b (3,) [1/m]; with "sea", molecules scatter as in sea water (Morel 1974)."""
     if water.phase_function == "sea":
         molecules = molecular_scattering_per_m(np.array(CENTRE_NM))
         share = np.minimum(molecules / np.maximum(scattering_per_m, 1e-12), 1.0)
@@ -90,7 +75,6 @@ def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, 
 
 
 def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
-    """Returns absorption and scattering (3,) [1/m], from given values, a spectrum file or the Jerlov type."""
     own = {"absorption_per_m": water.absorption_per_m, "scattering_per_m": water.scattering_per_m}
     given = [key for key, value in own.items() if value is not None]
     if given and water.spectrum_file is not None:
@@ -113,9 +97,8 @@ def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Arra
 def read_spectrum(file: Path) -> tuple[Array, Array]:
     """Returns absorption and scattering (n,) [1/m] at `NM` from comma-separated rows of nm, a, b; # is a comment.
 
-    Raises:
-        TwinError: the file cannot be read or is larger than `MAX_SPECTRUM_BYTES`, does not have 3 columns and 2 or more
-            rows, its wavelengths do not increase or do not cover 400 to 700 nm, or a value is negative or not finite.
+    Raises TwinError where the file cannot be read, is larger than `MAX_SPECTRUM_BYTES` or has another form, its
+    wavelengths do not increase or do not cover 400 to 700 nm, or a value is negative or not finite.
     """
     key = "water.spectrum_file"
     wanted = "rows of wavelength [nm], absorption, scattering [1/m]"

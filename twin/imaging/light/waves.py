@@ -7,9 +7,8 @@ phi from the wind with the density (1 + Delta(k) cos(2 phi)) / (2 pi). The sea i
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from twin.core.geometry import Array
 
 GRAVITY_MPS2 = 9.81
 #: Wave number [rad/m] and phase speed [m/s] of the slowest waves; shorter waves are capillary waves.
@@ -46,10 +45,7 @@ def directionality(k: Array, wind_mps: float) -> Array:
 
 
 def slope_density(kx: Array, ky: Array, wind_mps: float) -> Array:
-    """Returns the variance of the slope per area of the wave number plane [m^2/rad^2]; 0 at k = 0.
-
-    `kx`, `ky` are the wave numbers along and across the wind [rad/m]; the integral is the mean square slope.
-    """
+    """Returns the slope variance per area of wave numbers along and across the wind [m^2/rad^2]; 0 at k = 0."""
     k = np.hypot(kx, ky)
     k_or_1 = np.where(k > 0, k, 1.0)
     spread = 1 + directionality(k_or_1, wind_mps) * (kx**2 - ky**2) / k_or_1**2

@@ -11,7 +11,6 @@ GUIDE_G = 0.9  # mean cosine of the wider lobe around a lamp or the sun, see `sa
 
 @kernel(inline="always")
 def density_at(density_per_sr, cosine):
-    """Returns the value of a phase function table [1/sr] at the cosine of the scattering angle."""
     cells = density_per_sr.shape[0]
     x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 0.0)))
     return density_per_sr[min(int(x * cells), cells - 1)]
@@ -50,11 +49,7 @@ def sample_angle(cumulative_angle, rng):
 
 @kernel
 def turn(x, y, z, cosine, sine, azimuth):
-    """Returns the unit vector at a polar angle and an azimuth [rad] around the unit vector (x, y, z).
-
-    `cosine` and `sine` are those of the polar angle. The frame around the axis is that of Duff et al. (2017, J. Comput.
-    Graph. Tech. 6, 1).
-    """
+    """Returns the unit vector at a polar angle and an azimuth around (x, y, z), in the frame of Duff et al. (2017)."""
     sign = 1.0 if z >= 0 else -1.0
     a = -1 / (sign + z)
     b = x * y * a
@@ -68,7 +63,6 @@ def turn(x, y, z, cosine, sine, azimuth):
 
 @kernel
 def turn_by_cosine(x, y, z, cosine, rng):
-    """Returns the unit vector at an angle of given cosine from the unit vector (x, y, z), with a random azimuth."""
     sine = np.sqrt(max(1 - cosine * cosine, 0.0))
     return turn(x, y, z, cosine, sine, 2 * np.pi * rng.random())
 
@@ -89,11 +83,7 @@ def sample_guide(cumulative_angle, rng):
 
 @kernel
 def guide_density(density_per_sr, beyond, angle_integral, cosine):
-    """Returns the density [1/sr] of the directions of `sample_guide` at the cosine of the angle from the lamp or sun.
-
-    `beyond` (n + 1,) is the integral of the phase function from each cell boundary to pi [rad/sr], `angle_integral`
-    that of phase function times angle [rad^2/sr].
-    """
+    """Returns the density [1/sr] of the directions of `sample_guide` at the cosine of the angle from lamp or sun."""
     g, cells = GUIDE_G, density_per_sr.shape[0]
     x = np.sqrt(np.sqrt(max(0.5 - 0.5 * cosine, 1e-18)))
     k = min(int(x * cells), cells - 1)

@@ -28,24 +28,22 @@ from twin.imaging.reference.directions import (
     turn,
     turn_by_cosine,
 )
-from twin.imaging.reference.floor_crossings import LIFT_M, floor_distance, floor_normal, sees
 from twin.kernels import kernel
 
 #: Indices of the sums to which `walk` adds light; the bins of the blurred light start at FIRST_BIN.
 DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE, FIRST_BIN = 0, 1, 2, 3, 4
 GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that are sampled around lamps and sun
 UPWARDS = 0.1  # share of the directions that are sampled upwards, for downward walks in water with daylight
-#: Kinds of vertices. As an argument, an `int` constant would make numba compile each function once for each value.
-ON_FLOOR, IN_WATER = np.int64(0), np.int64(1)
+#: Kinds of vertices, and of ends of a path. For `int` arguments, numba would compile a function once for each value.
+ON_FLOOR, IN_WATER, ABOVE, NOWHERE = np.int64(0), np.int64(1), np.int64(2), np.int64(3)
+LIFT_M = 1e-6  # distance by which a path vertex on the floor is moved off the floor
+UP = (0.0, 0.0, 1.0)  # normal of the floor, the plane z = 0
 WEAK, STEPS = 0.002, 10000  # share of the first weight below which Russian roulette starts; most vertices of a walk
 
 
 @kernel
 def beam_at(beam, cosine):
-    """Returns the relative intensity of a lamp at the cosine of the angle from its beam axis; 0 beyond 90 deg.
-
-    `beam` has the values at equal steps of the angle from 0 to 90 deg.
-    """
+    """Returns the relative intensity of a lamp at the cosine of the angle from its axis; 0 beyond 90 deg."""
     if cosine <= 0:
         return 0.0
     at = np.arccos(min(cosine, 1.0)) / (np.pi / 2) * (beam.shape[0] - 1)
@@ -54,30 +52,28 @@ def beam_at(beam, cosine):
 
 
 @kernel
-def response(scene, kind, normal, direction, ox, oy, oz):
+def response(scene, kind, direction, ox, oy, oz):
     """Returns the share of the light from the direction o that a vertex sends back along the path [1/sr].
 
-    `normal` is that of the floor, `direction` the unit direction in which the backward path arrived.
+    `direction` is the unit direction in which the backward path arrived.
     """
     if kind == ON_FLOOR:
-        return scene.albedo / np.pi * max(normal[0] * ox + normal[1] * oy + normal[2] * oz, 0.0)
-    return density_at(scene.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
+        return scene.albedo / np.pi * max(oz, 0.0)
+    return density_at(scene.phase.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
 
 
 @kernel(inline="always")
 def towards(lamp, point):
-    """Returns the unit direction x, y, z from a point to a lamp, and their distance [m]."""
     x, y, z = lamp[0] - point[0], lamp[1] - point[1], lamp[2] - point[2]
     d = np.sqrt(x * x + y * y + z * z)
     return x / d, y / d, z / d, d
 
 
 @kernel
-def straight(scene, kind, point, normal, direction, before, density, step_m):
+def straight(scene, kind, point, direction, before, density, step_m):
     """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
 
-    If `density` [1/sr], with which the direction from `before` was sampled, is above 0, it is weighted by
-    `share_of_walk`.
+    If the direction from `before` was sampled with a `density` [1/sr] above 0, it is weighted by `share_of_walk`.
     """
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -86,31 +82,27 @@ def straight(scene, kind, point, normal, direction, before, density, step_m):
         if d <= scene.lamp_radius_m:
             continue
         light = lamp[6] * beam_at(scene.beams[k], -(x * lamp[3] + y * lamp[4] + z * lamp[5]))
-        light *= response(scene, kind, normal, direction, x, y, z)
-        if light > 0 and sees(scene.is_plane, scene.field, point[0], point[1], point[2], lamp[0], lamp[1], lamp[2]):
+        light *= response(scene, kind, direction, x, y, z)
+        if light > 0 and point[2] > 0 and lamp[2] > 0:  # the floor does not block the way
             light *= np.exp(-attenuation * d) / (d * d)
             if density > 0:
                 a, b, c = lamp[0] - before[0], lamp[1] - before[1], lamp[2] - before[2]
-                phase = density_at(scene.density_per_sr, direction[0] * x + direction[1] * y + direction[2] * z)
+                phase = density_at(scene.phase.density_per_sr, direction[0] * x + direction[1] * y + direction[2] * z)
                 light *= share_of_walk(scene, np.sqrt(a * a + b * b + c * c), phase, d, density, step_m)
             total += light
     return total
 
 
 @kernel
-def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
-    """Returns an estimate of the light of lamps that reaches a vertex after one scattering, times its `response`.
-
-    The estimate [cd/m2] is weighted by 1 - `share_of_walk`. The arguments are those of `straight` and
-    `direction_density`, and the random stream `rng`.
-    """
+def by_one_scattering(scene, kind, point, direction, guided, rng):
+    """Returns an estimate of lamp light after one scattering, times `response` and 1 - `share_of_walk` [cd/m2]."""
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
         lamp = scene.lamps[k]
         x, y, z, d = towards(lamp, point)
         if d <= scene.lamp_radius_m:
             continue
-        angle = sample_angle(scene.cumulative_angle, rng)
+        angle = sample_angle(scene.phase.cumulative_angle, rng)
         alpha = angle * rng.random()
         sine = np.sin(angle)
         if sine <= 0:
@@ -119,7 +111,7 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
         if from_lamp <= scene.lamp_radius_m:
             continue
         ox, oy, oz = turn(x, y, z, np.cos(alpha), np.sin(alpha), 2 * np.pi * rng.random())
-        own = response(scene, kind, normal, direction, ox, oy, oz)
+        own = response(scene, kind, direction, ox, oy, oz)
         if own <= 0:
             continue
         px, py, pz = point[0] + from_point * ox, point[1] + from_point * oy, point[2] + from_point * oz
@@ -127,19 +119,17 @@ def by_one_scattering(scene, kind, point, normal, direction, guided, rng):
             continue
         bx, by, bz = (px - lamp[0]) / from_lamp, (py - lamp[1]) / from_lamp, (pz - lamp[2]) / from_lamp
         light = own * lamp[6] * beam_at(scene.beams[k], bx * lamp[3] + by * lamp[4] + bz * lamp[5])
-        if light <= 0 or not sees(scene.is_plane, scene.field, point[0], point[1], point[2], px, py, pz):
-            continue
-        if sees(scene.is_plane, scene.field, px, py, pz, lamp[0], lamp[1], lamp[2]):
-            scale = 2 * np.pi * scene.angle_integral * scene.scattering / d
+        if light > 0 and min(point[2], pz, lamp[2]) > 0:  # the floor does not block the way
+            scale = 2 * np.pi * scene.phase.angle_integral * scene.scattering / d
             scale *= np.exp(-attenuation * (from_point + from_lamp))
             density = direction_density(scene, kind, point, direction, guided, own, ox, oy, oz)
-            phase = density_at(scene.density_per_sr, np.cos(angle))
+            phase = density_at(scene.phase.density_per_sr, np.cos(angle))
             total += scale * light * (1 - share_of_walk(scene, d, phase, from_lamp, density, from_point))
     return total
 
 
 @kernel
-def sunlight(scene, kind, point, normal, direction, guided, rng):
+def sunlight(scene, kind, point, direction, guided, rng):
     """Returns the unscattered sunlight at a vertex, times the `response` of the vertex [cd/m2].
 
     For a vertex in water, a sun with a disc is sampled at a random point of the disc, and its light is weighted by
@@ -151,12 +141,10 @@ def sunlight(scene, kind, point, normal, direction, guided, rng):
     has_disc = kind == IN_WATER and scene.sun_cosine < 1
     if has_disc:
         sx, sy, sz = turn_by_cosine(sx, sy, sz, 1 - rng.random() * (1 - scene.sun_cosine), rng)
-        if sz <= 0:
-            return 0.0
-    if floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], sx, sy, sz) < np.inf:
+    if sz <= 0:
         return 0.0
     path = (scene.surface_m - point[2]) / sz
-    own = response(scene, kind, normal, direction, sx, sy, sz)
+    own = response(scene, kind, direction, sx, sy, sz)
     light = scene.sun_lx * np.exp(-(scene.absorption + scene.scattering) * path) * own
     if has_disc:
         density = direction_density(scene, kind, point, direction, guided, own, sx, sy, sz)
@@ -174,10 +162,7 @@ def share_of_escape(scene, density, path_m):
 
 @kernel
 def light_above(scene, from_water, density, path_m, x, y, z):
-    """Returns the radiance of sky and sun's disc just below the surface from the unit direction (x, y, z) [cd/m2].
-
-    The disc counts only for a last vertex in the water, weighted by `share_of_escape`.
-    """
+    """Returns the radiance below the surface from the direction (x, y, z); the disc counts after the water only."""
     last = scene.sky.shape[0] - 1
     light = 0.0
     if last > 0:
@@ -209,17 +194,17 @@ def upward_share(scene, kind, direction, guided):
 
 @kernel
 def next_direction(scene, kind, point, normal, direction, guided, rng):
-    """Returns the next direction of a walk, sampled from the mixture whose density `direction_density` returns."""
+    """Returns the next direction of a walk, sampled from the mixture of `direction_density`."""
     n = scene.lamps.shape[0] + (1 if scene.sun_lx > 0 else 0)
     if n > 0 and rng.random() < guided:
         x, y, z = axis_of(scene, min(int(n * rng.random()), n - 1), point)
-        x, y, z = turn_by_cosine(x, y, z, sample_guide(scene.cumulative_angle, rng), rng)
+        x, y, z = turn_by_cosine(x, y, z, sample_guide(scene.phase.cumulative_angle, rng), rng)
     elif kind == ON_FLOOR:
         x, y, z = turn_by_cosine(normal[0], normal[1], normal[2], np.sqrt(rng.random()), rng)
     elif rng.random() < upward_share(scene, kind, direction, guided):
         x, y, z = turn_by_cosine(0.0, 0.0, 1.0, np.sqrt(rng.random()), rng)
     else:
-        cosine = sample_cosine(scene.cumulative, rng)
+        cosine = sample_cosine(scene.phase.cumulative, rng)
         x, y, z = turn_by_cosine(direction[0], direction[1], direction[2], cosine, rng)
     length = np.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length
@@ -242,7 +227,7 @@ def direction_density(scene, kind, point, direction, guided, own, x, y, z):
     for k in range(n):
         a, b, c = axis_of(scene, k, point)
         cosine = a * x + b * y + c * z
-        lobes += guide_density(scene.density_per_sr, scene.beyond, scene.angle_integral, cosine) / n
+        lobes += guide_density(scene.phase.density_per_sr, scene.phase.beyond, scene.phase.angle_integral, cosine) / n
     return (1 - guided) * own + guided * lobes
 
 
@@ -254,7 +239,7 @@ def share_of_walk(scene, lamp_m, phase, to_lamp_m, density, step_m):
     and s / (w + s) (balance heuristic, Veach 1997, section 9.2.2), without the common factor 1 / step_m^2.
     """
     by_walk = density * scene.scattering * np.exp(-scene.scattering * step_m)
-    by_connection = phase * lamp_m / (2 * np.pi * scene.angle_integral * to_lamp_m * to_lamp_m)
+    by_connection = phase * lamp_m / (2 * np.pi * scene.phase.angle_integral * to_lamp_m * to_lamp_m)
     return by_walk / (by_walk + by_connection)
 
 
@@ -280,6 +265,26 @@ def bin_of(view, bin_edges_px, x, y, z):
 
 
 @kernel
+def flight(scene, point, z, rng):
+    """Returns kind and distance [m] of the next vertex; ABOVE: the path leaves the water, NOWHERE: it meets nothing."""
+    floor_m = -point[2] / z if z < 0 else np.inf
+    surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
+    step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
+    if step_m >= surface_m and surface_m <= floor_m:
+        return ABOVE, surface_m
+    if step_m == np.inf and floor_m == np.inf:
+        return NOWHERE, np.inf
+    return (IN_WATER if step_m < floor_m else ON_FLOOR), min(step_m, floor_m)
+
+
+@kernel
+def vertex(kind, point, step_m, x, y, z):
+    """Returns the point at a distance in a unit direction, lifted off the floor."""
+    lift_m = LIFT_M if kind == ON_FLOOR else 0.0
+    return point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z + lift_m
+
+
+@kernel
 def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
     """Adds the light of one random walk from `point` to `sums`, arriving in the unit `direction`.
 
@@ -289,16 +294,15 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
     unscattered, before_floor, at_first_floor = kind == ON_FLOOR, kind == IN_WATER, False
     n_bins, at_bin, start = bin_edges_px.shape[0], 0, weight
     before, density, step_m = point, 0.0, 0.0
-    normal = floor_normal(scene.is_plane, scene.field, point[0], point[1])
     for order in range(STEPS):
         first = order == 0
         shared = 0.0 if scene.plain or kind == ON_FLOOR else density  # density is 0 at the first vertex
         guided = 0.0 if scene.plain else (GUIDED_AT_FLOOR if kind == ON_FLOOR else GUIDED_IN_WATER)
-        once = weight * sunlight(scene, kind, point, normal, direction, guided, rng)
-        once += weight * straight(scene, kind, point, normal, direction, before, shared, step_m)
+        once = weight * sunlight(scene, kind, point, direction, guided, rng)
+        once += weight * straight(scene, kind, point, direction, before, shared, step_m)
         more = 0.0
         if not scene.plain and scene.scattering > 0:
-            more = weight * by_one_scattering(scene, kind, point, normal, direction, guided, rng)
+            more = weight * by_one_scattering(scene, kind, point, direction, guided, rng)
         if before_floor:
             to, to_more = VEIL_ONCE if first else VEIL_MORE, VEIL_MORE
         elif unscattered:
@@ -311,8 +315,8 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
         sums[to_more] += more
         if scene.scattering <= 0 and scene.sky.shape[0] < 2:
             return
-        x, y, z = next_direction(scene, kind, point, normal, direction, guided, rng)
-        own = response(scene, kind, normal, direction, x, y, z)
+        x, y, z = next_direction(scene, kind, point, UP, direction, guided, rng)
+        own = response(scene, kind, direction, x, y, z)
         if own <= 0:
             return
         density = direction_density(scene, kind, point, direction, guided, own, x, y, z)
@@ -323,24 +327,18 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
                 return
             weight = WEAK * start
         direction = (x, y, z)
-        floor_m = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], x, y, z)
-        surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
-        step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
-        if step_m >= surface_m and surface_m <= floor_m:
-            above = light_above(scene, kind == IN_WATER, density, surface_m, x, y, z)
-            sums[to] += weight * np.exp(-scene.absorption * surface_m) * above
+        from_water = kind == IN_WATER
+        kind, step_m = flight(scene, point, z, rng)
+        if kind == ABOVE:
+            above = light_above(scene, from_water, density, step_m, x, y, z)
+            sums[to] += weight * np.exp(-scene.absorption * step_m) * above
+        if kind > IN_WATER:
             return
-        if step_m == np.inf and floor_m == np.inf:
-            return
-        kind = IN_WATER if step_m < floor_m else ON_FLOOR
-        step_m = min(step_m, floor_m)
         weight *= np.exp(-scene.absorption * step_m)
         before = point
-        point = (point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z)
+        point = vertex(kind, point, step_m, x, y, z)
         if kind == ON_FLOOR:
-            normal = floor_normal(scene.is_plane, scene.field, point[0], point[1])
-            point = (point[0] + LIFT_M * normal[0], point[1] + LIFT_M * normal[1], point[2] + LIFT_M * normal[2])
-            if normal[0] * x + normal[1] * y + normal[2] * z >= 0 or scene.albedo <= 0:
+            if scene.albedo <= 0:
                 return
             if before_floor:
                 before_floor, at_first_floor = False, True
@@ -361,18 +359,16 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
     y = (a * view[0, 1] + b * view[1, 1] + f * view[2, 1]) / length
     z = (a * view[0, 2] + b * view[1, 2] + f * view[2, 2]) / length
     ray = (x, y, z)
-    floor_m = floor_distance(scene.is_plane, scene.field, centre[0], centre[1], centre[2], x, y, z)
+    floor_m = -centre[2] / z if z < 0 else np.inf
     end_m = min(floor_m, (scene.surface_m - centre[2]) / z if z > 0 else np.inf)
     seen = floor_m < np.inf and floor_m <= end_m and scene.albedo > 0
     share = 1 - np.exp(-scene.scattering * end_m) if scene.scattering > 0 else 0.0
-    arrives, shown, up = 0.0, centre, (0.0, 0.0, 1.0)
+    arrives, shown = 0.0, centre
     if seen:
         arrives = np.exp(-(scene.absorption + scene.scattering) * floor_m)
-        shown = (centre[0] + floor_m * x, centre[1] + floor_m * y, centre[2] + floor_m * z)
-        up = floor_normal(scene.is_plane, scene.field, shown[0], shown[1])
-        shown = (shown[0] + LIFT_M * up[0], shown[1] + LIFT_M * up[1], shown[2] + LIFT_M * up[2])
-        direct = straight(scene, ON_FLOOR, shown, up, ray, shown, 0.0, 0.0)
-        direct += sunlight(scene, ON_FLOOR, shown, up, ray, 0.0, rng)
+        shown = vertex(ON_FLOOR, centre, floor_m, x, y, z)
+        direct = straight(scene, ON_FLOOR, shown, ray, shown, 0.0, 0.0)
+        direct += sunlight(scene, ON_FLOOR, shown, ray, 0.0, rng)
         sums[DIRECT] = n_walks * arrives * direct
     for k in range(n_walks):
         if seen and (scene.scattering > 0 or scene.sky.shape[0] > 1):
@@ -392,8 +388,7 @@ def trace_plane(scene, point, normal, n_walks, rng):
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     guided = 0.0 if scene.plain else GUIDED_AT_FLOOR
     facing = normal[0] * sx + normal[1] * sy + normal[2] * sz
-    blocked = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], sx, sy, sz) < np.inf
-    if scene.sun_lx > 0 and facing > 0 and not blocked:
+    if scene.sun_lx > 0 and facing > 0 and sz > 0:
         attenuation = scene.absorption + scene.scattering
         out[0] = n_walks * facing * scene.sun_lx * np.exp(-attenuation * (scene.surface_m - point[2]) / sz)
     for _ in range(n_walks):
@@ -403,28 +398,17 @@ def trace_plane(scene, point, normal, n_walks, rng):
             continue
         own = cosine / np.pi
         weight = cosine / direction_density(scene, IN_WATER, point, (0.0, 0.0, 1.0), guided, own, x, y, z)
-        floor_m = floor_distance(scene.is_plane, scene.field, point[0], point[1], point[2], x, y, z)
-        surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
-        step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
-        if step_m >= surface_m and surface_m <= floor_m:
-            light = light_above(scene, False, 0.0, surface_m, x, y, z)
-            out[1] += weight * np.exp(-scene.absorption * surface_m) * light
+        kind, step_m = flight(scene, point, z, rng)
+        if kind == ABOVE:
+            light = light_above(scene, False, 0.0, step_m, x, y, z)
+            out[1] += weight * np.exp(-scene.absorption * step_m) * light
+        if kind > IN_WATER or (kind == ON_FLOOR and scene.albedo <= 0):
             continue
-        if step_m == np.inf and floor_m == np.inf:
-            continue
-        kind = IN_WATER if step_m < floor_m else ON_FLOOR
-        if kind == ON_FLOOR and scene.albedo <= 0:
-            continue
-        step_m = min(step_m, floor_m)
         weight *= np.exp(-scene.absorption * step_m)
-        next_point = (point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z)
+        next_point = vertex(kind, point, step_m, x, y, z)
         if kind == ON_FLOOR:
-            up = floor_normal(scene.is_plane, scene.field, next_point[0], next_point[1])
-            next_point = (
-                next_point[0] + LIFT_M * up[0], next_point[1] + LIFT_M * up[1], next_point[2] + LIFT_M * up[2]
-            )  # fmt: skip
-            first = straight(scene, ON_FLOOR, next_point, up, (x, y, z), next_point, 0.0, 0.0)
-            first += sunlight(scene, ON_FLOOR, next_point, up, (x, y, z), 0.0, rng)
+            first = straight(scene, ON_FLOOR, next_point, (x, y, z), next_point, 0.0, 0.0)
+            first += sunlight(scene, ON_FLOOR, next_point, (x, y, z), 0.0, rng)
             sums[LAMP_SCATTERED] += weight * first
         walk(scene, no_view, edges, kind, next_point, (x, y, z), weight, rng, sums)
     out[2] = sums.sum()

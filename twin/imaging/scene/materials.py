@@ -33,8 +33,6 @@ _FAST = {"contract", "arcp", "nsz", "reassoc"}
 
 
 class Material(NamedTuple):
-    """Reflection of the floor."""
-
     kind: int  # LAMBERT, OREN_NAYAR or HAPKE
     a: np.float32  # coefficients A and B of Oren and Nayar's model
     b: np.float32
@@ -47,13 +45,9 @@ def material_of(terrain: TerrainConfig) -> Material | None:
     if terrain.material == "lambert" and not terrain.specular:
         return None
     square = np.deg2rad(terrain.roughness_deg) ** 2
-    return Material(
-        KINDS[terrain.material],
-        np.float32(1 - 0.5 * square / (square + 0.33)),
-        np.float32(0.45 * square / (square + 0.09)),
-        np.float32(terrain.specular),
-        np.float32(np.tan(np.deg2rad(terrain.specular_width_deg)) ** 2),
-    )
+    a, b = 1 - 0.5 * square / (square + 0.33), 0.45 * square / (square + 0.09)
+    width = np.tan(np.deg2rad(terrain.specular_width_deg)) ** 2
+    return Material(KINDS[terrain.material], *(np.float32(value) for value in (a, b, terrain.specular, width)))
 
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
@@ -89,12 +83,8 @@ def reflectance(material, albedo, mu_i, mu_o, phase):
 def add_reflected(material, lamp, albedo, here, y, focal, normal, arriving, reflected):
     """Adds the light [cd/m2] of one lamp that a row of W pixels reflects, before loss on the way, to `reflected`.
 
-    Args:
-        lamp: its first three values are the position in the axes of the camera [m].
-        albedo: (W, 3) uint8, 255 = white.
-        here: (W,) depth [m].
-        normal: (3, W) unit normals in the axes of the camera.
-        arriving: (3, W) illuminance by the lamp, attenuated on the path from lamp to floor [lx].
+    `lamp` starts with its position in camera axes [m], `albedo` (W, 3) is uint8, `here` (W,) the depth [m], `normal`
+    (3, W) in camera axes, `arriving` (3, W) the illuminance by the lamp, attenuated on its path to the floor [lx].
     """
     one, half, tiny = np.float32(1), np.float32(0.5), np.float32(1e-4)
     for u in range(here.size):

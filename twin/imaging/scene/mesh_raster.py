@@ -2,7 +2,7 @@
 
 One kernel serves the cameras, the shadow maps, and the view from above that gives the true heights. A pixel shows the
 triangle that the ray through its centre meets first, with the exact depth; 1 / depth (in a parallel view, depth) is
-linear in the image. Triangles are about as large as a pixel, so each part of a mesh (`objects.parts`) passes through
+linear in the image. Triangles are about as large as a pixel, so each part of a mesh (`objects.detail`) passes through
 loops that write lists, almost without branches. Parts outside the image or facing away are left out.
 """
 
@@ -15,13 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.records import Array, Depth
 from twin.core.threads import in_row_bands
 from twin.kernels import kernel
 from twin.terrains.objects.coloured_mesh import Mesh
-from twin.terrains.objects.parts import PART_FACES, UNKNOWN, Parts
-
-Array = NDArray[np.float64]
-Depth = NDArray[np.float32]
+from twin.terrains.objects.detail import PART_FACES, UNKNOWN, Parts
 
 NEAR_M = 0.05  #: depth of the near clipping plane of all cameras
 MARGIN = 1e-6  #: relative margin of tests that leave out parts, far above rounding errors
@@ -49,11 +47,12 @@ def view_planes(view: Projection, shape: tuple[int, int]) -> Array:
 
 
 class ObjectView(NamedTuple):
-    """Objects in an image."""
-
     # (H, W, 3) float32 unit normals in the axes of the camera, valid where `label` is not 0
     normal: NDArray[np.float32]
     label: NDArray[np.uint16]  # (H, W) uint16, 1 + number of the object that the pixel shows; 0: the floor, or nothing
+
+
+NO_OBJECTS = ObjectView(np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.uint16))
 
 
 class Target(NamedTuple):
@@ -70,8 +69,6 @@ class Target(NamedTuple):
 
 
 class DrawnMesh(NamedTuple):
-    """A mesh to draw into images."""
-
     mesh: Mesh  # triangles
     camera_from_object: Array  # (4, 4) or (3, 4) affine map from the axes of the mesh to those of the camera
     label: int = 0  # number to write into `Target.label`
@@ -104,7 +101,7 @@ def _draw(
     points, faces, colours, uv, parts, matrix, projection, depth, albedo, normal, label, places, number, closed, first,
     end,
 ):  # fmt: skip
-    """Compiled kernel of `draw_meshes`: draws the rows `first` to `end` - 1 of a mesh with the points (3, n)."""
+    """Draws the rows `first` to `end` - 1 of a mesh with the points (3, n), see `draw_meshes`."""
     n = faces.shape[0]
     shown = np.empty((n + PART_FACES - 1) // PART_FACES, np.int32)
     window = 0, depth.shape[1], first, end
@@ -206,14 +203,13 @@ def _list_parts(parts, matrix, projection, window, closed, shown):
 
 @kernel(error_model="numpy", forceinline=True)
 def _interval(row, centre, half):
-    """Returns centre and half extent of a box along one axis of the camera."""
     middle = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2] + row[3]
     return middle, abs(row[0]) * half[0] + abs(row[1]) * half[1] + abs(row[2]) * half[2]
 
 
 @kernel(error_model="numpy")
 def _inverse(matrix):
-    """Returns the inverse (3, 3) of the linear part of a map (3, 4); zeros if it mirrors: keeps all parts."""
+    """Returns the inverse (3, 3) of the linear part of a map (3, 4); zeros, which keep all parts, if it mirrors."""
     a, b, c = matrix[0, :3], matrix[1, :3], matrix[2, :3]
     inverse = np.zeros((3, 3))
     inverse[:, 0], inverse[:, 1], inverse[:, 2] = np.cross(b, c), np.cross(c, a), np.cross(a, b)
@@ -247,10 +243,7 @@ def _project(points, matrix, projection, point, place):
 
 @kernel(error_model="numpy", forceinline=True)
 def _list_triangles(faces, start, end, place, window, closed, kept):
-    """Writes to `kept` those of the triangles `start` to `end` - 1 that may cover pixel centres; returns their number.
-
-    Triangles with a corner nearer than the near plane are not listed, nor, with `closed`, those that face away.
-    """
+    """Writes to `kept` the triangles `start` to `end` - 1 that may cover pixel centres; returns their number."""
     u, v = place[0], place[1]
     n = 0
     for f in range(start, end):
@@ -265,7 +258,7 @@ def _list_triangles(faces, start, end, place, window, closed, kept):
 
 @kernel(error_model="numpy", forceinline=True)
 def _rectangle(ua, va, ub, vb, uc, vc, window):
-    """Returns first and last column, first and last row of the pixel centres in the rectangle around a triangle."""
+    """Returns first and last column, first and last row of the pixel centres around a triangle."""
     left, right, top, bottom = window
     u0, u1 = max(np.ceil(min(ua, ub, uc)), np.float64(left)), min(np.floor(max(ua, ub, uc)), np.float64(right - 1))
     v0, v1 = max(np.ceil(min(va, vb, vc)), np.float64(top)), min(np.floor(max(va, vb, vc)), np.float64(bottom - 1))
@@ -314,7 +307,6 @@ def _list_pixels(
 
 @kernel(error_model="numpy", forceinline=True)
 def _normal(point, i, j, k, perspective):
-    """Returns the unit normal of a triangle in camera axes, towards the camera."""
     x, y, z = point[0], point[1], point[2]
     px, py, pz, qx, qy, qz = x[j] - x[i], y[j] - y[i], z[j] - z[i], x[k] - x[i], y[k] - y[i], z[k] - z[i]
     nx, ny, nz = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx

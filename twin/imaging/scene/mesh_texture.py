@@ -1,12 +1,6 @@
-"""Colours of textured meshes: textures sampled at the pixels of an image, trilinearly between levels of resolution.
-
-The level is the one whose texels are as large as the pixel on the surface (Williams 1983), along the direction in which
-an oblique view stretches the pixel most, as OpenGL chooses it.
-"""
+"""Colours of textured meshes: trilinear samples of levels as coarse as the most stretched pixel (Williams 1983)."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,21 +12,16 @@ from twin.terrains.objects.texture_pyramid import Textures
 LEAST_COSINE = 0.1  #: smallest cosine of the angle between ray and normal; smaller ones count as this value
 
 
-class TexturedSurface(NamedTuple):
-    """Textures of the meshes in an image."""
+def paint_textures(target: Target, projection: Projection, textures: Textures, of_label: NDArray[np.int32]) -> None:
+    """Draws textures into `target.albedo` after `draw_meshes`; none of the images of `target` is None.
 
-    textures: Textures  # the textures
-    of_label: NDArray[np.int32]  # (labels,) int32 number of the texture of the mesh that `Target.label` names; -1: none
-
-
-def paint_textures(target: Target, projection: Projection, surface: TexturedSurface) -> None:
-    """Draws the textures into `target.albedo` after `draw_meshes`; none of the images of `target` is None."""
-    _paint(*target, projection, *surface.textures, surface.of_label)
+    `of_label` (labels,) is the number of the texture of the mesh that `Target.label` names; -1: none.
+    """
+    _paint(*target, projection, *textures, of_label)
 
 
 @kernel(error_model="numpy")
 def _paint(depth, albedo, normal, label, uv, projection, texels, levels, of_label):
-    """Compiled kernel of `paint_textures`."""
     focal, cx, cy, _, perspective = projection
     height, width = depth.shape
     coarsest = levels.shape[1] - 1

@@ -8,20 +8,16 @@ to the light by more than a bias of some pixels.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import StereoRig
+from twin.core.records import Array, Depth, StereoRig
 from twin.core.threads import in_row_bands
 from twin.imaging.scene.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.scene.object_view import Objects
 from twin.kernels import kernel
-
-Array = NDArray[np.float64]
-Depth = NDArray[np.float32]
 
 STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
 MARGIN_PX = 2.0  #: margin of a map around these points, in its pixels
@@ -30,12 +26,8 @@ BIAS_PX = 1.5  #: least distance of an occluder from a point of an object that f
 STEEPEST = 8.0  #: largest tangent of the angle of incidence by which the bias grows
 
 
-class _LightView(NamedTuple):
-    """View from a light, for its shadow map."""
-
-    light_from_camera: Array  # (4, 4) transform from the axes of the camera to those of the view
-    projection: Projection  # projection of the map
-    shape: tuple[int, int]  # rows and columns of the map
+#: View from a light: light_from_camera (4, 4), the projection of its shadow map, and rows and columns of the map.
+_LightView = tuple[Array, Projection, tuple[int, int]]
 
 
 class ObjectShadows:
@@ -51,9 +43,7 @@ class ObjectShadows:
     ) -> None:  # fmt: skip
         """Sets `lit` (lamps, H, W) to 0 where an object occludes a lamp or the sun (the last mask), or faces away.
 
-        Args:
-            depth: (H, W) float32 depth of floor and objects along the optical axis [m]; inf where there is nothing.
-            moment: camera (0 left, 1 right), and time since the start of the survey [s].
+        `depth` is that of floor and objects; `moment`: camera (0 left, 1 right), and time of the survey [s].
         """
         camera, time_s = moment
         points = self._sampled_points(depth)
@@ -68,16 +58,15 @@ class ObjectShadows:
                 light = _sun_view(camera_from_world[:3, :3] @ self._to_sun, points, depth.shape)
             if light is None:
                 continue
-            nearest = np.full(light.shape, np.inf, np.float32)
-            light_from_world = light.light_from_camera @ camera_from_world
-            casting = self._objects.in_view(light_from_world, light.projection, light.shape, time_s)
-            draw_meshes(casting, light.projection, Target(nearest))
-            matrix = np.ascontiguousarray(light.light_from_camera[:3])
-            scene = lit[k], depth, self._focal_px, *view, nearest, matrix, light.projection
+            light_from_camera, projection, shape = light
+            nearest = np.full(shape, np.inf, np.float32)
+            casting = self._objects.in_view(light_from_camera @ camera_from_world, projection, shape, time_s)
+            draw_meshes(casting, projection, Target(nearest))
+            matrix = np.ascontiguousarray(light_from_camera[:3])
+            scene = lit[k], depth, self._focal_px, *view, nearest, matrix, projection
             in_row_bands(partial(_darken, *scene), len(depth))
 
     def _sampled_points(self, depth: Depth) -> Array:
-        """Returns points (n, 3) [m] of floor and objects in camera axes, on a grid of pixels with spacing STRIDE_PX."""
         height, width = depth.shape
         rows = np.unique(np.append(np.arange(0, height, STRIDE_PX), height - 1))
         cols = np.unique(np.append(np.arange(0, width, STRIDE_PX), width - 1))
@@ -100,7 +89,6 @@ def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightVi
 
 
 def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightView:
-    """Returns the parallel view from the sun."""
     rotation = _axes_along(-to_sun)
     return _view_of((points @ rotation)[:, :2], shape, geometry.pose(rotation, np.zeros(3)), -np.inf, False)
 
@@ -114,7 +102,7 @@ def _view_of(
     low, high = low - MARGIN_PX / scale, high + MARGIN_PX / scale
     cols, rows = np.ceil((high - low) * scale).astype(int) + 1
     projection = Projection(scale, -low[0] * scale, -low[1] * scale, near_m, perspective)
-    return _LightView(geometry.inverse(camera_from_light), projection, (int(rows), int(cols)))
+    return geometry.inverse(camera_from_light), projection, (int(rows), int(cols))
 
 
 def _axes_along(forward: Array) -> Array:
@@ -127,10 +115,9 @@ def _axes_along(forward: Array) -> Array:
 
 @kernel(error_model="numpy")
 def _darken(lit, depth, focal, normal, label, nearest, matrix, projection, first, end):
-    """Sets `lit` (H, W) to 0 in the rows `first` to `end` - 1 where the map `nearest` shows an object that occludes.
+    """Sets `lit` (H, W) to 0 in rows where the map `nearest` shows an object that occludes, or objects face away.
 
-    The bias is one pixel of the map on the floor, and BIAS_PX (1 + t) pixels on an object, t being the tangent of the
-    angle of incidence up to STEEPEST. Surfaces of objects that face away are not lit.
+    The bias is one pixel on the floor, BIAS_PX (1 + t) on objects, t the tangent of incidence up to STEEPEST.
     """
     height, width = depth.shape
     x = (np.arange(width) - 0.5 * (width - 1)) / focal
@@ -176,7 +163,6 @@ def _find_cells(depth, x, y, matrix, projection, shape, cell, reach, bias):
 
 @kernel(error_model="numpy", forceinline=True)
 def _cosine(depth, x, y, normal, matrix, perspective):
-    """Returns the cosine of the angle between the normal (3,) at a point and the light, in camera axes."""
     z = np.float64(depth)
     x, y = x * z, y * z
     nx, ny, nz = normal[0], normal[1], normal[2]

@@ -8,37 +8,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core import geometry
-from twin.core.records import Image, StereoRig
+from twin.core.records import Array, Depth, Image, StereoRig
 from twin.imaging.scene.mesh_raster import NEAR_M, DrawnMesh, ObjectView, Projection, Target, draw_meshes, view_planes
-from twin.imaging.scene.mesh_texture import TexturedSurface, paint_textures
+from twin.imaging.scene.mesh_texture import paint_textures
 from twin.imaging.scene.sway import largest_displacement_m, swayed
+from twin.terrains.objects.detail import UNKNOWN
 from twin.terrains.objects.floor_mesh import FloorTiles
-from twin.terrains.objects.parts import UNKNOWN
 from twin.terrains.objects.placed_object import PlacedObject
-
-Array = NDArray[np.float64]
-Depth = NDArray[np.float32]
+from twin.terrains.objects.texture_pyramid import Textures
 
 LEVEL_PX = 1.0  #: largest side of the cells of a level of detail, in the image [px]
 
 
 class Objects:
-    """Objects in the world, with the level of detail that a view needs; plants sway in the current (3,).
-
-    The tiles of a mesh floor are drawn like objects and numbered after them.
-    """
+    """Objects in the world; plants sway in the current (3,). The tiles of a mesh floor follow, as objects."""
 
     def __init__(
         self, placed: Sequence[PlacedObject], current_mps: Array | None = None, floor: FloorTiles | None = None
     ):
         tiles = () if floor is None else floor.tiles
-        self._n_objects = len(placed)
+        n_objects = len(placed)
         self.placed = placed = (*placed, *(tile.placed for tile in tiles))
-        self._uv = [tile.uv if tile.texture >= 0 else None for tile in tiles]
-        self.surface = None
+        #: `FloorTile.uv` of the tiles with a texture; None for all other meshes
+        self.uv = [None] * n_objects + [tile.uv if tile.texture >= 0 else None for tile in tiles]
+        self.surface: tuple[Textures, NDArray[np.int32]] | None = None  # with the numbers of textures by labels
         if floor is not None and len(floor.textures.levels):
-            of_label = [-1] * (1 + self._n_objects) + [tile.texture for tile in tiles]
-            self.surface = TexturedSurface(floor.textures, np.array(of_label, np.int32))
+            of_label = [-1] * (1 + n_objects) + [tile.texture for tile in tiles]
+            self.surface = floor.textures, np.array(of_label, np.int32)
         self._current_mps = np.zeros(3) if current_mps is None else current_mps
         self._centres_m = np.array([item.centre_m for item in placed]).reshape(-1, 3)
         self._radii_m = np.array([item.radius_m + largest_displacement_m(item, self._current_mps) for item in placed])
@@ -46,10 +42,7 @@ class Objects:
     def in_view(
         self, camera_from_world: Array, view: Projection, shape: tuple[int, int], time_s: float
     ) -> list[DrawnMesh]:
-        """Returns the meshes of the objects in a view of (rows, cols) pixels, by depth of their centres.
-
-        Their labels are 1 + the index in `placed`. `camera_from_world` is (4, 4).
-        """
+        """Returns the meshes in a view of (rows, cols) pixels, by depth; their labels are 1 + the index in `placed`."""
         limits = view_planes(view, shape)
         centres = self._centres_m @ camera_from_world[:3, :3].T + camera_from_world[:3, 3]
         visible = np.all(centres @ limits[:, :3].T + limits[:, 3] >= -self._radii_m[:, None], axis=1)
@@ -64,12 +57,8 @@ class Objects:
             if item.model.sways:
                 mesh, parts = swayed(mesh, item, self._current_mps, time_s), UNKNOWN
             transform, closed = camera_from_world @ item.world_from_object, item.model.closed
-            drawn.append(DrawnMesh(mesh, transform, int(k) + 1, closed, parts, self.uv_of(k)))
+            drawn.append(DrawnMesh(mesh, transform, int(k) + 1, closed, parts, self.uv[k]))
         return drawn
-
-    def uv_of(self, number: int) -> NDArray[np.float32] | None:
-        """Returns `FloorTile.uv` of a tile with a texture; None for all other meshes."""
-        return self._uv[number - self._n_objects] if number >= self._n_objects else None
 
 
 def draw_objects(
@@ -79,20 +68,15 @@ def draw_objects(
     height, width = target.depth.shape
     draw_meshes(objects.in_view(camera_from_world, projection, (height, width), time_s), projection, target)
     if objects.surface is not None:
-        paint_textures(target, projection, objects.surface)
+        paint_textures(target, projection, *objects.surface)
 
 
-class ObjectRenderer:
-    """Renderer that draws objects into images of the floor."""
-
-    def __init__(self, objects: Objects, rig: StereoRig):
-        self._objects = objects
-        self._projection = Projection(rig.focal_px, rig.cx_px, rig.cy_px, NEAR_M, True)
-
-    def draw(self, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float) -> ObjectView:
-        """Draws the objects into `albedo` (H, W, 3) uint8 and `depth` (H, W) [m] in place; returns their view."""
-        view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
-        uv = None if self._objects.surface is None else np.empty((*depth.shape, 3), np.float32)
-        target = Target(depth, albedo, *view, uv)
-        draw_objects(self._objects, target, geometry.inverse(world_from_camera), self._projection, time_s)
-        return view
+def draw_over_floor(
+    objects: Objects, rig: StereoRig, albedo: Image, depth: Depth, world_from_camera: Array, time_s: float
+) -> ObjectView:
+    """Draws the objects into `albedo` (H, W, 3) and `depth` (H, W) [m] of the floor in place; returns their view."""
+    view = ObjectView(np.empty((*depth.shape, 3), np.float32), np.zeros(depth.shape, np.uint16))
+    uv = None if objects.surface is None else np.empty((*depth.shape, 3), np.float32)
+    projection = Projection(rig.focal_px, rig.cx_px, rig.cy_px, NEAR_M, True)
+    draw_objects(objects, Target(depth, albedo, *view, uv), geometry.inverse(world_from_camera), projection, time_s)
+    return view

@@ -1,7 +1,4 @@
-"""Rendering of the floor with MuJoCo: albedo and depth in one pass, without the effects of water and lamps.
-
-The texture of steep parts of the floor is sampled after the rendering, at the points that the depth gives.
-"""
+"""Rendering of the floor with MuJoCo: albedo and depth in one pass; steep parts are textured afterwards, by depth."""
 
 from __future__ import annotations
 
@@ -10,29 +7,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.imaging.scene.mesh_raster import NEAR_M
 from twin.imaging.scene.triplanar import paint_walls, wall_surface
-from twin.scenes.builder import SceneModel
-from twin.scenes.floor import FLOOR_GROUP
+from twin.scenes.builder import FLOOR_GROUP, SceneModel
 from twin.scenes.gl import MjModel, MjvScene, mujoco, offscreen_context
-
-Array = NDArray[np.float64]
 
 _NEAR, _FAR = np.float32(NEAR_M), np.float32(100.0)  # depths of the clipping planes [m]
 
 
 class Renderer:
-    """Renderer of the floor of a scene, without the vehicle, for a pinhole camera (x right, y down, z forward).
-
-    A renderer owns an OpenGL context: create one renderer per process and thread, and `close` it after use.
-
-    Args:
-        width_px, height_px, vfov_deg: image size and vertical field of view; square pixels, centred principal point.
-
-    Raises:
-        TwinError: OpenGL is not available.
-    """
+    """Renderer of the floor for a pinhole camera; `close` it. One per process and thread; TwinError without OpenGL."""
 
     def __init__(self, scene: SceneModel, width_px: int, height_px: int, vfov_deg: float):
         self._scene_model = scene
@@ -89,14 +75,12 @@ class Renderer:
                 setattr(camera, name, value)
 
     def _show(self, visible: NDArray[np.bool_]) -> None:
-        """Shows only the tiles of the mask `visible` (n,)."""
         for k in np.flatnonzero(visible != self._shown):
             self._tiles[k].dataid = self._meshes[k] if visible[k] else -1
         self._shown = visible
 
 
 def _open(model: MjModel, width_px: int, height_px: int) -> tuple[Any, Any]:
-    """Returns a current OpenGL context, and MuJoCo's rendering context in it with the model uploaded."""
     try:
         gl = offscreen_context(width_px, height_px)
         context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_100)
@@ -123,10 +107,7 @@ def _floor_scene(model: MjModel) -> MjvScene:
 
 
 def visible_tiles(scene: SceneModel, world_from_camera: Array, half_tangents: Array) -> NDArray[np.bool_]:
-    """Returns a mask (n,) of the floor tiles that may be in view, not outside a plane of the view frustum.
-
-    `half_tangents` (2,) are those of half the horizontal and vertical field of view.
-    """
+    """Returns a mask (n,) of the tiles not outside a plane of the view frustum, of half tangents (2,) across, down."""
     tx, ty = half_tangents
     inward = np.array([[1, 0, tx], [-1, 0, tx], [0, 1, ty], [0, -1, ty], [0, 0, 1.0]]) @ world_from_camera[:3, :3].T
     low, high = scene.tile_low_m - world_from_camera[:3, 3], scene.tile_high_m - world_from_camera[:3, 3]

@@ -1,18 +1,12 @@
-"""Plants that bend and sway in the current.
-
-The deflection grows with the square of the height above the holdfast (cantilever); it leans with the current and
-oscillates at the frequency at which a body of its width sheds eddies (Strouhal number).
-"""
+"""Plants that lean with the current, by the square of the height, and oscillate at the Strouhal frequency."""
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from twin.core.geometry import Array
 from twin.terrains.objects.coloured_mesh import Mesh
 from twin.terrains.objects.placed_object import PlacedObject
-
-Array = NDArray[np.float64]
 
 HALF_BENT_MPS = 0.5  #: current at which a plant leans by half of its largest lean
 LARGEST_LEAN = 0.6  #: deflection of the tip in a strong current, as a fraction of the height
@@ -22,11 +16,7 @@ WAVES = 0.5  #: number of waves along a plant
 
 
 def swayed(mesh: Mesh, item: PlacedObject, current_mps: Array, time_s: float) -> Mesh:
-    """Returns the mesh of a plant as the current bends it; unchanged without a horizontal current.
-
-    Args:
-        current_mps: (3,) velocity of the current in the world.
-    """
+    """Returns the mesh of a plant as the current (3,) bends it; unchanged without a horizontal current."""
     speed = float(np.hypot(*current_mps[:2]))
     if speed == 0:
         return mesh

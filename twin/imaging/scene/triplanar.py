@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.height_field import rises
-from twin.core.records import Image
+from twin.core.records import Array, Image
 from twin.core.threads import in_row_bands
 from twin.kernels import kernel
 from twin.terrains import Terrain
-
-Array = NDArray[np.float64]
 
 MOST_SAMPLES = 4.0  #: largest number of samples along the major axis of a footprint
 LEAST_COSINE = 0.05  #: smallest cosine of the angle between ray and normal; smaller ones count as this value
@@ -40,9 +38,7 @@ class WallSurface(NamedTuple):
     number: NDArray[np.int32]  # (ny - 1, nx - 1), weights: (n, 2, 2, 2): see `twin.terrains.walls.Walls`
     weights: NDArray[np.float32]
     texels: NDArray[np.uint64]  # (n,) uint64 colours of all levels, row by row
-    # (LEVELS, 3) int64: number of the first texel, rows and columns of each level, finest first. A texel of a level is
-    # the mean of 2 x 2 texels of the level before.
-    levels: NDArray[np.int64]
+    levels: NDArray[np.int64]  # (LEVELS, 3) first texel, rows and columns of each level, finest first
     spacing: np.float32  # distance between the nodes, length of the texture [texels]
     length: np.float32
     corner_m: Array  # (2,) x and y of the south-west corner of the floor [m]
@@ -65,7 +61,7 @@ def wall_surface(terrain: Terrain) -> WallSurface | None:
 
 
 def _levels(texture: Image) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
-    """Returns `WallSurface.texels` and `levels` of a texture (h, w, 3), continued beyond its lower and right edge."""
+    """Returns `texels` and `levels` of a texture (h, w, 3), continued beyond its lower and right edge."""
     period = 2 ** (LEVELS - 1)
     bottom, right = (period + -n % period for n in texture.shape[:2])
     image = cv2.copyMakeBorder(texture, 0, bottom, 0, right, cv2.BORDER_REPLICATE)
@@ -106,7 +102,6 @@ def paint_walls_from_above(
 
 @kernel(fastmath=_FAST, error_model="numpy")
 def _paint(surface, albedo, depth, view, origin, focal, first, end):
-    """Compiled kernel of `paint_walls` for the rows first to end - 1."""
     height, width = depth.shape
     work, steep = np.empty((_N_WORK, width), np.float32), np.empty((3, width), np.int32)
     total, used = np.empty(width, np.uint64), np.empty(width, np.int64)
@@ -122,7 +117,7 @@ def _paint(surface, albedo, depth, view, origin, focal, first, end):
 
 @kernel(fastmath=_FAST, error_model="numpy")
 def _paint_from_above(surface, albedo, columns, rows, step):
-    """Compiled kernel of `paint_walls_from_above`; columns, rows and step are in cells, cells and texels."""
+    """Compiled kernel of `paint_walls_from_above`; columns and rows are in cells, the step in texels."""
     n_rows, n_cols = surface.number.shape
     work, steep = np.empty((_N_WORK, columns.size), np.float32), np.empty((3, columns.size), np.int32)
     total, used = np.empty(columns.size, np.uint64), np.empty(columns.size, np.int64)
@@ -149,8 +144,7 @@ def _paint_from_above(surface, albedo, columns, rows, step):
 def _find(surface, depth, y, view, origin, focal, work, steep):
     """Finds the pixels of a row that show steep cells; returns their number.
 
-    Fills `steep` (3, W) with the column of each such pixel, and column and row of its cell, and rows _COL and _ROW of
-    `work` with its position in the cell.
+    Fills `steep` (3, W) with their columns, and the columns and rows of their cells; _COL and _ROW with positions.
     """
     rows, cols = surface.number.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
@@ -226,7 +220,6 @@ def _project(depth, y, view, focal, spacing, work, steep, n):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _blend(surface, albedo, work, steep, n, total, used):
-    """Blends the texture of the walls into the n steep pixels of a row of the image `albedo` (W, 3)."""
     texels, levels, spacing, length = surface.texels, surface.levels, surface.spacing, surface.length
     for i in range(n):
         total[i], used[i] = np.uint64(0), 0
@@ -256,8 +249,7 @@ def _footprints(across, down, work, n):
     """Fills the rows _MAJOR_ALONG to _LEVEL of `work`: the filter of the pixels.
 
     With J the (2, 2) displacement in the texture to the next pixels, the squared axes of the footprint are the
-    eigenvalues of J J^T. There are as many samples along the major axis as it is longer than the minor, at most
-    MOST_SAMPLES.
+    eigenvalues of J J^T. There are as many samples along the major axis as it is longer than the minor.
     """
     zero, one, half, most = np.float32(0), np.float32(1), np.float32(0.5), np.float32(MOST_SAMPLES)
     size = work[_LEVEL]
@@ -279,7 +271,6 @@ def _footprints(across, down, work, n):
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
 def _filtered(texels, levels, weight, along, turned, work, i, total, used):
-    """Returns the sum `total` of weighted colours and the sum `used` of their weights with those of a pixel added."""
     samples, level = np.int64(work[_SAMPLES, i]), min(work[_LEVEL, i], np.float32(LEVELS - 1.001))
     fine = np.int64(level)
     each = np.int64(weight * np.float32(WHOLE) / work[_SAMPLES, i] + np.float32(0.5))

@@ -1,4 +1,7 @@
-"""Comparison of runs: a table of their metrics with differences, overlaid curves and one HTML page."""
+"""Comparison of runs: a table of their metrics with differences, overlaid curves and one HTML page.
+
+Each figure function returns None if no run has the data that its figure shows.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +10,27 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+from matplotlib.figure import Figure
+
 from twin.core.user_files import resolved
 from twin.errors import TwinError
-from twin.judge.require import numbers_of
-from twin.report import wording
-from twin.report.comparison_figures import RUN_COLOURS, draw_comparison
+from twin.judge.verdict import numbers_of
 from twin.report.headline import badge, first_lines
 from twin.report.html import render_page
+from twin.report.number_formats import DASH, length, milliradians, percent, plain, ratio
+from twin.report.plotting import WIDTH_IN, drawn, legend_beside, log_axis, log_scale, one_panel
 from twin.report.run_folder import Run, load_run
+from twin.report.style import COLOURS
 
 #: Largest number of runs on one page; more curves cannot be told apart.
 MOST_RUNS = 8
+#: Colours of the runs in their order (Okabe & Ito palette, with grey in place of yellow).
+RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5d6d76", "#000000")
+#: Line styles of the runs: coinciding curves stay visible.
+_RUN_STYLES = ("-", "--", "-.", ":") * 2
+#: Runs, each with the style of its curves.
+Styled = Sequence[tuple[Run, dict[str, Any]]]
 
 
 class ComparedQuantity(NamedTuple):
@@ -30,33 +43,33 @@ class ComparedQuantity(NamedTuple):
 
 
 QUANTITIES = (
-    ComparedQuantity("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", wording.length),
-    ComparedQuantity("trajectory.online.ate_rmse_m", "position error, online (RMSE)", wording.length),
-    ComparedQuantity("trajectory.final.ate_rmse_m", "position error, final (RMSE)", wording.length),
-    ComparedQuantity("trajectory.final.ate_max_m", "position error, final (maximum)", wording.length),
-    ComparedQuantity("trajectory.final.z_rmse_m", "height error, final (RMSE)", wording.length),
-    ComparedQuantity("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", wording.milliradians),
-    ComparedQuantity("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", wording.plain, ""),
-    ComparedQuantity("map.le90_m", "LE90 of the map", wording.length),
-    ComparedQuantity("map.nmad_m", "NMAD of the map", wording.length),
-    ComparedQuantity("map.le90_area_m", "LE90 over the asked area", wording.length),
-    ComparedQuantity("map.completeness", "completeness, observed floor", wording.percent, "more"),
-    ComparedQuantity("map.completeness_area", "completeness, asked area", wording.percent, "more"),
-    ComparedQuantity("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", wording.plain),
-    ComparedQuantity("control.cross_track_rmse_m", "cross-track error (RMSE)", wording.length),
-    ComparedQuantity("self_check.frames_lost", "frames without measured motion", wording.percent),
-    ComparedQuantity("timing.frames", "frames", wording.plain, ""),
-    ComparedQuantity("timing.keyframes", "keyframes", wording.plain, ""),
-    ComparedQuantity("timing.wall_s", "computing time [s]", wording.plain),
-    ComparedQuantity("timing.peak_rss_mb", "peak memory [MiB]", wording.plain),
+    ComparedQuantity("trajectory.f2f.ate_rmse_m", "position error, F2F only (RMSE)", length),
+    ComparedQuantity("trajectory.online.ate_rmse_m", "position error, online (RMSE)", length),
+    ComparedQuantity("trajectory.final.ate_rmse_m", "position error, final (RMSE)", length),
+    ComparedQuantity("trajectory.final.ate_max_m", "position error, final (maximum)", length),
+    ComparedQuantity("trajectory.final.z_rmse_m", "height error, final (RMSE)", length),
+    ComparedQuantity("trajectory.final.heading_rmse_deg", "heading error, final (RMSE)", milliradians),
+    ComparedQuantity("consistency.nees_position_mean", "NEES of the positions (mean; 3 is right)", plain, ""),
+    ComparedQuantity("map.le90_m", "LE90 of the map", length),
+    ComparedQuantity("map.nmad_m", "NMAD of the map", length),
+    ComparedQuantity("map.le90_area_m", "LE90 over the asked area", length),
+    ComparedQuantity("map.completeness", "completeness, observed floor", percent, "more"),
+    ComparedQuantity("map.completeness_area", "completeness, asked area", percent, "more"),
+    ComparedQuantity("orthomosaic.ce90_px", "CE90 of the orthomosaic [px]", plain),
+    ComparedQuantity("control.cross_track_rmse_m", "cross-track error (RMSE)", length),
+    ComparedQuantity("self_check.frames_lost", "frames without measured motion", percent),
+    ComparedQuantity("timing.frames", "frames", plain, ""),
+    ComparedQuantity("timing.keyframes", "keyframes", plain, ""),
+    ComparedQuantity("timing.wall_s", "computing time [s]", plain),
+    ComparedQuantity("timing.peak_rss_mb", "peak memory [MiB]", plain),
 )
 
 
 class Cell(NamedTuple):
     """Value of one run in the table, and its difference from that of the first run; None if it is missing.
 
-    `change` is the difference as text, for example "+1.2 mm (+10 %)"; "same" if it is 0; "" if it is None.
-    `level` is "good" or "bad" if the value is better or worse than that of the first run; otherwise "".
+    `change` is the difference as text ("+1.2 mm (+10 %)", "same"), `level` "good" or "bad" against the first run, or
+    "".
     """
 
     value: float | None
@@ -67,19 +80,12 @@ class Cell(NamedTuple):
 
 
 class Row(NamedTuple):
-    """One quantity and its cells, one per run."""
-
     quantity: ComparedQuantity
     cells: list[Cell]
 
 
 def load_runs(folders: Sequence[Path]) -> list[Run]:
-    """Returns the runs in several folders.
-
-    Raises:
-        TwinError: there are fewer than two or more than `MOST_RUNS` folders, or one of them is given twice, is not a
-            run folder, has a damaged file, or has no metrics.json because its survey is unfinished.
-    """
+    """Returns the runs in folders; raises TwinError unless they are 2 to `MOST_RUNS` different, valid and finished."""
     if not 2 <= len(folders) <= MOST_RUNS:
         raise TwinError("RUN", f"{len(folders)} runs", f"2 to {MOST_RUNS}")
     if len({resolved(folder) for folder in folders}) < len(folders):
@@ -117,7 +123,7 @@ def scenario_differences(runs: Sequence[Run]) -> dict[str, list[str]]:
     """Returns the keys of the scenario in which the runs differ, with the value in every run as JSON, or a dash."""
     flat = [dict(_flattened(run.scenario)) for run in runs]
     keys = sorted(set().union(*flat))
-    texts = {key: [_json(one[key]) if key in one else wording.DASH for one in flat] for key in keys}
+    texts = {key: [_json(one[key]) if key in one else DASH for one in flat] for key in keys}
     return {key: values for key, values in texts.items() if len(set(values)) > 1}
 
 
@@ -174,8 +180,72 @@ def render(runs: Sequence[Run]) -> str:
     return render_page("twin.report", "comparison.html.j2", variables)
 
 
+def draw_comparison(runs: Sequence[Run], names: Sequence[str]) -> dict[str, str]:
+    """Returns the PNG data URI of each figure whose data at least one run contains, by name of the figure."""
+    styles = [
+        {"color": colour, "linestyle": style, "label": name}
+        for name, colour, style in zip(names, RUN_COLOURS, _RUN_STYLES, strict=False)
+    ]
+    functions = {"errors": error_curves, "paths": path_curves, "heights": height_error_curves}
+    return drawn(functions, list(zip(runs, styles, strict=True)))
+
+
+def error_curves(runs: Styled) -> Figure | None:
+    """Returns curves of the position error over the length of the true path: online above, final below."""
+    figure = Figure(figsize=(WIDTH_IN, 5.0))
+    panels = figure.subplots(2, 1, sharex=True)
+    for axes, estimate in zip(panels, ("online", "final"), strict=True):
+        for run, style in runs:
+            if "truth" in run.trajectories and estimate in run.trajectories:
+                errors = run.errors(estimate)
+                axes.plot(errors.travelled_m, errors.distance_m, **style)
+        log_scale(axes)
+        axes.set(ylabel=f"position error, {estimate} [m]")
+    panels[1].set_xlabel("length of the true path [m]")
+    if not panels[0].lines and not panels[1].lines:
+        return None
+    (panels[0] if panels[0].lines else panels[1]).legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1.0))
+    return figure
+
+
+def path_curves(runs: Styled) -> Figure | None:
+    """Returns a plan view of the final trajectories over the true path of the first run that has one."""
+    if not any("final" in run.trajectories for run, _ in runs):
+        return None
+    figure, axes = one_panel(4.4)
+    axes.set_aspect("equal", adjustable="datalim")
+    truth = next((run.trajectories["truth"] for run, _ in runs if "truth" in run.trajectories), None)
+    if truth is not None:
+        x, y, _ = truth.positions.T
+        axes.plot(x, y, color=COLOURS["truth"], linewidth=5, alpha=0.25, label="true path")
+    for run, style in runs:
+        if "final" in run.trajectories:
+            x, y, _ = run.trajectories["final"].positions.T
+            axes.plot(x, y, linewidth=1.1, **style)
+    axes.set(xlabel="x (east) [m]", ylabel="y (north) [m]")
+    legend_beside(axes)
+    return figure
+
+
+def height_error_curves(runs: Styled) -> Figure | None:
+    """Returns the cumulative distributions of the absolute height error of the map cells, with a line at 90 %."""
+    figure, axes = one_panel(3.4)
+    share = np.linspace(2, 99.8, 490)  # both tails are long on a logarithmic axis
+    for run, style in runs:
+        size_m = np.abs(run.rasters["dem_error"].values) if "dem_error" in run.rasters else np.zeros(0)
+        size_m = size_m[np.isfinite(size_m)]
+        if len(size_m):
+            axes.plot(np.percentile(size_m, share), share, **style)
+    if not axes.lines:
+        return None
+    axes.axhline(90, color=COLOURS["limit"], linewidth=0.8)
+    axes.set(xlabel="absolute height error [m]", ylabel="cells up to this error [%]", ylim=(0, 100))
+    log_axis(axes.xaxis)
+    legend_beside(axes)
+    return figure
+
+
 def _compared(quantity: ComparedQuantity, value: float | None, first: float | None) -> Cell:
-    """Returns the cell of a value that is compared with that of the first run."""
     text = quantity.text(value)
     if value is None or first is None:
         return Cell(value, text)
@@ -185,14 +255,14 @@ def _compared(quantity: ComparedQuantity, value: float | None, first: float | No
     better = {"less": difference < 0, "more": difference > 0}.get(quantity.better)
     level = "" if better is None else "good" if better else "bad"
     change = f"{'+' if difference > 0 else '-'}{quantity.text(abs(difference))}"
-    if quantity.text is not wording.percent and first > 0:
+    if quantity.text is not percent and first > 0:
         change += f" ({_relative(value / first)})"
     return Cell(value, text, difference, change, level)
 
 
 def _relative(factor: float) -> str:
     """Returns the ratio of two values as text: as a change in percent, e.g. "+10 %", below 3, otherwise as a factor."""
-    return f"{100 * (factor - 1):+.0f} %" if factor < 3 else wording.ratio(factor)
+    return f"{100 * (factor - 1):+.0f} %" if factor < 3 else ratio(factor)
 
 
 def _flattened(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -205,6 +275,5 @@ def _flattened(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 
 def _json(value: Any) -> str:
-    """Returns a value of a scenario as JSON, cut to 80 characters."""
     text = json.dumps(value, default=str)
     return text if len(text) <= 80 else f"{text[:77]}..."

@@ -46,8 +46,7 @@ class ComparisonVision:
 
     Attributes:
         statistics: samples by name; see `fit`.
-        classes: for each class of map cells, the measured values and the medians of the conditions of its cells, by
-            name of the kind of value.
+        classes: measured values and medians of the conditions of each class of map cells, by kind of value.
     """
 
     def __init__(self, images: StereoVision, surrogate: SurrogateVision, true_pose: Callable[[], Array]):
@@ -56,7 +55,7 @@ class ComparisonVision:
         self.runs_in_background = images.runs_in_background
         self.statistics: dict[str, list[float]] = defaultdict(list)
         self.classes: dict[str, list[list[float]]] = defaultdict(list)
-        self.statistics["lamp_share"] = [surrogate.lamp_share]
+        self.statistics["lamp_share"] = [surrogate.matchability.lamp_share]
         self._poses: dict[int, Array] = {}
         self._last_node = -1
         self._last_link: tuple[int, dict[str, Array]] = (-1, {})  # end node and errors of the chain's previous link
@@ -68,20 +67,17 @@ class ComparisonVision:
         last, self._last_pose = self._last_pose, self._true_pose()
         self.statistics["frame_lost"].append(float(status != "ok"))
         if last is not None and status == "ok" and measured.n_points and self.surrogate.frame_errors is not None:
-            true, unit = geometry.inverse(last) @ self._last_pose, self._unit_cov()
+            true = geometry.inverse(last) @ self._last_pose
+            unit = self.surrogate.latest.unit_cov / self.surrogate.rig.focal_px**2  # for flow vectors of 1 px
             error = geometry.log(geometry.inverse(true) @ measured.a_from_b)
             self.statistics["f2f_reported_px"].append(_sigma_ratio(measured.cov, unit))
             self.statistics["f2f_error_px"].append(float(np.sqrt(_chi2(error, unit) / 6)))
             self._frames.append((error, unit))
         return measured, status
 
-    def _unit_cov(self) -> Array:
-        """Returns the covariance (6, 6) of a frame-to-frame motion for flow vectors of 1 px."""
-        return self.surrogate.latest.unit_cov / self.surrogate.rig.focal_px**2
-
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:
         points, sampled = self.images.observe_stereo(frame, row), self.surrogate.observe_stereo(frame, row)
-        self.statistics["binning"] = [float(self.images.binning), float(self.surrogate.binning)]
+        self.statistics["binning"] = [float(self.images.binning), float(self.surrogate.matchability.binning)]
         if len(self._frames) > 1:
             error, cov = (np.sum(x, axis=0) for x in zip(*self._frames, strict=True))
             self.statistics["f2f_interval_px"].append(float(np.sqrt(_chi2(error, cov) / 6)))
@@ -136,7 +132,6 @@ class ComparisonVision:
         self.surrogate.discard(numbers)
 
     def measure_motions(self, node: Keyframe, others: Sequence[Keyframe]) -> list[Motion | None]:
-        """Returns the links measured in images, and adds statistics of their comparison with sampled links."""
         measured = {"images": self.images.measure_motions(node, others)}
         for name, model in single_error_models(self.surrogate.model).items():
             measured[name] = self.surrogate.sample_links(node, others, model)
@@ -149,7 +144,7 @@ class ComparisonVision:
         return measured["images"]
 
     def _compare_link(self, i: int, j: int, links: dict[str, Motion | None], true: Array) -> None:
-        """Adds the statistics of one link, measured in images and sampled with one error source at a time."""
+        """Adds the statistics of one link, measured in images and sampled with the `single_error_models`."""
         measured, sampled = links["images"], links["patches"]
         self.statistics["link_failed"].append(float(measured is None))
         if sampled is not None:
@@ -182,7 +177,7 @@ class ComparisonVision:
         self.surrogate.model = exact_map_model(model)
         exact = self.surrogate.build_map(result, grid, step_cov, lambda _: None)
         self.surrogate.model = model
-        map_model = self.surrogate.scene.map_model
+        map_model = self.surrogate.map_model
         cells, seen = map_model.conditions, map_model.n_heights == 1
         inner = seen & (cells.border_px > _INNER_PX)
         level = cells.roughness_px < _ROUGHNESS_BINS_PX[1]
@@ -201,7 +196,7 @@ class ComparisonVision:
         for low, high in pairwise(_EDGE_BINS):
             strength = cells.edge_m / np.maximum(cells.metres_per_px, 1e-12)
             edge = inner & known & (strength >= low) & (strength < high)
-            self._add_class("edge", edge, lambda one: [_p90(error_m[one]) / _HEAVY_P90])
+            self._add_class("edge", edge, lambda one: [_deviation(error_m[one], 90) / _HEAVY_P90])
         for smoothest, roughest in pairwise(_ROUGHNESS_BINS_PX):
             for low, high in pairwise(_VIEW_BINS):
                 rough = (cells.roughness_px >= smoothest) & (cells.roughness_px < roughest)
@@ -211,7 +206,7 @@ class ComparisonVision:
 
     def _near_walls(self) -> NDArray[np.bool_]:
         """Returns the mask (rows * cols,) of the cells whose matching window shows a wall or an edge."""
-        relief = self.surrogate.scene.map_model.relief
+        relief = self.surrogate.map_model.relief
         wall = (np.hypot(*np.moveaxis(relief.slope, -1, 0)) > WALL_SLOPE) | (relief.edge_m > 0)
         return np.asarray(maximum_filter(wall, 2 * round(relief.window_cells) + 1), np.bool_).ravel()
 
@@ -221,7 +216,7 @@ class ComparisonVision:
         """Adds a class of cells, if it has enough of them: values, then conditions."""
         if chosen.sum() < _MIN_CELLS:
             return
-        conditions = self.surrogate.scene.map_model.conditions
+        conditions = self.surrogate.map_model.conditions
         medians = [float(np.median(part[chosen])) for part in conditions]
         self.classes[kind].append([float(value) for value in values(chosen)] + medians)
 
@@ -252,15 +247,11 @@ def single_error_models(model: ErrorModel) -> dict[str, ErrorModel]:
 def _level_values(error_m: Array, noise_m: Array) -> list[float]:
     """Returns the robust standard deviation of errors, the median reported one, and the scatter of its logarithm."""
     logs = np.percentile(np.log(noise_m), (50, 90))
-    return [_median_size(error_m), float(np.exp(logs[0])), float(logs[1] - logs[0]) / _UPPER_TAIL]
+    return [_deviation(error_m, 50) / _NORMAL_MEDIAN, float(np.exp(logs[0])), float(logs[1] - logs[0]) / _UPPER_TAIL]
 
 
-def _median_size(error_m: Array) -> float:
-    return float(np.median(np.abs(error_m - np.median(error_m)))) / _NORMAL_MEDIAN
-
-
-def _p90(error_m: Array) -> float:
-    return float(np.percentile(np.abs(error_m - np.median(error_m)), 90))
+def _deviation(error_m: Array, percent: float) -> float:
+    return float(np.percentile(np.abs(error_m - np.median(error_m)), percent))
 
 
 def _chi2(error: Array, cov: Array) -> float:
@@ -269,5 +260,5 @@ def _chi2(error: Array, cov: Array) -> float:
 
 
 def _sigma_ratio(cov: Array, other: Array) -> float:
-    """Returns the ratio of the standard deviations of two covariances (n, n), as geometric mean over n directions."""
+    """Returns the ratio of the standard deviations of two covariances, as geometric mean over the directions."""
     return float(np.exp((np.linalg.slogdet(cov)[1] - np.linalg.slogdet(other)[1]) / (2 * len(cov))))

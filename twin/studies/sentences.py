@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.judge.require import more_is_better
-from twin.report.wording import DASH, length, percent, with_unit
+from twin.judge.verdict import more_is_better
+from twin.report.number_formats import DASH, length, percent, with_unit
 from twin.studies.analysis import StudyAnalysis, count_similar
 from twin.studies.answers import Answer
 from twin.studies.statistics import LEVEL, Interval
@@ -32,12 +32,10 @@ _METRIC_NAMES = {
 
 
 def metric_name(metric: str) -> str:
-    """Returns the readable name of a metric, e.g. "map height error (LE90)", or else its dotted name."""
     return _METRIC_NAMES.get(metric, metric)
 
 
 def metric_heading(metric: str) -> str:
-    """Returns the readable name of a metric with a capital first letter."""
     name = metric_name(metric)
     return name[:1].upper() + name[1:]
 
@@ -52,13 +50,12 @@ def metric_value(metric: str, value: float | None) -> str:
 
 
 def metric_interval(metric: str, interval: Interval) -> str:
-    """Returns the estimate of a metric, with its confidence interval in brackets unless the bounds are not finite."""
+    """Returns the estimate of a metric, with its confidence interval in brackets if it is finite."""
     value, low, high = (metric_value(metric, number) for number in interval)
     return f"{value} ({low} to {high})" if np.isfinite(interval.low) else value
 
 
 def correlation(interval: Interval) -> str:
-    """Returns a rank correlation with its confidence interval in brackets; a dash if it is not finite."""
     if not np.isfinite(interval.value):
         return DASH
     return f"{interval.value:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
@@ -70,27 +67,19 @@ def percent_interval(interval: Interval, label: str = "") -> str:
 
 
 def confidence(interval: Interval) -> str:
-    """Returns a fraction in percent with its confidence interval and confidence level in brackets."""
     return percent_interval(interval, f"{percent(LEVEL)} confidence interval: ")
 
 
 def counted(n: int, noun: str) -> str:
-    """Returns a number with its noun, e.g. "1 survey" or "2 surveys"."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 def headline(analysis: StudyAnalysis) -> str:
-    """Returns the main results of a study as text.
-
-    They are the answer for the key that `seek` of the study names, the pass probability, whether the requirement is
-    met, the most frequent reason if no survey passed, the numbers of surveys that are not counted, and the most
-    frequent warning. Without an evaluated survey, only the numbers of surveys that are not counted are given.
-    """
+    """Returns the main results of a study as text; without an evaluated survey, only which surveys are not counted."""
     n, study = int(analysis.evaluated.sum()), analysis.study
     left_out = [*_refused(analysis), *_duplicates(analysis), *_failed(analysis), *_not_flown(analysis)]
     if n == 0:
         return " ".join(["No survey could be evaluated.", *left_out])
-    sought = {} if study.seek is None else {study.seek: analysis.answers.get(study.seek)}
     limits = [
         f"{metric_name(metric)} {'at least' if more_is_better(metric) else 'at most'} {metric_value(metric, limit)}"
         for metric, limit in analysis.limits.items()
@@ -100,25 +89,20 @@ def headline(analysis: StudyAnalysis) -> str:
         f"The pass probability is {confidence(analysis.pass_probability)}: "
         f"{int(analysis.passed.sum())} of {n} surveys {completed}."
     )
-    answers = [answer_sentence(key, found, study.probability) for key, found in sought.items() if found]
+    sought = {key: found for key, found in analysis.answers.items() if key == study.seek}
+    answers = [answer_sentence(key, found, study.probability) for key, found in sought.items()]
     conclusions = [*_requirement(analysis), *_main_reason(analysis)]
     return " ".join([*answers, result, *conclusions, *left_out, *_warnings(analysis)])
 
 
 def answer_lines(analysis: StudyAnalysis) -> list[str]:
-    """Returns for each varied key a sentence on the values at which the required fraction of surveys passes.
-
-    Empty without a required pass probability.
-    """
+    """Returns `answer_sentence` for each varied key; empty without a required pass probability."""
     required = analysis.required_probability
     return [answer_sentence(key, answers, required) for key, answers in analysis.answers.items()]
 
 
 def answer_sentence(key: str, answers: list[Answer], required: float | None) -> str:
-    """Returns a sentence on the values of a key at which enough surveys pass, too few pass, or more must be flown.
-
-    It names only values that were flown.
-    """
+    """Returns a sentence on the flown values of a key at which enough surveys pass, too few, or more must be flown."""
     passes, fails, undecided = (
         [answer for answer in answers if answer.verdict == verdict] for verdict in ("passes", "fails", "undecided")
     )
@@ -145,7 +129,6 @@ def _labels(answers: list[Answer]) -> str:
 
 
 def _more(undecided: list[Answer]) -> str:
-    """Returns a phrase with the number of further surveys that would decide all undecided answers."""
     total = sum(answer.more_surveys for answer in undecided)
     if np.isinf(total):
         if any(answer.unknown for answer in undecided):
@@ -156,7 +139,6 @@ def _more(undecided: list[Answer]) -> str:
 
 
 def throughput(surveys: int, wall_s: float, worker_s: float) -> str:
-    """Returns a phrase with the number of surveys flown in a wall time [s], their rate, and their mean run time."""
     return (
         f"{surveys} surveys in {wall_s:.0f} s, {60 * surveys / wall_s:.3g} per minute; "
         f"mean run time {worker_s / surveys:.2f} s"
@@ -175,7 +157,6 @@ def requirement_verdict(analysis: StudyAnalysis) -> str:
 
 
 def _requirement(analysis: StudyAnalysis) -> list[str]:
-    """States whether the required pass probability is reached, and whether more surveys are needed."""
     required, passing = analysis.required_probability, analysis.pass_probability
     if required is None:
         return []
@@ -192,7 +173,6 @@ def _main_reason(analysis: StudyAnalysis) -> list[str]:
 
 
 def _refused(analysis: StudyAnalysis) -> list[str]:
-    """Describes the samples that cannot be flown or that only the surrogate refuses."""
     sentences = []
     if (refused := analysis.refused & ~analysis.unmodelled).any():
         n, verb, reason = _refusals(analysis, refused)
@@ -208,7 +188,7 @@ def _refused(analysis: StudyAnalysis) -> list[str]:
 
 
 def _refusals(analysis: StudyAnalysis, chosen: NDArray[np.bool_]) -> tuple[str, str, str]:
-    """Returns the numbers of samples and surveys among the chosen ones (n,), the verb, and the most frequent reason."""
+    """Returns numbers of samples and surveys among the chosen ones (n,), verb, and most frequent reason."""
     n = len(np.unique(analysis.numbers("sample")[chosen]))
     count = f"{counted(n, 'sample')} ({counted(int(chosen.sum()), 'survey')})"
     return count, "is" if n == 1 else "are", next(iter(count_similar(analysis.reason[chosen])))
@@ -225,11 +205,8 @@ def _failed(analysis: StudyAnalysis) -> list[str]:
     if not n:
         return []
     lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.counted.sum())))
-    subject, verb, none, again = (
-        ("1 more survey", "is", "it had not", "it")
-        if n == 1
-        else (f"{n} more surveys", "are", "none of them had", "them")
-    )
+    many, one = (f"{n} more surveys", "are", "none of them had", "them"), ("1 more survey", "is", "it had not", "it")
+    subject, verb, none, again = one if n == 1 else many
     return [
         f"{subject} failed because of the computer or the program and {verb} not counted; if {none} passed, the pass "
         f"probability would be {lowest}. Use --resume to fly {again} again."
@@ -248,7 +225,6 @@ def _warnings(analysis: StudyAnalysis) -> list[str]:
 
 
 def independence_note(analysis: StudyAnalysis) -> str:
-    """Returns a sentence on which surveys the confidence intervals assume to be independent."""
     n, name = len(np.unique(analysis.clusters)), analysis.cluster_name
     if n == analysis.rows.num_rows:
         return "The confidence intervals assume that the surveys are independent."
@@ -259,7 +235,6 @@ def independence_note(analysis: StudyAnalysis) -> str:
 
 
 def seeds_note(study: Study) -> str:
-    """Returns a sentence on which surveys share their seeds, i.e. their floor and noise."""
     sampling = study.sampling
     if not sampling.paired:
         return "Each design point has its own seeds, i.e. its own floor and noise."

@@ -1,31 +1,23 @@
-"""Figures of the survey report, and what the figures of all reports share: files, axes, legends, bars.
-
-Each figure function returns None if its data are missing from the run.
-"""
+"""Figures of the survey report. Each figure function returns None if its data are missing from the run."""
 
 from __future__ import annotations
 
-import base64
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LightSource, Normalize
+from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
 
-from twin.judge.processing_budget import stage_times
+from twin.report.number_formats import improvement, length
+from twin.report.plotting import WIDTH_IN, drawn, height_scale, hillshade, legend_beside, log_axis, log_scale, one_panel
 from twin.report.run_folder import Raster, Run
-from twin.report.stage_table import stage_rows
-from twin.report.style import COLOURS, ESTIMATES, FIGURE_STYLE, LABELS
-from twin.report.wording import PROCESSING_STAGES, improvement, length
+from twin.report.stage_tables import PROCESSING_STAGES, stage_rows, stage_times
+from twin.report.style import COLOURS, ESTIMATES, LABELS
 
-WIDTH_IN = 9.6
 #: Longest side of a map in a figure [cells]; maps with more cells are subsampled.
 MAP_CELLS = 500
 #: The true path is drawn as a broad band below the estimates, so it remains visible where they coincide with it.
@@ -45,26 +37,12 @@ def draw_all(run: Run) -> dict[str, str]:
     return drawn(functions, run)
 
 
-def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> dict[str, str]:
-    """Returns the PNG data URI of each figure that a function of `data` draws, by name of the figure."""
-    with matplotlib.rc_context(FIGURE_STYLE):
-        figures = {name: draw(*data) for name, draw in functions.items()}
-        return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
-
-
-def to_data_uri(figure: Figure) -> str:
-    """Returns a figure as a PNG data URI."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.08)
-    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
-
-
 def plan_view(run: Run) -> Figure | None:
     """Returns a plan view of the trajectories and keyframes, over the true floor in grey."""
     if not run.trajectories:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 5.2))
-    axes = _map_axes(figure.add_subplot())
+    figure, axes = one_panel(5.2)
+    _map_axes(axes)
     if "dem_truth" in run.rasters:
         floor = run.rasters["dem_truth"]
         axes.imshow(hillshade(subsampled(floor), "gray"), extent=_extent(floor), alpha=0.35)
@@ -78,11 +56,6 @@ def plan_view(run: Run) -> Figure | None:
     return figure
 
 
-def legend_beside(axes: Axes) -> None:
-    """Adds the legend to the right of the axes."""
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
-
-
 def _add_keyframes(axes: Axes, run: Run) -> None:
     """Plots the keyframes at their final positions, or at their online ones if there is no final trajectory."""
     name = "final" if "final" in run.trajectories else "online"
@@ -93,7 +66,6 @@ def _add_keyframes(axes: Axes, run: Run) -> None:
 
 
 def _limit_to_paths(axes: Axes, run: Run) -> None:
-    """Sets the limits of the axes to the extent of the trajectories plus a margin."""
     xy = np.concatenate([path.positions[:, :2] for path in run.trajectories.values()])
     if len(xy):
         low, high = xy.min(axis=0), xy.max(axis=0)
@@ -122,47 +94,13 @@ def path_error_curves(run: Run) -> Figure | None:
     return figure
 
 
-def log_scale(axes: Axes) -> None:
-    """Makes the y axis logarithmic, from 0.7 times the 1st percentile of the positive values; linear if none is."""
-    sizes = np.concatenate([np.zeros(0), *(np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines)])
-    sizes = sizes[sizes > 0]
-    if len(sizes):
-        log_axis(axes.yaxis)
-        axes.set_ylim(0.7 * float(np.percentile(sizes, 1)), None)
-
-
-class _RoundNumbers(LogLocator):
-    """Ticks at 1, 2 and 5, at 1 and 3 or at 1 times powers of 10: the most whose labels do not touch."""
-
-    def tick_values(self, vmin: float, vmax: float) -> Any:
-        axis: Any = self.axis
-        space = max(axis.get_tick_space() // (2 if axis.axis_name == "x" else 1), 1)  # labels are broader than high
-        decades = 10.0 ** np.arange(np.floor(np.log10(vmin)), np.log10(vmax) + 1)
-        shown = decades
-        for steps in ((1, 2, 5), (1, 3), (1,)):
-            ticks = np.outer(decades, steps).ravel()
-            shown = ticks[(ticks >= vmin) & (ticks <= vmax)]
-            if 0 < len(shown) <= space:
-                break
-        return shown[:: -(-len(shown) // space) or 1]
-
-
-def log_axis(axis: Any, label: Callable[[float], str] = "{:g}".format) -> None:
-    """Makes an x or y axis logarithmic, with labels at round numbers; the default formatter would write raw markup."""
-    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
-    axis.set_major_locator(_RoundNumbers())
-    axis.set_major_formatter(lambda value, _: label(value))
-    axis.set_minor_formatter(lambda *_: "")
-
-
 def stage_bars(run: Run) -> Figure | None:
     """Returns bars of the RMS position error after each positioning stage, with the change from the preceding stage."""
     rows = stage_rows(run.metrics or {}, run.scenario)
     errors_m = [row.rmse_m for row in rows if row.rmse_m]
     if not errors_m:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 0.7 + 0.4 * len(rows)))
-    axes = figure.add_subplot()
+    figure, axes = one_panel(0.7 + 0.4 * len(rows))
     bars = {LABELS[row.stage]: (row.rmse_m, COLOURS[row.stage]) for row in rows}
     for y, row in zip(_rows_of_bars(axes, bars, 0.62), rows, strict=True):
         notes = [length(row.rmse_m), improvement(row.gain), row.disabled]
@@ -187,8 +125,7 @@ def track_bars(run: Run) -> Figure | None:
     tracks = (run.metrics or {}).get("tracks") or []
     if not tracks:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 2.6))
-    axes = figure.add_subplot()
+    figure, axes = one_panel(2.6)
     bars = np.arange(len(tracks))
     for shift, key, role, label in ((-0.2, "before", "online", "before GA"), (0.2, "after", "final", "after GA")):
         values = [row[f"{key}_ga_rmse_m"] or 0.0 for row in tracks]
@@ -225,7 +162,7 @@ def elevation_maps(run: Run) -> Figure | None:
     rasters = [(run.rasters[key], title) for key, title in titles.items() if key in run.rasters]
     if not rasters:
         return None
-    scale = _height_scale(np.concatenate([raster.values.ravel() for raster, _ in rasters]))
+    scale = height_scale(np.concatenate([raster.values.ravel() for raster, _ in rasters]))
     figure = Figure(figsize=(WIDTH_IN, 4.0))
     panels = figure.subplots(1, len(rasters), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (raster, title) in zip(panels, rasters, strict=True):
@@ -268,8 +205,7 @@ def error_histogram(run: Run) -> Figure | None:
     size = size[np.isfinite(size)]
     if len(size) == 0:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 2.8))
-    axes = figure.add_subplot()
+    figure, axes = one_panel(2.8)
     top = max(float(np.percentile(size, 99.5)), 1e-6)
     axes.hist(np.minimum(size, top), bins=80, range=(0, top), color=COLOURS["online"], alpha=0.85)
     for key, label in (("p85_m", "85th percentile"), ("le90_m", "LE90"), ("le95_m", "LE95")):
@@ -285,8 +221,8 @@ def network_plot(run: Run) -> Figure | None:
     positions, edges = run.network
     if len(positions) == 0:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 4.4))
-    axes = _map_axes(figure.add_subplot())
+    figure, axes = one_panel(4.4)
+    _map_axes(axes)
     axes.set_adjustable("datalim")  # a network along a line fills the figure too
     links = list(positions[edges][:, :, :2])
     axes.add_collection(LineCollection(links, colors=COLOURS["link"], linewidths=0.5, alpha=0.6))
@@ -301,8 +237,7 @@ def timing_bars(run: Run) -> Figure | None:
     rows = [row for row in stages if row.mean_ms is not None]
     if not rows:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 0.6 + 0.34 * len(rows)))
-    axes = figure.add_subplot()
+    figure, axes = one_panel(0.6 + 0.34 * len(rows))
     colours = [COLOURS["online" if row.budget_ms else "link"] for row in rows]
     bars = {PROCESSING_STAGES[r.stage]: (r.mean_ms or 0.0, colour) for r, colour in zip(rows, colours, strict=True)}
     for y, row in zip(_rows_of_bars(axes, bars, 0.6), rows, strict=True):
@@ -320,41 +255,13 @@ def subsampled(raster: Raster) -> np.ndarray:
     return raster.values[::step, ::step]
 
 
-def _height_scale(heights: np.ndarray) -> tuple[float, float]:
-    """Returns the 0.5th and 99.5th percentile of the finite heights [m]; (0, 1) if there are none."""
-    finite = heights[np.isfinite(heights)]
-    low, high = np.percentile(finite, [0.5, 99.5]) if len(finite) else (0.0, 1.0)
-    return float(low), float(high)
-
-
-def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None = None) -> np.ndarray:
-    """Returns hill-shaded RGBA colours (rows, cols, 4), lit from the north-west; cells without data are transparent.
-
-    Heights (rows, cols) [m] are clipped to `scale`, the lowest and highest height of the colour map `cmap` (by default
-    `_height_scale`), because a single outlier would remove the shading from all other cells.
-    """
-    empty = ~np.isfinite(heights)
-    low, high = scale or _height_scale(heights)
-    filled = np.clip(np.where(empty, (low + high) / 2, heights), low, high)
-    shaded = LightSource(315, 45).shade(
-        filled,
-        matplotlib.colormaps[cmap],
-        Normalize(low, high),
-        "soft",
-        vert_exag=0.12 * max(heights.shape) / ((high - low) or 1.0),
-    )
-    shaded[..., 3] = ~empty
-    return shaded
-
-
 def _extent(raster: Raster) -> tuple[float, float, float, float]:
-    """Returns the west, east, south and north edges of a raster [m], in the order of matplotlib's `extent`."""
+    """Returns the edges of a raster [m] in the order of matplotlib's `extent`: west, east, south, north."""
     grid = raster.grid
     return (grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m)
 
 
 def _map_axes(axes: Axes) -> Axes:
-    """Returns the axes after setting equal scales and the labels of a map."""
     axes.set_aspect("equal")
     axes.grid(visible=False)
     axes.set(xlabel="east [m]", ylabel="north [m]")

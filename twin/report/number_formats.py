@@ -1,4 +1,4 @@
-"""Numbers with units as texts, and the names of processing stages and alignments in reports."""
+"""Numbers with units as texts in reports."""
 
 from __future__ import annotations
 
@@ -12,29 +12,6 @@ _UNITS = {
     "_m": " m", "_s": " s", "_ms": " ms", "_deg": " deg", "_px": " px", "_percent": " %", "_mb": " MiB",
 }  # fmt: skip
 
-#: Display names of the processing stages in metrics.json (`timing.stages`) and of the sum of all keyframe stages.
-PROCESSING_STAGES = {
-    "physics": "simulator: physics",
-    "render": "simulator: rendering",
-    "optics": "simulator: water and sensor",
-    "f2f": "frame-to-frame motion (F2F)",
-    "f2m": "registration with the mosaic (F2M)",
-    "stereo": "stereo matching",
-    "flow": "optical flow between keyframes",
-    "network": "keyframe network",
-    "ga": "global alignment (GA)",
-    "map": "elevation map",
-    "orthomosaic": "orthomosaic",
-    "keyframe": "all keyframe processing",
-}
-
-#: How the estimates of a replay were moved to the recorded truth, by the name of the alignment.
-REPLAY_ALIGNMENTS = {
-    "se3": "aligned with the truth by the best rigid motion (SE(3))",
-    "first": "anchored at the first true pose",
-    "none": "without alignment",
-}
-
 
 def length(value_m: float | None) -> str:
     """Returns a length as text in mm, cm or m; a dash for None."""
@@ -47,10 +24,7 @@ def length(value_m: float | None) -> str:
 
 
 def percent(fraction: float | None) -> str:
-    """Returns a fraction as text in percent with at most one decimal; a dash for None, NaN and infinity.
-
-    Fractions that are not 0 or 1 but would be rounded to 0 % or 100 % are given as "< 0.1 %" or "> 99.9 %".
-    """
+    """Returns a fraction in percent, with "< 0.1 %" and "> 99.9 %" near 0 and 1; a dash for None, NaN and infinity."""
     if fraction is None or not math.isfinite(fraction):
         return DASH
     value = 100 * fraction
@@ -62,7 +36,6 @@ def percent(fraction: float | None) -> str:
 
 
 def angle(value_deg: float | None) -> str:
-    """Returns an angle as text in degrees; a dash for None."""
     return DASH if value_deg is None else f"{value_deg:.2f}°"
 
 
@@ -77,11 +50,7 @@ def ratio(value: float | None) -> str:
 
 
 def improvement(gain: float | None) -> str:
-    """Returns the change of an error as text, e.g. "2.0 × smaller"; "" for gains of 0.95 to 1.05 and for None.
-
-    Args:
-        gain: error before divided by error after; None if unknown.
-    """
+    """Returns the change of an error, e.g. "2.0 × smaller", from before / after; "" for 0.95 to 1.05 and None."""
     if gain is None or 0.95 <= gain <= 1.05:
         return ""
     return f"{ratio(gain)} smaller" if gain > 1 else f"{ratio(1 / gain)} larger"

@@ -12,23 +12,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from twin.report.figures import WIDTH_IN, log_axis, to_data_uri
+from twin.report.number_formats import percent
+from twin.report.plotting import WIDTH_IN, log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
-from twin.report.wording import percent
 from twin.studies import agreement, statistics
 from twin.studies.analysis import Mask, MetricSummary, Sensitivity, StudyAnalysis
+from twin.studies.sentences import metric_name, metric_value
 from twin.studies.statistics import Array, Interval
-from twin.studies.wording import metric_name, metric_value
 
 PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
 _MAX_POINTS = 3000
 
 
 def draw_all(analysis: StudyAnalysis, compared: bool) -> dict[str, str]:
-    """Returns the figures for which the study has data, as {figure name: data URI}.
-
-    `compared` is whether the study has pairs of rendered and surrogate surveys.
-    """
+    """Returns {name: data URI} of the figures for which the study has data; `compared`: it has pairs of surveys."""
     with matplotlib.rc_context(FIGURE_STYLE):
         drawn = {
             "pass_probability": pass_probability(analysis),
@@ -45,7 +42,7 @@ def draw_all(analysis: StudyAnalysis, compared: bool) -> dict[str, str]:
 
 
 def make_panels(count: int, columns: int = 3, row_in: float = 2.7) -> tuple[Figure, list[Axes]]:
-    """Returns a figure and its `count` axes, in rows of at most `columns`; by default, four axes form a square."""
+    """Returns a figure and its axes, in rows of at most `columns`; by default, four form a square."""
     columns = 2 if count == 4 and columns == 3 else min(columns, count)
     rows = -(-count // columns)
     figure = Figure(figsize=(WIDTH_IN if columns > 1 else WIDTH_IN * 0.62, row_in * rows))
@@ -56,10 +53,7 @@ def make_panels(count: int, columns: int = 3, row_in: float = 2.7) -> tuple[Figu
 
 
 def value_axis(axis: Any, values: Array, ticks: int | None = None) -> bool:
-    """Makes an axis logarithmic if that suits the values, else limits its ticks; returns whether it is logarithmic.
-
-    It suits values that are all positive, of which the largest exceeds the smallest by a factor of 8.
-    """
+    """Makes an axis logarithmic, and returns True, if all values are positive and span more than a factor of 8."""
     is_log = bool(values.min(initial=np.inf) > 0 and values.max(initial=0) > 8 * values.min(initial=np.inf))
     if is_log:
         log_axis(axis)
@@ -69,18 +63,15 @@ def value_axis(axis: Any, values: Array, ticks: int | None = None) -> bool:
 
 
 def metric_axis(axis: Any, metric: str) -> None:
-    """Formats the ticks of an axis in the unit of the metric."""
     axis.set_major_formatter(lambda value, _: metric_value(metric, value))
     axis.set_tick_params(labelsize=8)
 
 
 def axis_label(metric: str) -> str:
-    """Returns the name of a metric, wrapped to the width of one plot."""
     return textwrap.fill(metric_name(metric), 26)
 
 
 def pass_probability(analysis: StudyAnalysis) -> Figure | None:
-    """Plots the pass probability against each varied key."""
     if not analysis.keys or not analysis.evaluated.any():
         return None
     figure, panels = make_panels(len(analysis.keys))
@@ -131,7 +122,7 @@ def _error_bars(axes: Axes, x: Array, intervals: list[Interval]) -> None:
 
 
 def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
-    """Plots the histogram of each metric that has two or more values, with its median, 95 % bound and limit."""
+    """Plots the histogram of each metric with two or more values, its median, 95 % bound and limit."""
     summaries = [summary for summary in summaries if summary.surveys > 1]
     if not summaries:
         return None
@@ -153,7 +144,6 @@ def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -
 
 
 def _histogram(axes: Axes, samples: list[Array], values: Array, ticks: int | None = None, **style: Any) -> None:
-    """Plots a stacked histogram of samples, in bins over the range of all values (n,)."""
     is_log = value_axis(axes.xaxis, values, ticks)
     count = int(np.clip(2 * len(values) ** (1 / 3), 5, 40))
     low, high = float(values.min()), float(values.max())
@@ -187,7 +177,7 @@ def metric_by_key(analysis: StudyAnalysis, metric: str) -> Figure | None:
 
 
 def _dots(axes: Axes, x: Array, y: Array, passed: Mask, rng: np.random.Generator) -> None:
-    """Plots surveys as dots whose colour shows whether they passed; of more than 3000, a random subset of 3000."""
+    """Plots surveys, of more than 3000 a random subset, as dots whose colour shows whether they passed."""
     shown = rng.permutation(len(x))[:_MAX_POINTS]
     for mask, colour in ((passed, POINTS), (~passed, NOT_PASSED)):
         subset = shown[mask[shown]]
@@ -195,7 +185,6 @@ def _dots(axes: Axes, x: Array, y: Array, passed: Mask, rng: np.random.Generator
 
 
 def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
-    """Plots the rank correlation of each metric with each numeric key, with its confidence interval."""
     shown = [s for s in sensitivities if np.isfinite(s.correlation.value)]
     metrics, keys = list(dict.fromkeys(s.metric for s in shown)), list(dict.fromkeys(s.key for s in shown))
     if not shown:
@@ -216,7 +205,7 @@ def sensitivity(sensitivities: list[Sensitivity]) -> Figure | None:
 
 
 def key_histograms(analysis: StudyAnalysis) -> Figure | None:
-    """Plots a stacked histogram of each numeric key: surveys that passed, and surveys that did not pass."""
+    """Plots a stacked histogram of each numeric key: surveys that passed, and that did not."""
     good, bad = analysis.evaluated & analysis.passed, analysis.evaluated & ~analysis.passed
     numeric = {key: x for key in analysis.keys if (x := analysis.key_numbers(key)) is not None}
     if not numeric or not good.any() or not bad.any():
@@ -232,7 +221,6 @@ def key_histograms(analysis: StudyAnalysis) -> Figure | None:
 
 
 def agreement_of_pairs(analysis: StudyAnalysis) -> Figure:
-    """Plots the surrogate against the rendered values of each compared metric."""
     figure, panels = make_panels(len(analysis.study.compare))
     for metric, axes in zip(analysis.study.compare, panels, strict=True):
         _draw_pairs(axes, *agreement.values_of_pairs(analysis, metric))

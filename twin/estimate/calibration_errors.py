@@ -1,7 +1,11 @@
-"""Scale of the lengths that the images give, compared with those of DVL, USBL and pressure.
+"""Errors of the calibration that the motions between keyframes show: an offset of all disparities, and wrong lengths.
 
-An error of the baseline scales all lengths, one of the focal length only those along the optical axis. Two scales are
-therefore estimated, across the axis and along it; the second is observable only where the camera moves along it.
+An offset of all disparities (principal point, yaw of a camera) is observable over relief, where the image motions of
+near and far points must be proportional to their disparities. Over a level floor it is not, and the scatter between
+links does not reveal that.
+
+Lengths are compared with those of DVL, USBL and pressure. An error of the baseline scales all lengths, one of the focal
+length only those along the optical axis, whose scale is observable only where the camera moves along it.
 """
 
 from __future__ import annotations
@@ -14,13 +18,52 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import LengthScale
+from twin.core.quality import DisparityOffset, LengthScale
 from twin.core.records import SensorNoise, StereoRig
+from twin.estimate.link_selection import RECURRENCE
 from twin.estimate.navigation.dvl import body_displacement
 from twin.estimate.vision.stereo import Keyframe
 
+#: Largest median standard deviation of the offset from a single link at which the offset counts as observable [px].
+MAX_LINK_SIGMA_PX = 0.3
 _MOST_SIGMA = 0.1  # a scale with a larger standard deviation is not observed
 _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many times that of all sensors together
+
+
+def disparity_offset(
+    offsets: Sequence[DisparityOffset], n_nodes: int, n_views: float, focal_px: float
+) -> DisparityOffset | None:
+    """Returns the weighted mean of the offsets of the links, with their standard deviations of independent links.
+
+    None without offsets or nodes, and where the offset is not observable (`MAX_LINK_SIGMA_PX`). The variance is
+    multiplied by the links per node, which share stereo points (if above 1), by 1 + c (m - 1) for nodes that share the
+    errors of relief, with c = `RECURRENCE` and m = `n_views` (`mean_views`), and by the mean chi-square if above 1.
+    """
+    if not offsets or n_nodes < 1:
+        return None
+    value, sigma = np.array(offsets).T
+    if np.median(sigma) * focal_px > MAX_LINK_SIGMA_PX:
+        return None
+    weight = sigma**-2
+    mean = float(np.sum(weight * value) / np.sum(weight))
+    chi2 = float(np.mean(weight * (value - mean) ** 2))
+    shared_by = max(len(offsets) / n_nodes, 1.0) * (1 + RECURRENCE * (n_views - 1))
+    variance = max(chi2, 1.0) * shared_by / float(np.sum(weight))
+    return DisparityOffset(mean, variance**0.5)
+
+
+def mean_views(world_from_camera: Array, depth_m: Array, rig: StereoRig) -> float:
+    """Returns the mean number of nodes that see a floor point in the image of a node, this node included.
+
+    It is the mean sum of a node's overlaps with all nodes, of poses (n, 4, 4) and median depths (n,). The overlap of
+    two images is that of their rectangles on a plane parallel to the first one at its depth; rotations are neglected.
+    """
+    images_per_unit = np.array([rig.fx_px / rig.width_px, rig.fy_px / rig.height_px])
+    views = []
+    for pose, depth in zip(world_from_camera, depth_m, strict=True):
+        shift = geometry.transform(geometry.inverse(pose), world_from_camera[:, :3, 3])[:, :2] / depth * images_per_unit
+        views.append(np.sum(np.prod(np.clip(1 - np.abs(shift), 0.0, None), axis=1)))
+    return float(np.mean(views)) if views else 1.0
 
 
 class _Fit(NamedTuple):
@@ -33,10 +76,7 @@ class _Fit(NamedTuple):
 def length_scales(
     nodes: Sequence[Keyframe], links: Links, rig: StereoRig, noise: SensorNoise
 ) -> tuple[LengthScale | None, LengthScale | None]:
-    """Returns the scales of the lengths from the images across and along the optical axis; None where not observed.
-
-    The links are the measured motions between the nodes; those between consecutive nodes are used.
-    """
+    """Returns the scales of the lengths from the images across and along the optical axis; None where not observed."""
     number = np.array([node.number for node in nodes])
     at_i, at_j = np.searchsorted(number, links.i), np.searchsorted(number, links.j)
     consecutive = links.select((links.n_points > 0) & (at_j == at_i + 1))
@@ -71,10 +111,7 @@ def _fits(
 
 
 def _dvl(nodes: Sequence[Keyframe], steps: Sequence[Link | None], rig: StereoRig) -> _Fit | None:
-    """Returns the fit to the DVL's displacements between consecutive nodes, in the axes of the earlier camera.
-
-    A small rotation between the axes of DVL and camera is estimated with the factors.
-    """
+    """Returns the fit to the DVL's displacements, in earlier camera axes, turned by a small unknown rotation."""
     to_camera, rows = rig.body_from_camera[:3, :3].T, []
     for node, step in zip(nodes[1:], steps, strict=True):
         if step is None or node.dvl_displacement is None:
@@ -95,10 +132,7 @@ def _split(moved: Array) -> Array:
 
 
 def _paths(nodes: Sequence[Keyframe], steps: Sequence[Link | None]) -> tuple[Array, Array]:
-    """Returns the sums (n, 3) of the motions across and along the optical axis by the images alone, in world axes.
-
-    The motion between two nodes without a link is that of their estimated poses.
-    """
+    """Returns the sums (n, 3) of the motions across and along the optical axis; without a link, that of the poses."""
     parts, rotation = [np.zeros((3, 2))], nodes[0].world_from_camera[:3, :3] if nodes else np.eye(3)
     for a, b, step in zip(nodes[:-1], nodes[1:], steps, strict=True):
         motion = geometry.inverse(a.world_from_camera) @ b.world_from_camera if step is None else step.i_from_j
@@ -109,7 +143,7 @@ def _paths(nodes: Sequence[Keyframe], steps: Sequence[Link | None]) -> tuple[Arr
 
 
 def _absolute(measured: Array, across: Array, along: Array, sigma_m: float) -> _Fit | None:
-    """Returns the fit to positions (n, 3) with NaN where unknown; their origin and a small rotation are estimated."""
+    """Returns the fit to positions (n, 3), NaN where unknown; their origin and a small rotation are estimated."""
     known = np.isfinite(measured)
     turn = np.array([geometry.skew(p) for p in across + along]).reshape(-1, 3, 3)
     nuisance = np.concatenate([turn, np.tile(np.eye(3), (len(turn), 1, 1))], axis=2)

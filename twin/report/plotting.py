@@ -1,0 +1,102 @@
+"""What the figures of all reports share: files, axes, legends, hill shading."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LightSource, Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
+
+from twin.report.style import FIGURE_STYLE
+
+WIDTH_IN = 9.6
+
+
+def drawn(functions: Mapping[str, Callable[..., Figure | None]], *data: Any) -> dict[str, str]:
+    """Returns the PNG data URI of each figure that a function of `data` draws, by name of the figure."""
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figures = {name: draw(*data) for name, draw in functions.items()}
+        return {name: to_data_uri(figure) for name, figure in figures.items() if figure is not None}
+
+
+def to_data_uri(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", bbox_inches="tight", pad_inches=0.08)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def one_panel(height_in: float) -> tuple[Figure, Axes]:
+    """Returns a figure of the usual width with one pair of axes."""
+    figure = Figure(figsize=(WIDTH_IN, height_in))
+    return figure, figure.add_subplot()
+
+
+def legend_beside(axes: Axes) -> None:
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
+
+
+def log_scale(axes: Axes) -> None:
+    """Makes the y axis logarithmic, from 0.7 times the 1st percentile of the positive values; linear if none is."""
+    sizes = np.concatenate([np.zeros(0), *(np.asarray(curve.get_ydata(), dtype=float) for curve in axes.lines)])
+    sizes = sizes[sizes > 0]
+    if len(sizes):
+        log_axis(axes.yaxis)
+        axes.set_ylim(0.7 * float(np.percentile(sizes, 1)), None)
+
+
+class _RoundNumbers(LogLocator):
+    """Ticks at 1, 2 and 5, at 1 and 3 or at 1 times powers of 10: the most whose labels do not touch."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        axis: Any = self.axis
+        space = max(axis.get_tick_space() // (2 if axis.axis_name == "x" else 1), 1)  # labels are broader than high
+        decades = 10.0 ** np.arange(np.floor(np.log10(vmin)), np.log10(vmax) + 1)
+        shown = decades
+        for steps in ((1, 2, 5), (1, 3), (1,)):
+            ticks = np.outer(decades, steps).ravel()
+            shown = ticks[(ticks >= vmin) & (ticks <= vmax)]
+            if 0 < len(shown) <= space:
+                break
+        return shown[:: -(-len(shown) // space) or 1]
+
+
+def log_axis(axis: Any, label: Callable[[float], str] = "{:g}".format) -> None:
+    """Makes an x or y axis logarithmic, with labels at round numbers; the default formatter would write raw markup."""
+    axis.axes.set(**{f"{axis.axis_name}scale": "log"})
+    axis.set_major_locator(_RoundNumbers())
+    axis.set_major_formatter(lambda value, _: label(value))
+    axis.set_minor_formatter(lambda *_: "")
+
+
+def height_scale(heights: np.ndarray) -> tuple[float, float]:
+    """Returns the 0.5th and 99.5th percentile of the finite heights [m]; (0, 1) if there are none."""
+    finite = heights[np.isfinite(heights)]
+    low, high = np.percentile(finite, [0.5, 99.5]) if len(finite) else (0.0, 1.0)
+    return float(low), float(high)
+
+
+def hillshade(heights: np.ndarray, cmap: str, scale: tuple[float, float] | None = None) -> np.ndarray:
+    """Returns hill-shaded RGBA colours (rows, cols, 4), lit from the north-west; cells without data are transparent.
+
+    Heights (rows, cols) [m] are clipped to `scale`, the ends of the colour map (by default `height_scale`): a single
+    outlier would remove the shading from all other cells.
+    """
+    empty = ~np.isfinite(heights)
+    low, high = scale or height_scale(heights)
+    filled = np.clip(np.where(empty, (low + high) / 2, heights), low, high)
+    shaded = LightSource(315, 45).shade(
+        filled,
+        matplotlib.colormaps[cmap],
+        Normalize(low, high),
+        "soft",
+        vert_exag=0.12 * max(heights.shape) / ((high - low) or 1.0),
+    )
+    shaded[..., 3] = ~empty
+    return shaded
