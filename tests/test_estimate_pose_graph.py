@@ -146,7 +146,9 @@ def chordal_poses(links):
 
 def solved_from(poses, links, huber=None):
     """Returns the solution of the links from initial poses, of which the first is fixed."""
-    return pose_graph.optimise(graph_of(poses, links, huber, sigma=1e-6), pose_graph.GraphState(np.array(poses)))
+    return pose_graph.optimise(
+        graph_of(poses, links, huber, sigma=1e-6), pose_graph.GraphState(np.array(poses), np.empty(0))
+    )
 
 
 def test_the_small_grid_reaches_the_optimum_of_gtsam(public_graph):
@@ -196,7 +198,7 @@ def test_a_lawnmower_survey_of_500_nodes_has_the_optimum_and_marginals_of_gtsam(
     start = np.array([poses[0] @ geometry.inverse(first[0]) @ first[k] for k in range(n)])
     assert np.linalg.norm(start[:, :3, 3] - np.array(poses)[:, :3, 3], axis=1).max() > 5e-3  # not already the optimum
     graph = graph_of(poses, links)
-    first = pose_graph.optimise(graph, pose_graph.GraphState(start))
+    first = pose_graph.optimise(graph, pose_graph.GraphState(start, np.empty(0)))
     assert first.converged
     solution = pose_graph.optimise(graph, first.state)  # the first run stops 5e-4 above the minimum of the cost
 
@@ -236,7 +238,7 @@ def test_huber_loss_reduces_the_influence_of_an_outlier():
 def test_chi2_is_the_squared_whitened_residual(huber):
     """The cost is half their sum, except for residuals above Huber's limit, which count linearly."""
     poses, links = ring(np.random.default_rng(4), share_of_sigma=2.5)
-    solution = pose_graph.optimise(graph_of(poses, links, huber), pose_graph.GraphState(np.array(poses)))
+    solution = pose_graph.optimise(graph_of(poses, links, huber), pose_graph.GraphState(np.array(poses), np.empty(0)))
     expected, losses = [], []
     for link in links:
         i_from_j = geometry.inverse(solution.state.poses[link.i]) @ solution.state.poses[link.j]
@@ -252,7 +254,7 @@ def test_chi2_is_the_squared_whitened_residual(huber):
 def test_marginals_of_all_nodes_are_those_of_gtsam():
     _, links = ring(np.random.default_rng(5))
     start = solved_from(chordal_poses(links), links).state.poses
-    solution = pose_graph.optimise(graph_of(start, links), pose_graph.GraphState(start))
+    solution = pose_graph.optimise(graph_of(start, links), pose_graph.GraphState(start, np.empty(0)))
     oracle = gtsam.Marginals(gtsam_graph(links, start[0]), gtsam_values(solution.state.poses))
     one_by_one = [solution.marginal(k) for k in range(12)]
     covs = solution.marginals_in_place()
@@ -271,7 +273,7 @@ def along_x(measured_m, reading=lambda x_m: x_m):
         x_m, step = i_from_j[:, 0, 3], 1e-6
         by_j = np.zeros((len(x_m), 1, 6))
         by_j[:, 0, 3] = (reading(x_m + step) - reading(x_m - step)) / (2 * step)
-        return by_j, None
+        return by_j
 
     n = len(measured_m)
     distances = pose_graph.BinaryFactors(
@@ -284,7 +286,7 @@ def along_x(measured_m, reading=lambda x_m: x_m):
 def start_at(x):
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = x
-    return pose_graph.GraphState(poses)
+    return pose_graph.GraphState(poses, np.empty(0))
 
 
 def test_a_linear_problem_is_factorised_once(monkeypatch):
@@ -327,16 +329,19 @@ def test_a_shared_parameter_is_solved_together_with_the_poses():
 
     def jacobians(i_from_j, shared, residuals):
         by_j = np.zeros((n - 1, 1, 6))
-        by_j[:, 0, 3:] = (1 + shared) * i_from_j[:, 0, :3]
-        return by_j, i_from_j[:, :1, 3]
+        by_j[:, 0, 3:] = (1 + shared[0]) * i_from_j[:, 0, :3]
+        return by_j
+
+    def by_shared(i_from_j, batch, n_shared):
+        return i_from_j[:, :1, 3, None]
 
     scaled = pose_graph.BinaryFactors(
         i, i + 1, information,
-        lambda i_from_j, shared: ((1 + shared) * i_from_j[:, 0, 3] - measured)[:, None], jacobians,
+        lambda i_from_j, shared: ((1 + shared[0]) * i_from_j[:, 0, 3] - measured)[:, None], jacobians, None, by_shared,
     )  # fmt: skip
-    unscaled = graph_of(poses, links)
-    graph = unscaled._replace(binary=[*unscaled.binary, scaled], shared_sigma=sigma)
-    solution = pose_graph.optimise(graph, pose_graph.GraphState(poses))
+    unscaled, prior = graph_of(poses, links), pose_graph.SharedPrior(np.zeros(1), np.array([sigma]))
+    graph = unscaled._replace(binary=[*unscaled.binary, scaled], shared=prior)
+    solution = pose_graph.optimise(graph, pose_graph.GraphState(poses, np.zeros(1)))
 
     def cost(unknowns):
         moved = np.array(
@@ -365,10 +370,10 @@ def test_an_unconstrained_pose_is_reported():
     poses, links = ring(np.random.default_rng(9))
     unconnected = graph_of([*poses, np.eye(4)], links)
     with pytest.raises(np.linalg.LinAlgError, match="the factors do not constrain every pose"):
-        pose_graph.optimise(unconnected, pose_graph.GraphState(np.array([*poses, np.eye(4)])))
+        pose_graph.optimise(unconnected, pose_graph.GraphState(np.array([*poses, np.eye(4)]), np.empty(0)))
     for seed in range(10):
         poses, links = ring(np.random.default_rng(seed))
         weak = pose_graph.prior_factors([0], np.array(poses[:1]), np.diag([1e-6] * 5 + [1e30])[None])
         floating = graph_of(poses, links)._replace(unary=[weak])
         with pytest.raises(np.linalg.LinAlgError):
-            pose_graph.optimise(floating, pose_graph.GraphState(np.array(poses)))
+            pose_graph.optimise(floating, pose_graph.GraphState(np.array(poses), np.empty(0)))

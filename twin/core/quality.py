@@ -29,6 +29,29 @@ class DisparityOffset(NamedTuple):
     sigma: float  #: standard deviation of `estimate`
 
 
+class YawEffect(NamedTuple):
+    """Yaw of the right camera away from the left one, estimated from a motion between keyframes, and its effect."""
+
+    estimate: float  #: rotation since the calibration [rad]
+    sigma: float  #: standard deviation of `estimate`
+    by_yaw: Array  #: (6,) change of the measured motion per rotation (rad, m per rad), in the axes of the later camera
+    removed_rad: float = 0.0  #: rotation for which the images were corrected before the motion was measured
+
+
+class CalibrationEstimate(NamedTuple):
+    """Errors of the calibration that the last global alignment estimated together with the poses (true minus believed).
+
+    They are 0 and exact where the calibration is taken as exact.
+    """
+
+    yaw_rad: float = 0.0  #: rotation of the right camera away from the left one
+    baseline_error: float = 0.0  #: relative error of the baseline
+    cov: Array = np.zeros((2, 2))  #: covariance of both
+
+
+EXACT = CalibrationEstimate()
+
+
 class LengthScale(NamedTuple):
     """Lengths from the images divided by those of navigation sensors; 1 is expected."""
 
@@ -58,6 +81,7 @@ class EstimationQuality(NamedTuple):
     frame_sigma_m: float | None = None
     #: offset common to all disparities, from the links; None without images or if it is not observable.
     disparity_offset: DisparityOffset | None = None
+    calibration: CalibrationEstimate = EXACT  #: errors of the calibration found by self-calibration
     #: number of independent errors equivalent to the position errors of all keyframes; None without a final alignment.
     independent_errors: float | None = None
     #: length_scale, depth_scale: scale of image lengths across and along the optical axis; None without a sensor.

@@ -44,6 +44,10 @@ class StereoRig:
     focal_y_px: float | None = None
     #: (cx, cy); by default the image centre ((width - 1) / 2, (height - 1) / 2).
     principal_point_px: tuple[float, float] | None = None
+    #: yaw_sigma_rad, baseline_sigma: standard deviations of the yaw between the cameras and of the relative change of
+    #: the baseline since the calibration; 0: exact, and not estimated.
+    yaw_sigma_rad: float = 0.0
+    baseline_sigma: float = 0.0
 
     @property
     def fx_px(self) -> float:

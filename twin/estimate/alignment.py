@@ -13,16 +13,20 @@ import numpy as np
 
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
+from twin.core.quality import CalibrationEstimate, DisparityOffset
 from twin.core.records import Mask, SensorNoise, StereoRig
 from twin.estimate.adjustment.pose_graph import (
+    BinaryFactors,
     FactorGraph,
     GraphState,
     Solution,
+    UnaryFactors,
     motion_factors,
     optimise,
     prior_factors,
 )
 from twin.estimate.navigation import aiding
+from twin.estimate.self_calibration import SharedParameters, shared_parameters
 from twin.estimate.vision.stereo import Keyframe
 
 _OUTLIER_CHI2 = 40.0  # chi-square with six degrees of freedom; one inlier in 2 million exceeds it
@@ -41,6 +45,7 @@ class AlignmentResult(NamedTuple):
     dropped: list[Link]  #: links that were removed as outliers
     link_chi2: float  #: mean chi-square of the remaining links per degree of freedom; 1 is expected, 0 without links
     converged: bool  #: false if the iterations ended before the minimum was reached
+    calibration: CalibrationEstimate  #: errors of the calibration, estimated with the poses
     #: number of independent position errors to which those of all nodes are equivalent (`_independent_errors`); None
     #: unless the covariances of all nodes were requested.
     independent_errors: float | None = None
@@ -53,6 +58,7 @@ def align(
     rig: StereoRig,
     noise: SensorNoise,
     marginals_of: Sequence[int] | None = None,
+    offset: DisparityOffset | None = None,
 ) -> AlignmentResult:
     """Returns the maximum-likelihood poses of a window of nodes, their covariances, and the links removed as outliers.
 
@@ -61,14 +67,18 @@ def align(
         anchors: prior covariance (6, 6) [rotation, translation] (rad, m) of each anchored node, by node number; the
             prior mean is the node's initial pose. Numbers of nodes that are not in the window are ignored.
         marginals_of: numbers of the nodes whose covariance is computed; all if None.
+        offset: offset of all disparities, measured by the links; used if the calibration states that it may have one.
 
     Raises:
         LinAlgError: the links, anchors and sensor readings do not constrain every node.
     """
-    index_of = {node.number: k for k, node in enumerate(nodes)}
     links, dropped = Links.from_sequence(links), list[Link]()
-    graph = _factor_graph(nodes, links, anchors, rig, noise)
-    solution = optimise(graph, GraphState(np.array([node.world_from_camera for node in nodes])), _ROUND_ITERATIONS)
+    displacements = [kind for kind in [aiding.displacement_factors(nodes, rig)] if len(kind.i)]
+    shared = shared_parameters(rig, noise, bool(displacements), offset)
+    unary = [_anchor_factors(nodes, anchors), *aiding.unary_factors(nodes, rig, noise)]
+    graph = FactorGraph(len(nodes), unary, [_motion_factors(nodes, links, shared), *displacements], shared.prior)
+    start = GraphState(np.array([node.world_from_camera for node in nodes]), shared.prior.mean)
+    solution = optimise(graph, start, _ROUND_ITERATIONS)
     for _ in range(_MAX_ROUNDS):
         outliers = _outliers(graph, solution.chi2[0])
         if not outliers.any():
@@ -76,41 +86,38 @@ def align(
         dropped += links.select(outliers)
         links, state = links.select(~outliers), solution.state
         del solution  # frees its Cholesky factor before the next one is allocated
-        graph = graph._replace(binary=[motion_factors(links, index_of, _HUBER), *graph.binary[1:]])
+        graph = graph._replace(binary=[_motion_factors(nodes, links, shared), *displacements])
         solution = optimise(graph, state, _ROUND_ITERATIONS)
     if not solution.converged:
         state = solution.state
         del solution
         solution = optimise(graph, state, _MAX_ITERATIONS)
-    poses, chi2 = solution.state.poses, _mean_chi2(links, solution.chi2[0])
+    poses, chi2, calibration = solution.state.poses, _mean_chi2(links, solution.chi2[0]), shared.estimate(solution)
     if marginals_of is None:
         draws = _draw_positions(solution)  # before the marginals, which overwrite the factor
         covs = solution.marginals_in_place()
         independent = _independent_errors(draws, covs[1:, 3:, 3:])
-        return AlignmentResult(poses, covs, dropped, chi2, solution.converged, independent)
+        return AlignmentResult(poses, covs, dropped, chi2, solution.converged, calibration, independent)
     covs = np.zeros((len(nodes), 6, 6))
-    for number in marginals_of:
-        covs[index_of[number]] = solution.marginal(index_of[number])
-    return AlignmentResult(poses, covs, dropped, chi2, solution.converged)
+    for k, node in enumerate(nodes):
+        if node.number in marginals_of:
+            covs[k] = solution.marginal(k)
+    return AlignmentResult(poses, covs, dropped, chi2, solution.converged, calibration)
 
 
-def _factor_graph(
-    nodes: Sequence[Keyframe], links: Links, anchors: dict[int, Array], rig: StereoRig, noise: SensorNoise
-) -> FactorGraph:
-    """Returns the factor graph of links, anchors and navigation sensors; the first binary factors are the links."""
-    index_of = {node.number: k for k, node in enumerate(nodes)}
-    anchored = [node for node in nodes if node.number in anchors]
-    priors = prior_factors(
-        [index_of[node.number] for node in anchored],
-        np.array([node.world_from_camera for node in anchored]).reshape(-1, 4, 4),
-        np.array([anchors[node.number] for node in anchored]).reshape(-1, 6, 6),
+def _anchor_factors(nodes: Sequence[Keyframe], anchors: dict[int, Array]) -> UnaryFactors:
+    """Returns the priors of the anchored nodes, at their initial poses."""
+    anchored = [(k, node) for k, node in enumerate(nodes) if node.number in anchors]
+    return prior_factors(
+        [k for k, _ in anchored],
+        np.array([node.world_from_camera for _, node in anchored]).reshape(-1, 4, 4),
+        np.array([anchors[node.number] for _, node in anchored]).reshape(-1, 6, 6),
     )
-    unary = [priors, *aiding.unary_factors(nodes, rig, noise)]
-    motions = motion_factors(links, index_of, _HUBER)
-    displacements = aiding.displacement_factors(nodes, rig)
-    if not len(displacements.i):
-        return FactorGraph(len(nodes), unary, [motions])
-    return FactorGraph(len(nodes), unary, [motions, displacements], noise.dvl_scale)
+
+
+def _motion_factors(nodes: Sequence[Keyframe], links: Links, shared: SharedParameters) -> BinaryFactors:
+    index_of = {node.number: k for k, node in enumerate(nodes)}
+    return motion_factors(links, index_of, _HUBER, shared.effect_on(links))
 
 
 def _outliers(graph: FactorGraph, chi2: Array) -> Mask:

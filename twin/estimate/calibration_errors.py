@@ -18,7 +18,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import DisparityOffset, LengthScale
+from twin.core.quality import DisparityOffset, LengthScale, YawEffect
 from twin.core.records import SensorNoise, StereoRig
 from twin.estimate.link_selection import RECURRENCE
 from twin.estimate.navigation.dvl import body_displacement
@@ -31,7 +31,7 @@ _SHARE = 3.0  # a sensor is named if its standard deviation is at most this many
 
 
 def disparity_offset(
-    offsets: Sequence[DisparityOffset], n_nodes: int, n_views: float, focal_px: float
+    offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, n_views: float, focal_px: float
 ) -> DisparityOffset | None:
     """Returns the weighted mean of the offsets of the links, with their standard deviations of independent links.
 
@@ -41,7 +41,7 @@ def disparity_offset(
     """
     if not offsets or n_nodes < 1:
         return None
-    value, sigma = np.array(offsets).T
+    value, sigma = np.array([offset[:2] for offset in offsets]).T
     if np.median(sigma) * focal_px > MAX_LINK_SIGMA_PX:
         return None
     weight = sigma**-2

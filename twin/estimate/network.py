@@ -3,7 +3,7 @@ from __future__ import annotations
 import time
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -14,13 +14,14 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Link, Links
-from twin.core.quality import DisparityOffset
+from twin.core.quality import CalibrationEstimate, DisparityOffset, YawEffect
 from twin.core.records import Alignment, Displacement, SensorNoise, StereoRig
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer
 from twin.errors import SurveyAborted
-from twin.estimate import link_selection
+from twin.estimate import calibration_errors, link_selection
 from twin.estimate.alignment import AlignmentResult, align
+from twin.estimate.self_calibration import fused
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision_interface import Vision
 
@@ -35,7 +36,9 @@ class LinkAttempt(NamedTuple):
 
     link: Link | None  #: None if the measurement failed
     residual: float = np.nan  #: residual of the points divided by the expected one; NaN if the measurement failed
-    disparity_offset: DisparityOffset | None = None  #: None if the points of the link do not determine it
+    #: disparity_offset, yaw: see `Motion`; None if the points of the link do not determine it.
+    disparity_offset: DisparityOffset | None = None
+    yaw: YawEffect | None = None
 
 
 @dataclass
@@ -47,13 +50,15 @@ class AlignmentHistory:
     #: before_ga, after_ga: positions (n, 3) of the keyframes just before and after each alignment of a track [m].
     before_ga: list[Array] = field(default_factory=list[Array])
     after_ga: list[Array] = field(default_factory=list[Array])
-    #: link_residuals, disparity_offsets: those of all `LinkAttempt`s; offsets that are None are left out.
+    #: link_residuals, disparity_offsets, yaws: those of all `LinkAttempt`s; offsets that are None are left out.
     link_residuals: list[float] = field(default_factory=list[float])
     disparity_offsets: list[DisparityOffset] = field(default_factory=list[DisparityOffset])
+    yaws: list[YawEffect] = field(default_factory=list[YawEffect])
     #: standard deviations (3-D) of positions relative to the previous keyframe, by F2F alone [m], where known.
     frame_sigmas_m: list[float] = field(default_factory=list[float])
     nodes_bridged: int = 0  #: number of nodes whose link to the previous node is the F2F motion
     independent_errors: float | None = None  #: see `AlignmentResult`, of the final alignment; None before it
+    calibration: CalibrationEstimate = CalibrationEstimate()  #: that of the last alignment
 
 
 class KeyframeNetwork:
@@ -110,7 +115,10 @@ class KeyframeNetwork:
             LinkAttempt(None)
             if motion is None
             else LinkAttempt(
-                link_selection.to_link(node, other, overlap, motion), motion.residual, motion.disparity_offset
+                link_selection.to_link(node, other, overlap, motion),
+                motion.residual,
+                motion.disparity_offset,
+                motion.yaw,
             )
             for (other, overlap), motion in zip(others, motions, strict=True)
         ]
@@ -165,6 +173,7 @@ class KeyframeNetwork:
             self.links.add(links + bridge)
             self.history.link_residuals += [attempt.residual for attempt in attempts]
             self.history.disparity_offsets += [a.disparity_offset for a in attempts if a.disparity_offset is not None]
+            self.history.yaws += [attempt.yaw for attempt in attempts if attempt.yaw is not None]
 
     def align_window(self, track: int) -> Array | None:
         """Aligns the nodes of the window of tracks that ends with `track`, and rebuilds the mosaic from this track.
@@ -218,6 +227,19 @@ class KeyframeNetwork:
         self.nodes = [k for k in self.nodes if k.row < n_frames]
         self.links = self.links.select(self.links.j < len(self.keyframes))
 
+    def yaw_rad(self) -> tuple[float, float]:
+        """Returns the yaw of the right camera by all links so far and by the calibration, and its sigma [rad]."""
+        pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
+        return fused(self.rig.yaw_sigma_rad, self.disparity_offset([*self.history.yaws, *pending]))
+
+    def disparity_offset(self, offsets: Sequence[DisparityOffset | YawEffect]) -> DisparityOffset | None:
+        """Returns the mean of the offsets of links (`calibration_errors.disparity_offset`)."""
+        if not offsets:
+            return None
+        poses, depth_m = (np.array([getattr(n, key) for n in self.nodes]) for key in ("world_from_camera", "depth_m"))
+        n_views = calibration_errors.mean_views(poses, depth_m, self.rig)
+        return calibration_errors.disparity_offset(offsets, len(self.nodes) - 1, n_views, self.rig.focal_px)
+
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
         """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
 
@@ -231,8 +253,9 @@ class KeyframeNetwork:
         everyone = [k for k in self.nodes if k.number in fixed] + nodes
         anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
         start_s = time.perf_counter()
+        yaw = self.disparity_offset(self.history.yaws) if self.rig.yaw_sigma_rad else None
         try:
-            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals)
+            aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, yaw)
         except np.linalg.LinAlgError as error:
             self._alignable = False
             raise SurveyAborted(f"global alignment failed: {error}") from None
@@ -240,6 +263,7 @@ class KeyframeNetwork:
         sizes = len(everyone), len(links), len(aligned.dropped)
         self.history.alignments.append(Alignment(track, ms, *sizes, aligned.link_chi2, aligned.converged))
         self.history.dropped += aligned.dropped
+        self.history.calibration = aligned.calibration
         if aligned.dropped:
             dropped = {link[:2] for link in aligned.dropped}
             ends = zip(self.links.i.tolist(), self.links.j.tolist(), strict=True)

@@ -35,7 +35,7 @@ from twin.core.records import (
 from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import StageTimer, Stopwatch
-from twin.estimate.calibration_errors import disparity_offset, length_scales, mean_views
+from twin.estimate.calibration_errors import length_scales
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
@@ -246,6 +246,8 @@ class Navigator:
             cov = self.filter.since_node_cov + np.eye(6) * 1e-10
             bridge = Link(self.network.nodes[-1].number, node.number, self.filter.since_node, cov, 0.0, 0)
         self.network.connect(node, chain, bridge, self.filter.start_from_node(node.number))
+        if self.rig.yaw_sigma_rad:
+            self.vision.correct_yaw(*self.network.yaw_rad())
 
     def align_track(self, track: int) -> None:
         """Aligns the window of tracks that ends with `track`; the online pose is corrected as the last keyframe is.
@@ -298,9 +300,7 @@ class Navigator:
         history, nodes = self.network.history, self.network.nodes
         residuals, alignments = np.array(history.link_residuals), history.alignments
         failed, counts = np.isnan(residuals), self.filter.gates.counts
-        poses, depth_m = np.array([n.world_from_camera for n in nodes]), np.array([n.depth_m for n in nodes])
-        n_views = mean_views(poses, depth_m, self.rig) if history.disparity_offsets else 1.0
-        offset = disparity_offset(history.disparity_offsets, len(nodes) - 1, n_views, self.rig.focal_px)
+        offset = None if self.rig.yaw_sigma_rad else self.network.disparity_offset(history.disparity_offsets)
         across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
             frames_lost=self.log.n_lost,
@@ -314,6 +314,7 @@ class Navigator:
             epipolar=self.vision.epipolar_error(),
             frame_sigma_m=float(np.percentile(history.frame_sigmas_m, 90)) if history.frame_sigmas_m else None,
             disparity_offset=offset,
+            calibration=history.calibration,
             independent_errors=history.independent_errors,
             length_scale=across,
             depth_scale=along,

@@ -119,7 +119,7 @@ def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
     epipolar, focal_px = result.quality.epipolar, damage.rig.focal_px
     if epipolar is None:
         return
-    yaw, sigma = float(epipolar.estimate[1]), float(epipolar.sigma[1])
+    yaw, sigma = float(epipolar.estimate[1]) - result.quality.calibration.yaw_rad, float(epipolar.sigma[1])
     if abs(yaw) > _SIGNIFICANT * sigma:
         text = (
             f"row differences imply a yaw of {np.rad2deg(yaw):+.3f} deg between the cameras, or a distortion error:"

@@ -136,6 +136,7 @@ class StereoVision:
         depth_m = self.rig.focal_px * self.rig.baseline_m / far_enough_px
         self._points, self._depth_m = points, depth_m.astype(np.float32)
         self.spool.put(row, left, corrected, (self._gray, gray))
+        self.matcher.removed_yaw[row] = float(self.calibration.removed[1])
         self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left, corrected)))
         return points
 
@@ -238,6 +239,9 @@ class StereoVision:
     def epipolar_error(self) -> EpipolarError:
         return self.calibration.report()
 
+    def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> None:
+        self.calibration.correct_yaw(yaw_rad, sigma_rad, self.full_rig)
+
     def discard(self, numbers: range) -> None:
         """Does nothing: the images are on disk, so there is no memory to release."""
 
@@ -245,11 +249,13 @@ class StereoVision:
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
         rows = result.keyframe_rows
-        images = (self._binned(*self.spool.pair(int(row))) for row in rows)
+        pairs = (self._binned(*self.spool.pair(int(row))) for row in rows)
+        removed_rad = np.array([self.matcher.removed_yaw[row] for row in rows.tolist()])
+        yaw_rad = result.quality.calibration.yaw_rad - removed_rad
         chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
         pattern = light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
-        path = KeyframePath(result.final.world_from_camera[rows], result.node_cov, step_cov)
-        return build_map(images, path, self.rig, grid, progress, pattern)
+        path = KeyframePath(result.final.world_from_camera[rows], result.node_cov, step_cov, yaw_rad)
+        return build_map(pairs, path, self.rig, grid, progress, pattern, result.quality.calibration)
 
     def _binned(self, left: Image, right: Image) -> ImagePair:
         return matching.binned(left, self.binning), matching.binned(right, self.binning)

@@ -59,6 +59,10 @@ class Vision(Protocol):
         """Returns the estimated errors of the rectification; None if row differences are not measured."""
         ...
 
+    def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> None:
+        """Corrects the right images from now on for a yaw of the right camera and its standard deviation [rad]."""
+        ...
+
     def discard(self, numbers: range) -> None:
         """Frees the memory of the keyframes with these numbers, for which `measure_motions` is not called any more."""
         ...

@@ -68,6 +68,12 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
         "roll_deg": roll,
         "row_shift": None if epipolar is None else float(epipolar.estimate[3]),
         "row_pattern": None if epipolar is None else epipolar.pattern,
+        "calibration": {
+            "yaw_deg": float(np.rad2deg(quality.calibration.yaw_rad)),
+            "yaw_sigma_deg": float(np.rad2deg(quality.calibration.cov[0, 0] ** 0.5)),
+            "baseline_error": quality.calibration.baseline_error,
+            "baseline_error_sigma": float(quality.calibration.cov[1, 1] ** 0.5),
+        },
         "disparity_offset": None if quality.disparity_offset is None else quality.disparity_offset.estimate,
         "sigma_max_m": float(np.sqrt(variances.max())) if len(variances) else None,
         "frame_sigma_m": quality.frame_sigma_m,

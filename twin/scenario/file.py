@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 from twin.core.user_files import is_file, read_text, resolved
 from twin.errors import ScenarioError, TwinError, did_you_mean
 from twin.scenario.model import Scenario, Source
+from twin.scenario.rigs import REPLACED, RigFile, find_rig, sections_of
 from twin.scenario.toml_lines import key_lines
 from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVELS, parse_toml, value_errors
 
@@ -35,6 +36,7 @@ _RENAMED_KEYS = {
 #: Sections with a key `plugin`, and the group of its entry points.
 _PLUGIN_SECTIONS = {"control": "controllers", "estimate": "estimators", "terrain": "terrains"}
 _IN_PYTHON = "in Python: allow_plugins=True"
+_RIG = "rig.model"
 #: Keys of [terrain] that say which floor it is.
 _FLOOR_KEYS = ("kind", "plugin", "height_file", "mesh_file")
 #: Largest number of errors that are listed.
@@ -50,7 +52,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins
     tree, source, errors = _read_with_base(find_scene(path))
     base = copy.deepcopy(tree)
     source = source.model_copy(update={"overrides": tuple(overrides), "allow_plugins": allow_plugins})
-    for override in overrides:
+    for override in sorted(overrides, key=lambda one: not one.startswith(f"{_RIG}=")):
         try:
             _apply_override(tree, override)
         except ScenarioError as error:
@@ -84,13 +86,14 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
     ScenarioError if a key is renamed or cannot be set, or the scenario is invalid.
     """
     changed = copy.deepcopy(dict(tree))
-    for key, value in values.items():
+    for key, value in sorted(values.items(), key=lambda item: item[0] != _RIG):
         if new_key := _renamed(key):
             raise ScenarioError([source.describe(TwinError(key, f"renamed to {new_key}"))])
         if value == "" and _is_path_key(key):
             continue
         try:
             _assign(changed, key, _absolute(key, value, source.path.parent), key)
+            _take_rig(changed, changed, source.path.parent)
         except ScenarioError as error:
             problem = error.lines[0].removeprefix(f"{key}: ")
             raise ScenarioError([source.describe(TwinError(key, problem))]) from None
@@ -201,16 +204,46 @@ def _read_with_base(file: Path, including: tuple[Path, ...] = ()) -> tuple[dict[
     tree = _absolute("", tree, file.parent)
     base = tree.pop("extends", None)
     if base is None:
-        return tree, source, errors
+        return _merged(tree, {}, source), source, errors
     base_file = resolved(file.parent / str(base))
     if not is_file(base_file) and (base_file := _built_in_scenes().get(str(base))) is None:
         allowed = f"a path relative to this file, or one of {', '.join(_built_in_scenes())}"
         message = f"no such file {shown(repr(str(base)))} (allowed: {allowed})"
         raise ScenarioError([*errors, f"{file}:{lines.get('extends', 1)}: extends: {message}"])
     base_tree, base_source, base_errors = _read_with_base(base_file, (*including, resolved(file)))
-    merged = _merge(base_tree, tree)
+    merged = _merged(tree, base_tree, source)
     _leave_objects_on_their_floor(merged, base_tree)
     return merged, source.model_copy(update={"base": base_source}), errors + base_errors
+
+
+def _merged(tree: dict[str, Any], base: dict[str, Any], source: Source) -> dict[str, Any]:
+    """Returns the keys of a file merged over those of its base file, or over those of the rig that it names."""
+    try:
+        _take_rig(tree, base, source.path.parent)
+    except ScenarioError:
+        raise
+    except TwinError as error:
+        raise ScenarioError([source.describe(error)]) from None
+    return _merge(base, tree)
+
+
+def _take_rig(tree: dict[str, Any], base: dict[str, Any], folder: Path) -> None:
+    """Removes rig.model from a tree; replaces what `base` says about cameras and lamps by the rig of that name.
+
+    Raises TwinError if there is no such rig, ScenarioError if its file is invalid.
+    """
+    rig = tree.get("rig")
+    model = rig.pop("model", None) if isinstance(rig, dict) else None
+    if not isinstance(model, str):
+        if model is not None:
+            rig["model"] = model  # refused by the validation
+        return
+    file = find_rig(model, folder)
+    sections, lines = read_toml(file)
+    validated(sections, RigFile, Source(path=file, lines=lines))
+    for key in REPLACED:
+        base.pop(key, None)
+    base |= sections_of(sections)
 
 
 def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:
@@ -268,6 +301,12 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     value = _override_value(key, text)
     value = str(value) if _is_path_key(key) and not isinstance(value, list) else value
     _assign(tree, key, _absolute(key, value, Path.cwd()), f"--set {shown(override)}")
+    try:
+        _take_rig(tree, tree, Path.cwd())
+    except ScenarioError:
+        raise
+    except TwinError as error:
+        raise ScenarioError([f"--set: {error}"]) from None
 
 
 def _override_value(key: str, text: str) -> Any:

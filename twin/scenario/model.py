@@ -34,6 +34,7 @@ from twin.scenario.water_sources import WATER_SOURCES, WaterSourceName
 FINEST_TEXEL_M, COARSEST_TEXEL_M = 0.0006, 0.005  #: limits of the default size of a texel [m]
 SEA_WATER_INDEX = 1.339  #: refractive index of sea water in visible light
 PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry point
+_CALIBRATION_STREAM = 7311  # of random numbers, for the calibration error of a dive
 _VISIBLE_NOISE = 1e-4  # noise that changes an 8-bit image, a fraction of full scale
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
 AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
@@ -181,6 +182,11 @@ class VehicleConfig(Section):
 class RigConfig(Section):
     """Calibrated stereo pair that looks down, with the top of the image towards the bow."""
 
+    model: str | None = Field(default=None, min_length=1, max_length=500)
+    """name of a rig in scenes/rigs, or its file: cameras, sensor, lens, port, calibration error and lamps. They replace
+    those of the files that this file extends; keys beside it change single values"""
+    title: str = Field(default="", max_length=80)
+    """name of the rig for reports, set by model"""
     image_width_px: int = Field(default=320, ge=64, le=4096)
     """image width [px]"""
     image_height_px: int = Field(default=240, ge=48, le=4096)
@@ -328,8 +334,15 @@ class PortConfig(Section):
 class CalibrationErrorConfig(Section):
     """Calibration error: true camera parameters minus those that the estimators use.
 
-    The errors of focal length and baseline are relative to the values that the estimators use.
+    The errors of focal length and baseline are relative to the values that the estimators use. Errors that change from
+    dive to dive are given as standard deviations: each seed draws its own, and the estimators know how large they may
+    be.
     """
+
+    rotation_sigma_deg: float = Field(default=0.0, ge=0, le=2)
+    """standard deviation of the rotation of the right camera about each of its axes, drawn by the seed [deg]"""
+    baseline_sigma_mm: float = Field(default=0.0, ge=0, le=20)
+    """standard deviation of the error of the baseline, drawn by the seed [mm]"""
 
     focal_error: float = Field(default=0.0, ge=-0.2, le=0.2)
     """relative error of the focal length of both cameras"""
@@ -742,6 +755,25 @@ class Scenario(Section):
         width_m = 2.0 * self.plan.altitude_m * np.tan(np.deg2rad(self.rig.hfov_deg) / 2)
         return float(np.clip(width_m / self.rig.image_width_px, FINEST_TEXEL_M, COARSEST_TEXEL_M))
 
+    def true_calibration_error(self) -> CalibrationErrorConfig:
+        """Returns the calibration error with the errors that the seed draws."""
+        error = self.calibration_error
+        if not (error.rotation_sigma_deg or error.baseline_sigma_mm):
+            return error
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(_CALIBRATION_STREAM,)))
+        roll, pitch, yaw, baseline = rng.standard_normal(4).tolist()
+        sigma = error.baseline_sigma_mm / 1000 / self.rig.baseline_m
+        return error.model_copy(
+            update={
+                "right_roll_deg": error.right_roll_deg + error.rotation_sigma_deg * roll,
+                "right_pitch_deg": error.right_pitch_deg + error.rotation_sigma_deg * pitch,
+                "right_yaw_deg": error.right_yaw_deg + error.rotation_sigma_deg * yaw,
+                "baseline_error": error.baseline_error + sigma * baseline,
+                "rotation_sigma_deg": 0.0,
+                "baseline_sigma_mm": 0.0,
+            }
+        )
+
     def believed_rig(self) -> StereoRig:
         """Returns the calibration that the estimators use; the true cameras differ from it by the calibration error."""
         rig = self.rig
@@ -750,7 +782,12 @@ class Scenario(Section):
         position = np.array([forward, left + rig.baseline_m / 2, up])
         body_from_camera = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, position)
         size = rig.image_width_px, rig.image_height_px
-        return StereoRig(*size, focal_px, rig.baseline_m, rig.frame_rate_hz, body_from_camera)
+        error = self.calibration_error
+        return StereoRig(
+            *size, focal_px, rig.baseline_m, rig.frame_rate_hz, body_from_camera,
+            yaw_sigma_rad=float(np.deg2rad(error.rotation_sigma_deg)),
+            baseline_sigma=error.baseline_sigma_mm / 1000 / rig.baseline_m,
+        )  # fmt: skip
 
     def believed_noise(self) -> SensorNoise:
         navigation = self.navigation

@@ -290,6 +290,9 @@ class SurrogateVision:
     def epipolar_error(self) -> EpipolarError | None:
         return None if self._rows is None else self._rows.report()
 
+    def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> None:
+        """Does nothing: the measurements are those of exactly calibrated cameras."""
+
     def discard(self, numbers: range) -> None:
         for number in numbers:
             self._keyframes.pop(number, None)

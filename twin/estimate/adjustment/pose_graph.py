@@ -4,8 +4,9 @@ The cost F is the sum of rho(r) over the binary and of r^2 / 2 over the unary fa
 residual, log(Z_ij^-1 X_i^-1 X_j) for a measured motion Z_ij, and rho either r^2 / 2 or Huber's loss. It is minimised by
 Gauss-Newton, with Levenberg-Marquardt damping after a step that increased F; X exp(d) replaces X.
 
-A scalar with a zero-mean prior may be shared by binary factors (scale error of the DVL). It adds a row and a column,
-the border, to the normal equations, which the Schur complement of the block of the poses solves.
+Parameters with a Gaussian prior may be shared by binary factors (scale error of the DVL, errors of the calibration).
+They add rows and columns, the border, to the normal equations, which the Schur complement of the block of the poses
+solves.
 """
 
 from __future__ import annotations
@@ -41,35 +42,52 @@ class UnaryFactors(NamedTuple):
     jacobians: Callable[[Array, Array], Array]
 
 
+#: Function of the relative poses i_from_j (m, 4, 4) of a slice of the links, and of this slice. It returns the
+#: derivatives (m, 6, k) of the measured motions with respect to the shared parameters, in the axes of camera j, and the
+#: values (m, k) of the parameters for which the motions are already corrected.
+Effect = Callable[[Array, slice], tuple[Array, Array]]
+
+
 class BinaryFactors(NamedTuple):
-    """Factors of one kind that each constrain the relative pose of two nodes, and perhaps the shared parameter."""
+    """Factors of one kind that each constrain the relative pose of two nodes, and perhaps the k shared parameters."""
 
     #: i, j: (m,) indices of the two poses of each factor.
     i: Indices
     j: Indices
     information: Array  #: (m, d, d) information matrices
-    #: function of i_from_j (m, 4, 4) and the shared parameter that returns residuals (m, d).
-    residuals: Callable[[Array, float], Array]
-    #: function of i_from_j, the shared parameter and the residuals that returns the Jacobians with respect to the
-    #: increment of pose j (m, d, 6) and to the shared parameter (m, d), None if there is no dependence; called for a
-    #: part of the factors at a time.
-    jacobians: Callable[[Array, float, Array], tuple[Array, Array | None]]
+    #: function of i_from_j (m, 4, 4) and the shared parameters (k,) that returns residuals (m, d).
+    residuals: Callable[[Array, Array], Array]
+    #: function of i_from_j, the shared parameters and the residuals that returns the Jacobians (m, d, 6) with respect
+    #: to the increment of pose j; called for a part of the factors at a time.
+    jacobians: Callable[[Array, Array, Array], Array]
     huber: float | None = None  #: residual [standard deviations] above which the loss is linear; None: least squares
+    #: function of i_from_j of a slice of the factors, this slice, and k, that returns the Jacobians (m, d, k) with
+    #: respect to the shared parameters; None: there is no dependence.
+    by_shared: Callable[[Array, slice, int], Array] | None = None
+
+
+class SharedPrior(NamedTuple):
+    """Gaussian prior of the k shared parameters, which are independent a priori."""
+
+    mean: Array  #: (k,)
+    sigma: Array  #: (k,) standard deviations
+
+
+NOTHING_SHARED = SharedPrior(np.empty(0), np.empty(0))
 
 
 class FactorGraph(NamedTuple):
     n_poses: int  #: number of poses
     unary: Sequence[UnaryFactors]
     binary: Sequence[BinaryFactors]
-    #: standard deviation of the zero-mean prior of the shared parameter; None: no such parameter.
-    shared_sigma: float | None = None
+    shared: SharedPrior = NOTHING_SHARED
 
 
 class GraphState(NamedTuple):
-    """Values of all unknowns of a factor graph: poses (n, 4, 4) and the shared parameter (0 if not used)."""
+    """Values of all unknowns of a factor graph: poses (n, 4, 4) and shared parameters (k,)."""
 
     poses: Array
-    shared: float = 0.0
+    shared: Array
 
 
 class _Evaluation(NamedTuple):
@@ -85,23 +103,23 @@ class _NormalEquations(NamedTuple):
 
     diagonal: Array  #: (n, 6, 6) diagonal blocks
     gradient: Array  #: (n, 6) gradient of F with respect to the poses
-    border: Array  #: (n, 6) mixed second derivatives of F with respect to the poses and the shared parameter
-    corner: float  #: second derivative of F with respect to the shared parameter; 0 if there is no such parameter
-    shared_gradient: float  #: derivative of F with respect to the shared parameter
+    border: Array  #: (n, 6, k) mixed second derivatives of F with respect to the poses and the shared parameters
+    corner: Array  #: (k, k) second derivatives of F with respect to the shared parameters
+    shared_gradient: Array  #: (k,) derivatives of F with respect to the shared parameters
 
 
 class Solution(NamedTuple):
     """Minimum of the cost of a factor graph; if not converged, the last accepted state of the iteration."""
 
-    state: GraphState  #: poses and shared parameter at the minimum
+    state: GraphState  #: poses and shared parameters at the minimum
     cost: float  #: F at the minimum
     #: squared norms (m,) of the whitened residuals of each kind of binary factors, without robust weights.
     chi2: list[Array]
     converged: bool  #: false if the iterations ended before the minimum was reached
     #: factor of the normal matrix of the poses, undamped, at the last linearisation.
     cholesky: block_cholesky.CholeskyFactor
-    #: derivatives (n, 6) of the optimal poses by the shared parameter, if any, and its marginal information.
-    border: tuple[Array, float] | None
+    by_shared: Array  #: (n, 6, k) derivatives of the optimal poses with respect to the shared parameters
+    shared_cov: Array  #: (k, k) marginal covariance of the shared parameters
 
     def marginals_in_place(self) -> Array:
         """Returns the covariances (n, 6, 6) of all poses (rad, m), in camera axes; overwrites the Cholesky factor."""
@@ -113,17 +131,13 @@ class Solution(NamedTuple):
     def sample(self, rng: np.random.Generator) -> Array:
         """Returns errors (n, 6) of all poses, drawn from their joint covariance; units and axes as of the marginals."""
         errors = self.cholesky.sample(rng.standard_normal((len(self.state.poses), 6)))
-        if self.border is None:
-            return errors
-        by_shared, information = self.border
-        return errors + by_shared * rng.standard_normal() / information**0.5
+        root = np.linalg.cholesky(self.shared_cov)
+        return errors + self.by_shared @ (root @ rng.standard_normal(len(root)))
 
     def _add_shared(self, covs: Array, rows: slice) -> Array:
-        """Returns the covariances of the poses `rows`, plus the part due to the uncertainty of the shared parameter."""
-        if self.border is None:
-            return covs
-        by_shared, information = self.border
-        return covs + by_shared[rows, :, None] * by_shared[rows, None, :] / information
+        """Returns the covariances of the poses `rows`, plus the part due to the shared parameters."""
+        by_shared = self.by_shared[rows]
+        return covs + by_shared @ self.shared_cov @ by_shared.transpose(0, 2, 1)
 
 
 def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -> Solution:
@@ -140,7 +154,7 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
         equations = _linearise(graph, current, matrix)
         step = _solve(matrix, equations, damping)
         trial = GraphState(_retract(current.state.poses, step.poses), current.state.shared + step.shared)
-        expected = -0.5 * (np.sum(equations.gradient * step.poses) + equations.shared_gradient * step.shared)
+        expected = -0.5 * (np.sum(equations.gradient * step.poses) + equations.shared_gradient @ step.shared)
         after, max_iterations = _evaluate(graph, trial), max_iterations - 1
         if after.cost <= current.cost + _COST_TOLERANCE:
             converged = bool(damping == 0 and abs(current.cost - after.cost - expected) < _COST_TOLERANCE)
@@ -151,16 +165,19 @@ def optimise(graph: FactorGraph, start: GraphState, max_iterations: int = 100) -
             break
     if step.damping:  # marginal covariances follow from the undamped equations
         step = _solve(matrix, _linearise(graph, current, matrix), 0.0)
-    return Solution(current.state, current.cost, current.chi2, converged, step.cholesky, step.border)
+    return Solution(
+        current.state, current.cost, current.chi2, converged, step.cholesky, step.by_shared, step.shared_cov
+    )
 
 
 class _Step(NamedTuple):
     damping: float  #: the diagonal of the pose block was multiplied by 1 + damping
     poses: Array  #: (n, 6) increments of the poses
-    shared: float  #: increment of the shared parameter
-    #: cholesky, border: as in `Solution`, but of the damped equations.
+    shared: Array  #: (k,) increments of the shared parameters
+    #: cholesky, by_shared, shared_cov: as in `Solution`, but of the damped equations.
     cholesky: block_cholesky.CholeskyFactor
-    border: tuple[Array, float] | None
+    by_shared: Array
+    shared_cov: Array
 
 
 def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damping: float) -> _Step:
@@ -172,16 +189,17 @@ def _solve(matrix: block_cholesky.BlockMatrix, equations: _NormalEquations, damp
     except np.linalg.LinAlgError:
         raise np.linalg.LinAlgError("the factors do not constrain every pose") from None
     poses = cholesky.solve(-equations.gradient)
-    if not equations.corner:
-        return _Step(damping, poses, 0.0, cholesky, None)
-    by_shared = -cholesky.solve(equations.border)
-    information = equations.corner + float(np.sum(equations.border * by_shared))
-    shared = (-equations.shared_gradient - float(np.sum(equations.border * poses))) / information
-    return _Step(damping, poses + by_shared * shared, shared, cholesky, (by_shared, information))
+    by_shared = np.zeros_like(equations.border)
+    for k in range(by_shared.shape[2]):
+        by_shared[:, :, k] = -cholesky.solve(np.ascontiguousarray(equations.border[:, :, k]))
+    information = equations.corner + np.einsum("nak,nal->kl", equations.border, by_shared)
+    cov = symmetric_inverses(information[None])[0]
+    shared = cov @ (-equations.shared_gradient - np.einsum("nak,na->k", equations.border, poses))
+    return _Step(damping, poses + by_shared @ shared, shared, cholesky, by_shared, cov)
 
 
 def _evaluate(graph: FactorGraph, state: GraphState) -> _Evaluation:
-    cost = 0.0 if graph.shared_sigma is None else (state.shared / graph.shared_sigma) ** 2 / 2
+    cost = float(np.sum(((state.shared - graph.shared.mean) / graph.shared.sigma) ** 2)) / 2
     unary, binary, chi2 = [], [], []
     for factors in graph.unary:
         residuals = factors.residuals(state.poses[factors.pose_index])
@@ -208,10 +226,10 @@ def _robust_loss(chi2: Array, huber: float | None) -> tuple[Array, Array]:
 
 def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.BlockMatrix) -> _NormalEquations:
     """Returns the normal equations of all factors; fills `matrix` with the off-diagonal blocks."""
-    n = graph.n_poses
-    diagonal, gradient, border = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, 6))
-    corner = 0.0 if graph.shared_sigma is None else graph.shared_sigma**-2
-    shared_gradient = corner * current.state.shared
+    n, shared = graph.n_poses, current.state.shared
+    diagonal, gradient, border = np.zeros((n, 6, 6)), np.zeros((n, 6)), np.zeros((n, 6, len(shared)))
+    corner = np.diag(graph.shared.sigma**-2)
+    shared_gradient = corner @ (shared - graph.shared.mean)
     n_added = 0
     matrix.clear()
     for factors, residuals in zip(graph.unary, current.unary, strict=True):
@@ -225,16 +243,17 @@ def _linearise(graph: FactorGraph, current: _Evaluation, matrix: block_cholesky.
             i, j, information = factors.i[batch], factors.j[batch], factors.information[batch]
             residuals, weights = (values[batch] for values in evaluated)
             i_from_j = _relative_poses(current.state.poses, i, j)
-            by_j, by_shared = factors.jacobians(i_from_j, current.state.shared, residuals)
+            by_j = factors.jacobians(i_from_j, shared, residuals)
             off_diagonal = np.empty((len(i), 6, 6))
             _add_binary(i, j, by_j, information, weights, residuals, i_from_j, diagonal, off_diagonal, gradient)
             matrix.add(n_added, off_diagonal)
             n_added += len(i)
-            if by_shared is not None:
-                weighted = weights[:, None] * _matvec(information, by_shared)
+            if factors.by_shared is not None and len(shared):
+                by_shared = factors.by_shared(i_from_j, batch, len(shared))
+                weighted = weights[:, None, None] * (information @ by_shared)
                 _add_border(i, j, by_j, weighted, i_from_j, border)
-                corner += float(np.sum(weighted * by_shared))
-                shared_gradient += float(np.sum(weighted * residuals))
+                corner += np.einsum("mdk,mdl->kl", weighted, by_shared)
+                shared_gradient += np.einsum("mdk,md->k", weighted, residuals)
     return _NormalEquations(diagonal, gradient, border, corner, shared_gradient)
 
 
@@ -274,29 +293,45 @@ def _add_binary(first, second, by_j, information, weights, residuals, i_from_j, 
 
 @kernel
 def _add_border(first, second, by_j, weighted, i_from_j, border):
-    """Adds the mixed derivatives of poses and shared parameter to `border`, from weighted shared Jacobians (m, d)."""
+    """Adds the mixed derivatives of poses and shared parameters to `border`; weighted shared Jacobians (m, d, k)."""
     for m in range(len(first)):
-        slope = np.zeros(6)
-        for k in range(weighted.shape[1]):
-            slope += weighted[m, k] * by_j[m, k]
         j_from_i = geometry.adjoint(geometry.inverse(i_from_j[m]))
-        for a in range(6):
-            border[second[m], a] += slope[a]
-            for b in range(6):
-                border[first[m], a] -= j_from_i[b, a] * slope[b]
+        for s in range(weighted.shape[2]):
+            slope = np.zeros(6)
+            for d in range(weighted.shape[1]):
+                slope += weighted[m, d, s] * by_j[m, d]
+            for a in range(6):
+                border[second[m], a, s] += slope[a]
+                for b in range(6):
+                    border[first[m], a, s] -= j_from_i[b, a] * slope[b]
 
 
-def motion_factors(links: Sequence[Link], index_of: dict[int, int], huber: float | None = None) -> BinaryFactors:
+def motion_factors(
+    links: Sequence[Link], index_of: dict[int, int], huber: float | None = None, effect: Effect | None = None
+) -> BinaryFactors:
+    """Returns binary factors of measured motions, with the loss of `BinaryFactors.huber`.
+
+    `effect` is that of the shared parameters on the measured motions; None: they have none.
+    """
     columns = Links.from_sequence(links)
     measured, information = (np.ascontiguousarray(column) for column in (columns.i_from_j, columns.information))
     i, j = (np.array([index_of[number] for number in ends.tolist()], np.int64) for ends in (columns.i, columns.j))
 
-    def residuals(i_from_j: Array, _: float) -> Array:
-        return pose_residuals(measured, i_from_j)
+    def residuals(i_from_j: Array, shared: Array) -> Array:
+        found = pose_residuals(measured, i_from_j)
+        if effect is None:
+            return found
+        derivatives, at = effect(i_from_j, slice(None))
+        return found - np.einsum("mdk,mk->md", derivatives, shared - at)
+
+    def by_shared(i_from_j: Array, batch: slice, _: int) -> Array:
+        assert effect is not None
+        return -effect(i_from_j, batch)[0]
 
     return BinaryFactors(
-        i, j, information, residuals, lambda _, __, residuals: (pose_residual_jacobians(residuals), None), huber
-    )
+        i, j, information, residuals, lambda _, __, residuals: pose_residual_jacobians(residuals), huber,
+        None if effect is None else by_shared,
+    )  # fmt: skip
 
 
 def prior_factors(pose_index: Sequence[int], poses: Array, covs: Array) -> UnaryFactors:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import NamedTuple
 
 import cv2
@@ -10,6 +11,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.quality import EXACT, CalibrationEstimate
 from twin.core.records import ElevationMap, Image, Map, MapGrid, Mask, StereoRig
 from twin.core.threads import prefetched
 from twin.estimate.mapping import depth_filter, elevation, surface
@@ -36,6 +38,7 @@ class KeyframePath(NamedTuple):
     world_from_camera: Array  #: (n, 4, 4) poses of the left camera
     pose_cov: Array  #: (n, 6, 6) covariance of each pose
     step_cov: Array  #: (n, 6, 6) covariance of each pose relative to the previous one; the first is not used
+    yaw_rad: Array | None = None  #: (n,) yaw of the right camera for which each right image is not corrected
 
 
 class _FilterState(NamedTuple):
@@ -52,12 +55,19 @@ def build_map(
     grid: MapGrid,
     progress: Callable[[int], None] = lambda _: None,
     pattern: Map | None = None,
+    calibration: CalibrationEstimate = EXACT,
 ) -> ElevationMap:
-    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far."""
+    """Returns the map, built from keyframes in their order; `progress` is called with the number processed so far.
+
+    Depths are corrected for the errors of `calibration`; what remains uncertain is part of the standard deviations.
+    """
+    rig = replace(rig, baseline_m=rig.baseline_m * (1 + calibration.baseline_error))
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
     search_range = disparity.SearchRange(rig)
     poses, old = path.world_from_camera, None
-    stereo = prefetched(_measure_depth(pair, search_range, rig, pattern) for pair in pairs)
+    yaw_rad = np.zeros(len(poses)) if path.yaw_rad is None else path.yaw_rad
+    turned = zip(pairs, yaw_rad.tolist(), strict=True)
+    stereo = prefetched(_measure_depth(pair, yaw, search_range, rig, pattern) for pair, yaw in turned)
     for k, (left, gray, stereo_depth) in enumerate(stereo):
         depth, inherited = stereo_depth, None
         if old is not None:
@@ -72,7 +82,23 @@ def build_map(
         progress(k + 1)
     if old is not None and old.patch is not None:
         mapper.fuse(old.patch)
-    return mapper.result()
+    return _with_calibration_sigma(mapper.result(), poses, rig, calibration)
+
+
+def _with_calibration_sigma(
+    found: ElevationMap, poses: Array, rig: StereoRig, calibration: CalibrationEstimate
+) -> ElevationMap:
+    """Returns the map with the uncertainty of the calibration in its standard deviations.
+
+    A yaw e changes a depth Z = b / d by -Z^2 e / b at the image centre, a baseline error e by Z e. These errors are the
+    same in all keyframes, so that they do not average out. Z is taken from the mean height of the cameras.
+    """
+    if not calibration.cov.any():
+        return found
+    depth_m = float(np.mean(poses[:, 2, 3])) - found.height_m.astype(np.float64)
+    by_error = np.stack([-(depth_m**2) / rig.baseline_m, depth_m], axis=-1)
+    variance = np.einsum("...i,ij,...j->...", by_error, calibration.cov, by_error)
+    return replace(found, sigma_m=np.sqrt(found.sigma_m**2 + variance).astype(found.sigma_m.dtype))
 
 
 def gray_levels(pair: ImagePair) -> tuple[Map, Map]:
@@ -82,7 +108,7 @@ def gray_levels(pair: ImagePair) -> tuple[Map, Map]:
 
 
 def _measure_depth(
-    pair: ImagePair, search_range: disparity.SearchRange, rig: StereoRig, pattern: Map | None
+    pair: ImagePair, yaw_rad: float, search_range: disparity.SearchRange, rig: StereoRig, pattern: Map | None
 ) -> tuple[Image, Map, DepthMap]:
     """Returns the left image, its grey levels without the light pattern, and its depth from this pair alone."""
     left, right = gray_levels(pair)
@@ -91,6 +117,10 @@ def _measure_depth(
     stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
     stereo = stereo.with_sigma_below(np.minimum(MAX_STEREO_SIGMA_PX, MAX_RELATIVE_SIGMA * stereo.disparity_px))
     search_range.update(stereo.disparity_px)
+    if yaw_rad:
+        column = (np.arange(left.shape[1]) - stereo.disparity_px - rig.cx_px) / rig.focal_px  # in the right image
+        offset_px = (yaw_rad * rig.focal_px * (1 + column**2)).astype(np.float32)
+        stereo = stereo._replace(disparity_px=stereo.disparity_px - offset_px)
     return pair[0], left, depth_filter.stereo_depth(stereo, rig)
 
 

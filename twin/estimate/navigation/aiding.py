@@ -119,7 +119,7 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
     """Returns the factors of the displacements between nodes measured by the DVL: measured = (1 + s) d + noise.
 
     d is the displacement of the body's origin, in the body axes at the earlier node; s is the scale error of the DVL,
-    one parameter shared by all factors. A displacement whose earlier node is not in `nodes` is left out.
+    the first of the shared parameters. A displacement whose earlier node is not in `nodes` is left out.
     """
     index_of = {node.number: k for k, node in enumerate(nodes)}
     with_dvl = [(k, node.dvl_displacement) for k, node in enumerate(nodes) if node.dvl_displacement is not None]
@@ -128,14 +128,18 @@ def displacement_factors(nodes: Sequence[Keyframe], rig: StereoRig) -> BinaryFac
     measured_m = np.array([d.displacement_m for _, _, d in pairs]).reshape(-1, 3)
     information = symmetric_inverses(np.array([d.cov for _, _, d in pairs]).reshape(-1, 3, 3))
 
-    def residuals(i_from_j: Array, scale: float) -> Array:
-        return (1 + scale) * _body_displacements(i_from_j, rig.body_from_camera)[0] - measured_m
+    def residuals(i_from_j: Array, shared: Array) -> Array:
+        return (1 + shared[0]) * _body_displacements(i_from_j, rig.body_from_camera)[0] - measured_m
 
-    def jacobians(i_from_j: Array, scale: float, _: Array) -> tuple[Array, Array]:
-        displacements, by_j = _body_displacements(i_from_j, rig.body_from_camera)
-        return (1 + scale) * by_j, displacements
+    def jacobians(i_from_j: Array, shared: Array, _: Array) -> Array:
+        return (1 + shared[0]) * _body_displacements(i_from_j, rig.body_from_camera)[1]
 
-    return BinaryFactors(i, j, information, residuals, jacobians)
+    def by_shared(i_from_j: Array, _: slice, n_shared: int) -> Array:
+        derivatives = np.zeros((len(i_from_j), 3, n_shared))
+        derivatives[:, :, 0] = _body_displacements(i_from_j, rig.body_from_camera)[0]
+        return derivatives
+
+    return BinaryFactors(i, j, information, residuals, jacobians, by_shared=by_shared)
 
 
 @kernel

@@ -106,6 +106,12 @@ class EpipolarCalibration:
         self._regions = np.zeros_like(self._regions)  # before, matches with large row differences were rejected
         return True
 
+    def correct_yaw(self, yaw_rad: float, sigma_rad: float, rig: StereoRig) -> None:
+        """Sets the yaw of `removed`, if it changes disparities by more than a standard deviation and 0.02 px."""
+        change = abs(yaw_rad - self.removed[1])
+        if change > sigma_rad and change * rig.focal_px > NOTICEABLE_PX:
+            self.removed = np.array([self.removed[0], yaw_rad, *self.removed[2:]])
+
     def rectify(self, right: Image, rig: StereoRig) -> Image:
         """Returns the full right image (H, W, 3) corrected for the errors `removed`; itself if these are zero."""
         if not self.removed.any():

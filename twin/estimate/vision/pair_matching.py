@@ -29,10 +29,15 @@ class MatchedPair(NamedTuple):
 
 
 class PairMatcher:
-    """Matches a node with earlier nodes, at the scale of the grey levels in `spool`, and estimates their motions."""
+    """Matches a node with earlier nodes, at the scale of the grey levels in `spool`, and estimates their motions.
+
+    Attributes:
+        removed_yaw: yaw of the right camera for which the images of a keyframe were corrected, by frame index [rad].
+    """
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
+        self.removed_yaw: dict[int, float] = {}
         self._workers = ThreadPoolExecutor(2)
 
     def close(self) -> None:
@@ -68,6 +73,8 @@ class PairMatcher:
         left_px, right_px, node_points = in_left.points[ok], in_right.points[ok], points.subset(ok)
         cov *= stereo.row_noise_ratio(left_px, right_px, cov) ** 2
         measured, measured_cov = stereo.fuse(left_px, right_px, cov, rig)
+        if turned := self.removed_yaw.get(node.row, 0.0) - self.removed_yaw.get(other.row, 0.0):
+            measured[:, 2] -= turned * (1 + (measured[:, 0] - measured[:, 2]) ** 2)
         left_shift = patches.locking_shifts(left_px, left_warp[ok], self.patch_px)
         right_shift = patches.locking_shifts(right_px, right_warp[ok], self.patch_px)
         locking = stereo.fused_shift(left_shift, right_shift, measured_cov, rig)
@@ -113,4 +120,6 @@ class PairMatcher:
         motion = two_view_motion.pair_motion(measured, self.rig.baseline_m, guess, settings)
         if motion is None or motion.n_points < MIN_INLIER_SHARE * len(measured.b):
             return None
-        return motion._replace(closed_form=closed_form)
+        yaw_rad = self.removed_yaw.get(node.row, 0.0)
+        yaw = motion.yaw and motion.yaw._replace(estimate=motion.yaw.estimate + yaw_rad, removed_rad=yaw_rad)
+        return motion._replace(closed_form=closed_form, yaw=yaw)

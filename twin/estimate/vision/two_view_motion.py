@@ -12,7 +12,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.quality import DisparityOffset
+from twin.core.quality import DisparityOffset, YawEffect
 from twin.estimate.vision.observation_equations import (
     LinearisedObservations,
     PairMeasurements,
@@ -49,6 +49,7 @@ class Motion(NamedTuple):
     residual: float
     closed_form: Array | None = None  #: (4, 4) motion by eq. 2 from which the estimation started, if it did
     disparity_offset: DisparityOffset | None = None  #: offset of all disparities, if it is estimated (`pair_motion`)
+    yaw: YawEffect | None = None  #: yaw between the cameras, as `disparity_offset`
 
 
 class PairMotionSettings(NamedTuple):
@@ -127,8 +128,10 @@ def pair_motion(
         return pair_motion(measured, baseline_m, guess, settings._replace(locking=None))
     if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
         return None
-    n_points, offset = int(np.count_nonzero(normals.weight)), _disparity_offset(normals, settings)
-    return Motion(a_from_b, _pair_cov(normals, settings), n_points, normals.scale, disparity_offset=offset)
+    motion = Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
+    if settings.n_measured < 3:
+        return motion
+    return motion._replace(disparity_offset=_disparity_offset(normals, settings), yaw=_yaw(normals, measured, settings))
 
 
 class _WeightedNormals(NamedTuple):
@@ -183,22 +186,43 @@ def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -
     """Returns the offset of all disparities [focal lengths], an additional unknown of the last Gauss-Newton step.
 
     The derivative of the residual z_a - g(z_b) with respect to an offset of both disparities is u - G u, with u the
-    unit vector along the disparity. None if disparity is not measured in both pairs, or the offset is not observable.
+    unit vector along the disparity. None if the offset is not observable.
     """
-    if settings.n_measured < 3:
-        return None
+    by_offset = np.array([0.0, 0.0, 1.0]) - normals.observations.jacobian_point[:, :, 2]
+    found = _additional_unknown(normals, by_offset, settings)
+    return None if found is None else DisparityOffset(*found[:2])
+
+
+def _yaw(normals: _WeightedNormals, measured: PairMeasurements, settings: PairMotionSettings) -> YawEffect | None:
+    """Returns the yaw of the right camera, as `_disparity_offset`, and its effect on the motion.
+
+    A yaw e adds (1 + x^2) e to the disparity of a point at the normalised column x of the right image.
+    """
+    by_a, by_b = (1 + (z[:, 0] - z[:, 2]) ** 2 for z in (measured.a, measured.b))
+    by_yaw = by_a[:, None] * [0.0, 0.0, 1.0] - by_b[:, None] * normals.observations.jacobian_point[:, :, 2]
+    found = _additional_unknown(normals, by_yaw, settings)
+    return None if found is None else YawEffect(*found)
+
+
+def _additional_unknown(
+    normals: _WeightedNormals, derivative: Array, settings: PairMotionSettings
+) -> tuple[float, float, Array] | None:
+    """Returns an unknown that changes the residuals by its `derivative` (n, 3); None if it cannot be estimated.
+
+    Returns:
+        The unknown, its standard deviation, and the change (6,) of the motion per unit of the unknown.
+    """
     observations, weight = normals.observations, normals.weight
-    by_offset = np.array([0.0, 0.0, 1.0]) - observations.jacobian_point[:, :, 2]
-    weighted = weight[:, None] * np.einsum("nrc,nr->nc", observations.information, by_offset)
+    weighted = weight[:, None] * np.einsum("nrc,nr->nc", observations.information, derivative)
     coupling = np.einsum("nc,ncp->p", weighted, observations.jacobian_motion)
-    information = float(np.sum(weighted * by_offset))
+    information = float(np.sum(weighted * derivative))
     score = float(np.sum(weighted * observations.residual))
     by_unknowns = np.linalg.solve(normals.normal, coupling)
     remaining = information - float(coupling @ by_unknowns)  # after elimination of the other unknowns
     if remaining <= 1e-9 * information:
         return None
     variance = max(normals.scale, _MIN_SCALE) ** 2 * settings.variance_inflation / remaining
-    return DisparityOffset((score - float(by_unknowns @ normals.right)) / remaining, variance**0.5)
+    return (score - float(by_unknowns @ normals.right)) / remaining, variance**0.5, -by_unknowns[:6]
 
 
 def _scatter_cov(normals: _WeightedNormals, n_measured: int) -> Array:

@@ -120,7 +120,7 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
     Raises TwinError where the lens is outside its dome, the port transmits no rays to part of the image, the distortion
     folds the image back onto itself, or the field of view is too wide.
     """
-    believed_rig, calibration = scenario.believed_rig(), scenario.calibration_error
+    believed_rig, calibration = scenario.believed_rig(), scenario.true_calibration_error()
     _check_port(scenario.port)
     true_rig = replace(believed_rig, baseline_m=believed_rig.baseline_m * (1 + calibration.baseline_error))
     models, believed = _models(scenario)
@@ -148,7 +148,7 @@ def make_true_cameras(scenario: Scenario) -> TrueCameras:
 
 
 def _models(scenario: Scenario) -> tuple[tuple[CameraModel, CameraModel], CameraModel]:
-    calibration, port, rig = scenario.calibration_error, scenario.port, scenario.believed_rig()
+    calibration, port, rig = scenario.true_calibration_error(), scenario.port, scenario.believed_rig()
     pinhole, principal_px = ports.pinhole(port), np.array([rig.cx_px, rig.cy_px])
     focal_px, lens = rig.focal_px / pinhole.focal_ratio, lenses.true_lens(scenario.lens)
 
@@ -171,7 +171,7 @@ def right_rotation(calibration: CalibrationErrorConfig) -> Array:
 
 
 def _is_ideal(scenario: Scenario, believed: CameraModel) -> bool:
-    same = scenario.calibration_error.model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
+    same = scenario.true_calibration_error().model_copy(update={"baseline_error": 0.0}) == CalibrationErrorConfig()
     return same and scenario.port.kind == "none" and not any(lenses.true_lens(scenario.lens)) and not any(believed.lens)
 
 

@@ -1,0 +1,80 @@
+"""Self-calibration: parameters that all factors of the alignment share and that are estimated together with the poses.
+
+They are the scale error of the DVL and, if the calibration states a standard deviation for them, the yaw between the
+cameras and the error of the baseline since the calibration. The yaw moves near and far points differently, so that it
+is observable over relief (`disparity_offset`); the baseline only by navigation sensors. What is not observable remains
+as uncertain as the calibration states, in the covariances of all poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.core.links import Links
+from twin.core.quality import CalibrationEstimate, DisparityOffset
+from twin.core.records import SensorNoise, StereoRig
+from twin.estimate.adjustment.pose_graph import Effect, SharedPrior, Solution
+
+DVL, YAW, BASELINE = "dvl", "yaw", "baseline"
+
+
+class SharedParameters(NamedTuple):
+    """Names of the k shared parameters, in the order of the columns, and their prior."""
+
+    names: Sequence[str]
+    prior: SharedPrior
+
+    def effect_on(self, links: Links) -> Effect | None:
+        """Returns the effect of the parameters on measured motions; None if there is none.
+
+        A longer baseline makes all lengths longer: those of the adjusted motions, as with the measured ones, a shorter
+        baseline would reduce the residuals.
+        """
+        if YAW not in self.names and BASELINE not in self.names:
+            return None
+
+        def effect(i_from_j: Array, batch: slice) -> tuple[Array, Array]:
+            derivatives, at = (np.zeros((len(i_from_j), *shape, len(self.names))) for shape in ((6,), ()))
+            if YAW in self.names:
+                k = self.names.index(YAW)
+                derivatives[:, :, k], at[:, k] = links.by_yaw[batch], links.yaw_rad[batch]
+            if BASELINE in self.names:
+                rotation, moved = i_from_j[:, :3, :3], i_from_j[:, :3, 3]
+                derivatives[:, 3:, self.names.index(BASELINE)] = np.einsum("nji,nj->ni", rotation, moved)
+            return derivatives, at
+
+        return effect
+
+    def estimate(self, solution: Solution) -> CalibrationEstimate:
+        """Returns the errors of the calibration at the solution; those that are not estimated are 0."""
+        value, cov = np.zeros(2), np.zeros((2, 2))
+        found = [(row, self.names.index(name)) for row, name in enumerate((YAW, BASELINE)) if name in self.names]
+        rows, columns = [row for row, _ in found], [column for _, column in found]
+        value[rows] = solution.state.shared[columns]
+        cov[np.ix_(rows, rows)] = solution.shared_cov[np.ix_(columns, columns)]
+        return CalibrationEstimate(float(value[0]), float(value[1]), cov)
+
+
+def shared_parameters(
+    rig: StereoRig, noise: SensorNoise, with_dvl: bool, offset: DisparityOffset | None
+) -> SharedParameters:
+    """Returns the parameters to estimate; `offset` is that of the links, None where it is not observable."""
+    rows = [(DVL, 0.0, noise.dvl_scale)] if with_dvl else []
+    if rig.yaw_sigma_rad > 0:
+        rows.append((YAW, *fused(rig.yaw_sigma_rad, offset)))
+    if rig.baseline_sigma > 0:
+        rows.append((BASELINE, 0.0, rig.baseline_sigma))
+    names, mean, sigma = zip(*rows, strict=True) if rows else ((), (), ())
+    return SharedParameters(names, SharedPrior(np.array(mean, np.float64), np.array(sigma, np.float64)))
+
+
+def fused(sigma: float, offset: DisparityOffset | None) -> tuple[float, float]:
+    """Returns the mean and the standard deviation of an error whose prior is (0, sigma) and which was measured."""
+    if offset is None:
+        return 0.0, sigma
+    information = sigma**-2 + offset.sigma**-2
+    return offset.estimate * offset.sigma**-2 / information, information**-0.5
