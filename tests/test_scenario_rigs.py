@@ -83,10 +83,12 @@ def test_a_resolved_scenario_needs_no_rig_file(folder):
     [
         ('[rig]\nmodel = "gopro_par"\n', r"scene.toml:2: rig.model: 'gopro_par': no such rig .*gopro_pair"),
         ("[rig]\nmodel = 3\n", r"scene.toml:2: rig.model: 3: not allowed \(allowed: a string\)"),
+        ('[rig]\nmodel = "nested.toml"\n', r"nested.toml:4: rig.model: 'ideal': not allowed .*load_scenario"),
         ('[rig]\nmodel = "bad.toml"\n', r"bad.toml:4: rig.baseline_m: -1: not allowed"),
     ],
 )
 def test_a_wrong_rig_is_reported_where_it_stands(folder, text, message):
+    (folder / "nested.toml").write_text('title = "bad"\nsources = {}\n[rig]\nmodel = "ideal"\n')
     (folder / "bad.toml").write_text('title = "bad"\nsources = {}\n[rig]\nbaseline_m = -1\n')
     with pytest.raises(ScenarioError, match=message):
         scenario(folder, text)

@@ -233,11 +233,9 @@ def _take_rig(tree: dict[str, Any], base: dict[str, Any], folder: Path) -> None:
     Raises TwinError if there is no such rig, ScenarioError if its file is invalid.
     """
     rig = tree.get("rig")
-    model = rig.pop("model", None) if isinstance(rig, dict) else None
-    if not isinstance(model, str):
-        if model is not None:
-            rig["model"] = model  # refused by the validation
-        return
+    if not isinstance(rig, dict) or not isinstance(rig.get("model"), str):
+        return  # a model of another type is refused by the validation
+    model = rig.pop("model")
     file = find_rig(model, folder)
     sections, lines = read_toml(file)
     validated(sections, RigFile, Source(path=file, lines=lines))

@@ -200,6 +200,14 @@ class RigConfig(Section):
     mount_m: Vector3 = (0.0, 0.0, -0.15)
     """midpoint of the cameras in the body frame: forward, left, up [m]"""
 
+    @field_validator("model")
+    @classmethod
+    def _is_read_by_the_loader(cls, value: str | None) -> str | None:
+        """Refuses a rig that has not been read from its file: in a rig file, or a model made in Python."""
+        if value is not None:
+            raise PydanticCustomError("rig", "none here: twin.load_scenario reads the file of a rig")
+        return value
+
 
 #: How light is scattered: see `imaging.scattering`.
 ScatteringModel = Literal["full", "single", "none"]
