@@ -20,7 +20,7 @@ SCENARIO_NOTE = (
 )
 STUDY_NOTE = "What studies and tunings do with them is in\n[studies and tuning](../guide/studies.md)."
 _TITLES = {"lamps": "[[lamps]]", "beacons": "[[beacons]]", "objects": "[[objects]]", "together": "[[together]]"}
-_UNIT = re.compile(r"\s*\[([^\[\],]+)\](?=$|;)")
+_UNIT = re.compile(r"\s*(?<!with )(?<!needs )\[([^\[\],]+)\](?=$|;)")
 _BOUNDS = {
     "minimum": ">= {}", "exclusiveMinimum": "> {}", "maximum": "<= {}", "exclusiveMaximum": "< {}",
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""Height errors of the elevation map, over the cells that at least one keyframe observed and over the asked area."""
+"""Height errors of the elevation map, over the cells that both cameras saw in a keyframe and over the asked area."""
 
 from __future__ import annotations
 
