@@ -28,6 +28,7 @@ from twin.estimate.vision_interface import Vision
 _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the world frame
 _FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are practically fixed
 _START_NODES = 4  # the first nodes are candidates for every link, because loops return to the reference position
+_REMEASURED_PX = 0.05  # error of disparities above which a link is measured again, as its effect is not linear
 _MOST_PENDING = 8  # largest number of nodes with link measurements in progress
 
 
@@ -106,8 +107,14 @@ class KeyframeNetwork:
         """Measures the link from the last node to a new one; None for the first node. Raises OSError."""
         if not self.nodes:
             return None
-        last = self.nodes[-1]
-        return self._measure(node, [(last, self.overlap(node, last.world_from_camera))])[0]
+        last = self.nodes[-1], self.overlap(node, self.nodes[-1].world_from_camera)
+        attempt = self._measure(node, [last])[0]
+        if self.rig.yaw_sigma_rad and attempt.yaw is not None:
+            yaw_rad, _ = self.yaw_rad(attempt.yaw)
+            if abs(yaw_rad - node.yaw_rad) * self.rig.focal_px > _REMEASURED_PX:
+                node.yaw_rad = yaw_rad
+                attempt = self._measure(node, [last])[0]
+        return attempt
 
     def _measure(self, node: Keyframe, others: list[tuple[Keyframe, float]]) -> list[LinkAttempt]:
         motions = self.vision.measure_motions(node, [other for other, _ in others])
@@ -227,18 +234,22 @@ class KeyframeNetwork:
         self.nodes = [k for k in self.nodes if k.row < n_frames]
         self.links = self.links.select(self.links.j < len(self.keyframes))
 
-    def yaw_rad(self) -> tuple[float, float]:
-        """Returns the yaw of the right camera by all links so far and by the calibration, and its sigma [rad]."""
-        pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
-        return fused(self.rig.yaw_sigma_rad, self.disparity_offset([*self.history.yaws, *pending]))
+    def yaw_rad(self, *latest: YawEffect) -> tuple[float, float]:
+        """Returns the yaw of the right camera by all links so far and by the calibration, and its sigma [rad].
 
-    def disparity_offset(self, offsets: Sequence[DisparityOffset | YawEffect]) -> DisparityOffset | None:
+        `latest` are those of links that are not yet in the network.
+        """
+        pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
+        yaws = [*self.history.yaws, *pending, *latest]
+        return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, len(self.nodes) - 1 + len(latest)))
+
+    def disparity_offset(self, offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int) -> DisparityOffset | None:
         """Returns the mean of the offsets of links (`calibration_errors.disparity_offset`)."""
         if not offsets:
             return None
         poses, depth_m = (np.array([getattr(n, key) for n in self.nodes]) for key in ("world_from_camera", "depth_m"))
         n_views = calibration_errors.mean_views(poses, depth_m, self.rig)
-        return calibration_errors.disparity_offset(offsets, len(self.nodes) - 1, n_views, self.rig.focal_px)
+        return calibration_errors.disparity_offset(offsets, n_nodes, n_views, self.rig.focal_px)
 
     def _align(self, nodes: list[Keyframe], track: int, marginals: list[int] | None) -> AlignmentResult:
         """Aligns the given nodes, which are the latest ones, and moves all keyframes from the first of them on.
@@ -253,7 +264,7 @@ class KeyframeNetwork:
         everyone = [k for k in self.nodes if k.number in fixed] + nodes
         anchors = dict.fromkeys(fixed, _FIXED_COV) | {0: self.reference_cov}
         start_s = time.perf_counter()
-        yaw = self.disparity_offset(self.history.yaws) if self.rig.yaw_sigma_rad else None
+        yaw = self.disparity_offset(self.history.yaws, len(self.nodes) - 1) if self.rig.yaw_sigma_rad else None
         try:
             aligned = align(everyone, links, anchors, self.rig, self.noise, marginals, yaw)
         except np.linalg.LinAlgError as error:

@@ -185,6 +185,8 @@ class Navigator:
         keyframe = Keyframe(
             number, len(self.log), track, self.filter.world_from_camera, points, frame.readings, depth_m, frame.exposure
         )
+        if self.rig.yaw_sigma_rad:
+            keyframe.yaw_rad = self.network.yaw_rad()[0]
         self._accumulate(keyframe, self.filter.since_node_cov)
         self.network.add(keyframe)
         is_node = number % self.settings.node_stride == 0
@@ -300,7 +302,9 @@ class Navigator:
         history, nodes = self.network.history, self.network.nodes
         residuals, alignments = np.array(history.link_residuals), history.alignments
         failed, counts = np.isnan(residuals), self.filter.gates.counts
-        offset = None if self.rig.yaw_sigma_rad else self.network.disparity_offset(history.disparity_offsets)
+        offset = (
+            None if self.rig.yaw_sigma_rad else self.network.disparity_offset(history.disparity_offsets, len(nodes) - 1)
+        )
         across, along = length_scales(nodes, self.network.links, self.rig, self.network.noise)
         return EstimationQuality(
             frames_lost=self.log.n_lost,

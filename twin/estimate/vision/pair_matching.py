@@ -73,8 +73,6 @@ class PairMatcher:
         left_px, right_px, node_points = in_left.points[ok], in_right.points[ok], points.subset(ok)
         cov *= stereo.row_noise_ratio(left_px, right_px, cov) ** 2
         measured, measured_cov = stereo.fuse(left_px, right_px, cov, rig)
-        if turned := self.removed_yaw.get(node.row, 0.0) - self.removed_yaw.get(other.row, 0.0):
-            measured[:, 2] -= turned * (1 + (measured[:, 0] - measured[:, 2]) ** 2)
         left_shift = patches.locking_shifts(left_px, left_warp[ok], self.patch_px)
         right_shift = patches.locking_shifts(right_px, right_warp[ok], self.patch_px)
         locking = stereo.fused_shift(left_shift, right_shift, measured_cov, rig)
@@ -108,7 +106,8 @@ class PairMatcher:
         The estimation starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the motion between the
         current poses if that fails. None if too few points are matched or too few of them are inliers.
         """
-        measured = matched.measured
+        a, b = (self._turned(z, node.yaw_rad, at) for z, at in zip(matched.measured[:2], (other, node), strict=True))
+        measured = matched.measured._replace(a=a, b=b)
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         closed_form = two_view_motion.exact_depth_motion(measured.a, measured.b, self.rig.baseline_m, predicted)
         settings = two_view_motion.PairMotionSettings(
@@ -120,6 +119,14 @@ class PairMatcher:
         motion = two_view_motion.pair_motion(measured, self.rig.baseline_m, guess, settings)
         if motion is None or motion.n_points < MIN_INLIER_SHARE * len(measured.b):
             return None
-        yaw_rad = self.removed_yaw.get(node.row, 0.0)
+        yaw_rad = node.yaw_rad
         yaw = motion.yaw and motion.yaw._replace(estimate=motion.yaw.estimate + yaw_rad, removed_rad=yaw_rad)
         return motion._replace(closed_form=closed_form, yaw=yaw)
+
+    def _turned(self, points: Array, yaw_rad: float, keyframe: Keyframe) -> Array:
+        """Returns points (n, 3) measured in the images of a keyframe, corrected for a yaw of the right camera."""
+        remaining = yaw_rad - self.removed_yaw.get(keyframe.row, 0.0)
+        if not remaining:
+            return points
+        offset = remaining * (1 + (points[:, 0] - points[:, 2]) ** 2)
+        return points - np.column_stack([np.zeros((len(points), 2)), offset])

@@ -54,6 +54,7 @@ class Keyframe:
     readings: Readings  #: readings of the navigation sensors
     depth_m: float = np.nan  #: median depth of the matched points [m]
     exposure: Exposure | None = None  #: exposure of its images; None if it was not reported
+    yaw_rad: float = 0.0  #: yaw of the right camera for which the measurements of links to earlier nodes are corrected
     #: displacement since the previous node, measured by the DVL; None if it was not measured, or if the link to the
     #: previous node is the F2F motion, which already includes the DVL readings.
     dvl_displacement: Displacement | None = None
