@@ -127,6 +127,9 @@ class ComparisonVision:
     def left_image(self, row: int) -> Image | None:
         return self.images.left_image(row)
 
+    def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> None:
+        self.images.correct_yaw(yaw_rad, sigma_rad)
+
     def discard(self, numbers: range) -> None:
         self.images.discard(numbers)
         self.surrogate.discard(numbers)
