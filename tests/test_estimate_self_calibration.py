@@ -28,16 +28,19 @@ def reef(rng, n=300, relief_m=0.4):
 
 
 def observed(points, yaw, baseline_m=BASELINE_M):
-    """Returns (x, y, disparity) (n, 3) of points in the left camera; the right one is turned away by the yaw [rad]."""
-    right = points - [baseline_m, 0, 0]
-    turned = right @ geometry.exp(np.array([0, yaw, 0, 0, 0, 0]))[:3, :3]
-    left = points[:, :2] / points[:, 2:]
-    return np.column_stack([left, left[:, 0] - turned[:, 0] / turned[:, 2]])
+    """Returns (x, y, disparity) (n, 3) of points in the left camera; the right one is turned away by the yaw [rad].
+
+    As `stereo.fuse` does with equal noise in both images, y is the mean of both rows.
+    """
+    turned = (points - [baseline_m, 0, 0]) @ geometry.exp(np.array([0, yaw, 0, 0, 0, 0]))[:3, :3]
+    left, right = (p[:, :2] / p[:, 2:] for p in (points, turned))
+    return np.column_stack([left[:, 0], (left[:, 1] + right[:, 1]) / 2, left[:, 0] - right[:, 0]])
 
 
 def corrected(z, yaw):
     """Returns observations (n, 3) from images that were corrected for a yaw [rad], to first order."""
-    return z - np.column_stack([np.zeros((len(z), 2)), (1 + (z[:, 0] - z[:, 2]) ** 2) * yaw])
+    x = z[:, 0] - z[:, 2]
+    return z - yaw * np.column_stack([np.zeros(len(z)), -x * z[:, 1] / 2, 1 + x**2])
 
 
 def motion(points, a_from_b, yaw, rng=None, removed=0.0, baseline_m=BASELINE_M):

@@ -126,7 +126,4 @@ class PairMatcher:
     def _turned(self, points: Array, yaw_rad: float, keyframe: Keyframe) -> Array:
         """Returns points (n, 3) measured in the images of a keyframe, corrected for a yaw of the right camera."""
         remaining = yaw_rad - self.removed_yaw.get(keyframe.row, 0.0)
-        if not remaining:
-            return points
-        offset = remaining * (1 + (points[:, 0] - points[:, 2]) ** 2)
-        return points - np.column_stack([np.zeros((len(points), 2)), offset])
+        return points - remaining * observation_equations.change_by_yaw(points) if remaining else points

@@ -18,6 +18,7 @@ from twin.estimate.vision.observation_equations import (
     PairMeasurements,
     PixelLocking,
     adjust_structure,
+    change_by_yaw,
     image_jacobian,
     linearise,
     motion_normal_equations,
@@ -196,11 +197,10 @@ def _disparity_offset(normals: _WeightedNormals, settings: PairMotionSettings) -
 def _yaw(normals: _WeightedNormals, measured: PairMeasurements, settings: PairMotionSettings) -> YawEffect | None:
     """Returns the yaw of the right camera, as `_disparity_offset`, and its effect on the motion.
 
-    A yaw e adds (1 + x^2) e to the disparity of a point at the normalised column x of the right image.
+    The derivative is e_a - G e_b, with e of `change_by_yaw`.
     """
-    by_a, by_b = (1 + (z[:, 0] - z[:, 2]) ** 2 for z in (measured.a, measured.b))
-    by_yaw = by_a[:, None] * [0.0, 0.0, 1.0] - by_b[:, None] * normals.observations.jacobian_point[:, :, 2]
-    found = _additional_unknown(normals, by_yaw, settings)
+    moved = np.einsum("nij,nj->ni", normals.observations.jacobian_point, change_by_yaw(measured.b))
+    found = _additional_unknown(normals, change_by_yaw(measured.a) - moved, settings)
     return None if found is None else YawEffect(*found)
 
 
