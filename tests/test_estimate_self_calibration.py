@@ -153,3 +153,20 @@ def test_positions_of_an_acoustic_system_reveal_an_error_of_the_baseline():
     sigma = found.calibration.cov[1, 1] ** 0.5
     assert sigma < 0.002
     assert found.calibration.baseline_error == pytest.approx(0.02, abs=4 * sigma)
+
+
+@pytest.mark.long
+def test_a_rendered_survey_finds_the_yaw_that_its_seed_drew(tmp_path):
+    """Seed 1 draws 0.14 deg with a sigma of 0.06: uncorrected, 0.65 px of 20 px, or 6 cm of height at 2 m."""
+    from twin import survey
+    from twin.scenario.file import load_scenario
+
+    keys = ["calibration_error.rotation_sigma_deg=0.06", "plan.area_m=[1.5,1.0]", "plan.tracks=1", "seed=1"]
+    scenario = load_scenario("reef", keys)
+    run = survey.run(scenario, tmp_path / "run", outputs=())
+    found = run.metrics["self_check"]["calibration"]
+    yaw_deg = scenario.true_calibration_error().right_yaw_deg
+    assert abs(found["yaw_deg"] - yaw_deg) < min(4 * found["yaw_sigma_deg"], 0.01)
+    assert run.metrics["status"] == "complete"
+    assert run.metrics["trajectory"]["final"]["ate_max_m"] < 4e-3
+    assert run.metrics["map"]["le90_m"] < 8e-3 and 0.5 < run.metrics["map"]["sigma_ratio"] < 2
