@@ -107,13 +107,20 @@ class SurrogateVision:
         frame_errors: error distribution of the current frame-to-frame motions; None if there are no points to track.
         n_corners: `corner_count`.
 
-    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`.
+    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`, or if the calibration
+    error is drawn by the seed, as the estimators then calibrate themselves.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
 
     def __init__(self, mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer):
         scenario, terrain = mission.scenario, mission.terrain
+        if mission.rig.yaw_sigma_rad or mission.rig.baseline_sigma:
+            problem = (
+                "the surrogate does not simulate the self-calibration of cameras with an unknown calibration error"
+            )
+            allowed = f"calibration_error.rotation_sigma_deg = 0 and baseline_sigma_mm = 0, or {RENDERED}"
+            raise unmodelled(mission, [(problem, allowed)])
         rng, settings = streams(scenario.seed)["surrogate"], scenario.estimator_settings()
         self.matchability = matchability = _matchability(mission)
         self.view = view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
@@ -291,7 +298,7 @@ class SurrogateVision:
         return None if self._rows is None else self._rows.report()
 
     def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> None:
-        """Does nothing: the measurements are those of exactly calibrated cameras."""
+        """Does nothing: surveys with an unknown yaw are refused."""
 
     def discard(self, numbers: range) -> None:
         for number in numbers:
