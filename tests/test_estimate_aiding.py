@@ -266,7 +266,8 @@ def test_displacement_residuals_are_invariant_to_a_common_motion_of_both_nodes()
     common = geometry.exp(np.array([0.5, -0.3, 1.0, 3.0, -2.0, 1.0]))
     factors = aiding.displacement_factors(keyframes(poses, displacements=displacements), RIG)
     start, moved = (
-        factors.residuals((geometry.inverse(a) @ b)[None], 0.0) for a, b in (poses, [common @ pose for pose in poses])
+        factors.residuals((geometry.inverse(a) @ b)[None], np.zeros(1))
+        for a, b in (poses, [common @ pose for pose in poses])
     )
     assert np.linalg.norm(start) > 1e-3
     np.testing.assert_allclose(moved, start, atol=1e-12)
@@ -277,12 +278,12 @@ def test_jacobians_of_displacement_factors_agree_with_finite_differences(scale):
     motion = geometry.exp(np.array([0.02, -0.05, 0.3, 0.2, -0.4, 0.1]))
     displacements = [None, Displacement(0, np.array([0.3, 0.0, 0.0]), np.eye(3) * 1e-6)]
     factors = aiding.displacement_factors(keyframes([POSE, POSE @ motion], displacements=displacements), RIG)
-    by_j, by_scale = factors.jacobians(motion[None], scale, factors.residuals(motion[None], scale))
-    by_motion = numeric(lambda m: factors.residuals((motion @ geometry.exp(m))[None], scale)[0], np.zeros(6))
+    shared = np.array([scale, 0.3])  # the second parameter is of no effect
+    by_j = factors.jacobians(motion[None], shared, factors.residuals(motion[None], shared))
+    by_motion = numeric(lambda m: factors.residuals((motion @ geometry.exp(m))[None], shared)[0], np.zeros(6))
     np.testing.assert_allclose(by_j[0], by_motion, atol=1e-8)
-    np.testing.assert_allclose(
-        by_scale[0], numeric(lambda s: factors.residuals(motion[None], scale + s[0])[0], np.zeros(1))[:, 0], atol=1e-8
-    )
+    by_shared = numeric(lambda s: factors.residuals(motion[None], shared + s)[0], np.zeros(2))
+    np.testing.assert_allclose(factors.by_shared(motion[None], slice(None), 2)[0], by_shared, atol=1e-8)
 
 
 def outliers():

@@ -184,7 +184,7 @@ class RigConfig(Section):
 
     model: str | None = Field(default=None, min_length=1, max_length=500)
     """name of a rig in scenes/rigs, or its file: cameras, sensor, lens, port, calibration error and lamps. They replace
-    those of the files that this file extends; keys beside it change single values"""
+    those of the files that this file extends; further keys of this file change single values"""
     title: str = Field(default="", max_length=80)
     """name of the rig for reports, set by model"""
     image_width_px: int = Field(default=320, ge=64, le=4096)
@@ -348,9 +348,9 @@ class CalibrationErrorConfig(Section):
     """
 
     rotation_sigma_deg: float = Field(default=0.0, ge=0, le=2)
-    """standard deviation of the rotation of the right camera about each of its axes, drawn by the seed [deg]"""
+    """standard deviation of the rotation of the right camera about each of its axes, which depends on the seed [deg]"""
     baseline_sigma_mm: float = Field(default=0.0, ge=0, le=20)
-    """standard deviation of the error of the baseline, drawn by the seed [mm]"""
+    """standard deviation of the error of the baseline, which depends on the seed [mm]"""
 
     focal_error: float = Field(default=0.0, ge=-0.2, le=0.2)
     """relative error of the focal length of both cameras"""
