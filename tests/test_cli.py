@@ -224,7 +224,7 @@ def test_a_crash_of_the_driver_is_a_failed_check(monkeypatch):
     assert doctor.check_rendering().found == "rendering failed with exit status -11"
 
 
-@pytest.mark.long
+@pytest.mark.slow
 def test_an_interrupted_survey_leaves_a_readable_run_folder(tmp_path):
     out = tmp_path / "run"
     survey = subprocess.Popen(

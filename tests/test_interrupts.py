@@ -243,3 +243,21 @@ def test_other_threads_get_no_handlers():
     thread.start()
     thread.join()
     assert found == [(1, signal.default_int_handler)]
+
+
+@pytest.mark.parametrize(("cause", "ends"), [(KeyboardInterrupt(), True), (ValueError("damaged"), False)])
+def test_an_interrupt_while_compiled_code_is_loaded_ends_the_stage(cause, ends):
+    """numba then raises a SystemError, with the interrupt as its cause."""
+
+    def load():
+        try:
+            raise SystemError("unpickling") from cause
+        except SystemError as error:
+            raise SystemError("dispatcher") from error
+
+    guard = StageGuard()
+    if ends:
+        assert guard.attempt("flight", load) is None and guard.skipped == ["flight"]
+    else:
+        with pytest.raises(SystemError):
+            guard.attempt("flight", load)

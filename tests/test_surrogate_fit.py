@@ -192,7 +192,7 @@ class SimulatedImages:
     """Surrogate in place of vision by images: each stereo point has the covariance of a single match."""
 
     def __init__(self, vision):
-        self._vision = vision
+        self._vision, self.binning = vision, vision.matchability.binning
 
     def __getattr__(self, name):
         return getattr(self._vision, name)

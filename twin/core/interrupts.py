@@ -49,6 +49,10 @@ class StageGuard:
             if self._waiting:
                 self._deliver(self._waiting.pop(), None)
             yield
+        except SystemError as error:
+            if _is_interrupt(error):
+                raise KeyboardInterrupt from error
+            raise
         finally:
             self._open = False
 
@@ -75,3 +79,10 @@ class StageGuard:
 
     def _deliver(self, number: int, frame: FrameType | None) -> None:
         self._handlers[number](number, frame)
+
+
+def _is_interrupt(error: BaseException | None) -> bool:
+    """Returns whether an interrupt caused an error: compiled code that is being loaded turns it into a SystemError."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
