@@ -97,7 +97,7 @@ MUTANTS = [
         ("twin/estimate/navigation/pose_filter.py", "[[1, 0, -x / depth], [0, 1, -y / depth]]", "[[1, 0, x / depth], [0, 1, -y / depth]]", "estimate_positioning estimate_aiding"),
         ("twin/estimate/navigation/vertical.py", "up = ahead * information[0][:, None] + back[::-1] * information[1][:, None]", "up = ahead * information[1][:, None] + back[::-1] * information[0][:, None]", "estimate_vertical"),
         ("twin/estimate/adjustment/pose_graph.py", "damping / 10 if damping > _MIN_DAMPING else 0.0", "damping * 10 if damping > _MIN_DAMPING else 0.0", "estimate_pose_graph"),
-        ("twin/estimate/adjustment/pose_graph.py", "shared = (-equations.shared_gradient - float(np.sum(equations.border * poses))) / information", "shared = -equations.shared_gradient / information", "estimate_pose_graph estimate_aiding"),
+        ("twin/estimate/adjustment/pose_graph.py", 'shared = cov @ (-equations.shared_gradient - np.einsum("nak,na->k", equations.border, poses))', "shared = cov @ -equations.shared_gradient", "estimate_pose_graph estimate_aiding"),
         ("twin/estimate/link_selection.py", "return 1 / (1 - min(overlap, _LARGEST_OVERLAP))", "return 1 / (2 - min(overlap, _LARGEST_OVERLAP))", "estimate_network estimate_link_noise"),
         ("twin/estimate/self_check.py", "quality.frames_lost / max(n, 1), MAX_FRAMES_LOST", "quality.frames_lost / max(2 * n, 1), MAX_FRAMES_LOST", "estimate_self_check"),
         # judge
@@ -137,6 +137,15 @@ MUTANTS = [
         ("twin/planning/cost.py", "n_frames * frame + n_keyframes *", "n_frames * frame - n_keyframes *", "app_plan"),
         ("twin/planning/expected_error.py", "float(np.mean(2 * ndtr(x / sigma) - 1)) - share", "float(np.mean(ndtr(x / sigma))) - share", "app_plan"),
         ("twin/reproduce/tank_sizes.py", "share = np.sqrt(3) / 2 if item.shape == \"dome\"", "share = 0.5 if item.shape == \"dome\"", "reproduce_tank"),
+        # self-calibration, rigs, interrupts
+        ("twin/estimate/vision/observation_equations.py", "-x * points[:, 1] / 2, 1 + x**2", "x * points[:, 1] / 2, 1 + x**2", "estimate_self_calibration"),
+        ("twin/estimate/vision/two_view_motion.py", "variance**0.5, -by_unknowns[:6]", "variance**0.5, by_unknowns[:6]", "estimate_self_calibration"),
+        ("twin/estimate/self_calibration.py", 'np.einsum("nji,nj->ni", rotation, moved)', 'np.einsum("nij,nj->ni", rotation, moved)', "estimate_self_calibration"),
+        ("twin/estimate/adjustment/pose_graph.py", "derivatives, shared - at)", "derivatives, shared + 0 * at)", "estimate_self_calibration"),
+        ("twin/estimate/mapping/map_builder.py", "stereo.disparity_px - offset_px", "stereo.disparity_px + offset_px", "estimate_self_calibration"),
+        ("twin/estimate/vision/pair_matching.py", "return points - remaining * ", "return points + remaining * ", "estimate_self_calibration"),
+        ("twin/scenario/model.py", "np.random.SeedSequence(self.seed, spawn_key", "np.random.SeedSequence(0, spawn_key", "scenario_rigs"),
+        ("twin/core/interrupts.py", "error = error.__cause__ or error.__context__", "error = None", "interrupts"),
     ]
 ]  # fmt: skip
 

@@ -72,6 +72,14 @@ def test_a_study_varies_the_rig(folder):
     assert (found.rig.title, found.rig.baseline_m) == ("mine", 0.4)
 
 
+@pytest.mark.parametrize(("model", "message"), [("nope", "'nope': no such rig"), ("bad.toml", "bad.toml:4: rig.base")])
+def test_a_wrong_rig_in_a_sample_of_a_study_is_an_error_of_this_sample(folder, model, message):
+    (folder / "bad.toml").write_text('title = "bad"\nsources = {}\n[rig]\nbaseline_m = -1\n')
+    source = Source(path=folder / "study.toml", lines={"rig.model": 7})
+    with pytest.raises(ScenarioError, match=rf"study.toml:7: rig.model: .*{message}"):
+        with_values({}, {"rig.model": model}, source)
+
+
 def test_a_resolved_scenario_needs_no_rig_file(folder):
     found = scenario(folder, '[rig]\nmodel = "mine.toml"\n')
     (folder / "mine.toml").unlink()

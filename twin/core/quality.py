@@ -16,7 +16,7 @@ class EpipolarError(NamedTuple):
     #: (4,) pitch, yaw, roll [rad], with the signs of `calibration_error.right_*`, and row offset [focal lengths].
     estimate: Array
     sigma: Array  #: (4,) standard deviations of `estimate`
-    removed: Array  #: (4,) errors corrected in the right images, in the same units; yaw is never corrected
+    removed: Array  #: (4,) errors corrected in the right images, in the same units; the yaw is that of self-calibration
     #: weighted RMS over the regions of the image of the mean row difference that `estimate` does not explain, without
     #: the part due to matching noise [focal lengths].
     pattern: float = 0.0

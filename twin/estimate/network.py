@@ -29,6 +29,7 @@ _REFERENCE_COV = np.eye(6) * 1e-12  # the first pose defines the world frame
 _FIXED_COV = np.eye(6) * 1e-10  # nodes older than the window are practically fixed
 _START_NODES = 4  # the first nodes are candidates for every link, because loops return to the reference position
 _REMEASURED_PX = 0.05  # error of disparities above which a link is measured again, as its effect is not linear
+_VIEWED_NODES = 200  # latest nodes whose views are counted at every keyframe: the time grows with their square
 _MOST_PENDING = 8  # largest number of nodes with link measurements in progress
 
 
@@ -240,14 +241,20 @@ class KeyframeNetwork:
         `latest` are those of links that are not yet in the network.
         """
         pending = [attempt.yaw for _, chain, _ in self._pending for attempt in chain if attempt.yaw is not None]
-        yaws = [*self.history.yaws, *pending, *latest]
-        return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, len(self.nodes) - 1 + len(latest)))
+        yaws, n_nodes = [*self.history.yaws, *pending, *latest], len(self.nodes) - 1 + len(latest)
+        return fused(self.rig.yaw_sigma_rad, self.disparity_offset(yaws, n_nodes, self.nodes[-_VIEWED_NODES:]))
 
-    def disparity_offset(self, offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int) -> DisparityOffset | None:
-        """Returns the mean of the offsets of links (`calibration_errors.disparity_offset`)."""
+    def disparity_offset(
+        self, offsets: Sequence[DisparityOffset | YawEffect], n_nodes: int, viewed: Sequence[Keyframe] | None = None
+    ) -> DisparityOffset | None:
+        """Returns the mean of the offsets of links (`calibration_errors.disparity_offset`).
+
+        The number of views of a point is that by the nodes `viewed`, by default by all nodes.
+        """
         if not offsets:
             return None
-        poses, depth_m = (np.array([getattr(n, key) for n in self.nodes]) for key in ("world_from_camera", "depth_m"))
+        nodes = self.nodes if viewed is None else viewed
+        poses, depth_m = (np.array([getattr(n, key) for n in nodes]) for key in ("world_from_camera", "depth_m"))
         n_views = calibration_errors.mean_views(poses, depth_m, self.rig)
         return calibration_errors.disparity_offset(offsets, n_nodes, n_views, self.rig.focal_px)
 

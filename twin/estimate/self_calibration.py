@@ -1,9 +1,10 @@
 """Self-calibration: parameters that all factors of the alignment share and that are estimated together with the poses.
 
 They are the scale error of the DVL and, if the calibration states a standard deviation for them, the yaw between the
-cameras and the error of the baseline since the calibration. The yaw moves near and far points differently, so that it
-is observable over relief (`disparity_offset`); the baseline only by navigation sensors. What is not observable remains
-as uncertain as the calibration states, in the covariances of all poses.
+cameras and the error of the baseline since the calibration. A yaw adds (1 + x^2) times itself to the disparity at
+column x, which images that overlap contradict, over relief more than over a level floor; the baseline is observable
+by navigation sensors only. What is not observable remains as uncertain as the calibration states, in the covariances of
+all poses.
 """
 
 from __future__ import annotations

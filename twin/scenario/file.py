@@ -6,7 +6,7 @@ import copy
 import os
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -93,7 +93,7 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
             continue
         try:
             _assign(changed, key, _absolute(key, value, source.path.parent), key)
-            _take_rig(changed, changed, source.path.parent)
+            _take_rig(changed, changed, source.path.parent, str)
         except ScenarioError as error:
             problem = error.lines[0].removeprefix(f"{key}: ")
             raise ScenarioError([source.describe(TwinError(key, problem))]) from None
@@ -218,25 +218,23 @@ def _read_with_base(file: Path, including: tuple[Path, ...] = ()) -> tuple[dict[
 
 def _merged(tree: dict[str, Any], base: dict[str, Any], source: Source) -> dict[str, Any]:
     """Returns the keys of a file merged over those of its base file, or over those of the rig that it names."""
-    try:
-        _take_rig(tree, base, source.path.parent)
-    except ScenarioError:
-        raise
-    except TwinError as error:
-        raise ScenarioError([source.describe(error)]) from None
+    _take_rig(tree, base, source.path.parent, source.describe)
     return _merge(base, tree)
 
 
-def _take_rig(tree: dict[str, Any], base: dict[str, Any], folder: Path) -> None:
-    """Removes rig.model from a tree; replaces what `base` says about cameras and lamps by the rig of that name.
+def _take_rig(tree: dict[str, Any], base: dict[str, Any], folder: Path, describe: Callable[[TwinError], str]) -> None:
+    """Removes rig.model from a tree; replaces the cameras and lamps of `base` by those of the rig of that name.
 
-    Raises TwinError if there is no such rig, ScenarioError if its file is invalid.
+    Raises ScenarioError if there is no such rig, as `describe` words it, or if its file is invalid.
     """
     rig = tree.get("rig")
     if not isinstance(rig, dict) or not isinstance(rig.get("model"), str):
         return  # a model of another type is refused by the validation
     model = rig.pop("model")
-    file = find_rig(model, folder)
+    try:
+        file = find_rig(model, folder)
+    except TwinError as error:
+        raise ScenarioError([describe(error)]) from None
     sections, lines = read_toml(file)
     validated(sections, RigFile, Source(path=file, lines=lines))
     for key in REPLACED:
@@ -299,12 +297,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     value = _override_value(key, text)
     value = str(value) if _is_path_key(key) and not isinstance(value, list) else value
     _assign(tree, key, _absolute(key, value, Path.cwd()), f"--set {shown(override)}")
-    try:
-        _take_rig(tree, tree, Path.cwd())
-    except ScenarioError:
-        raise
-    except TwinError as error:
-        raise ScenarioError([f"--set: {error}"]) from None
+    _take_rig(tree, tree, Path.cwd(), lambda error: f"--set: {error}")
 
 
 def _override_value(key: str, text: str) -> Any:

@@ -18,7 +18,7 @@ from twin.scenario.model import (
     RigConfig,
     Section,
     SensorConfig,
-)  # fmt: skip
+)
 
 #: Sections of a scenario that a rig replaces as a whole; its lamps, if it has any, replace those of the scenario too.
 REPLACED = ("rig", "sensor", "lens", "port", "calibration_error")

@@ -5,9 +5,10 @@ point [focal lengths], the normalised row of a point at (x, y) changes by
 
     dy = w_x (1 + y^2) - w_y x y - w_z x + e
 
-(Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed from the right image; yaw is not, because a
-distortion error looks nearly the same and a wrong yaw would shift all disparities. `_pattern` separates matching
-noise, which averages out in a region of the image, from errors of the calibration.
+(Hartley & Zisserman 2004, section 6.1). Pitch, roll and offset are removed from the right image; this estimate of the
+yaw is not, because a distortion error looks nearly the same and a wrong yaw would shift all disparities (that of the
+motions is, see `self_calibration`). `_pattern` separates matching noise, which averages out in a region of the image,
+from errors of the calibration.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from twin.core.records import Image, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import StereoPoints
 
-#: Which of pitch, yaw, roll and row offset are removed from the right images.
+#: Which estimates of pitch, yaw, roll and row offset are removed from the right images.
 CORRECTED = np.array([True, False, True, True])
 #: Prior standard deviations of pitch, yaw, roll [rad] and offset (normalised): 20 times those of a poor calibration.
 _PRIOR_SIGMA = np.array([0.02, 0.02, 0.02, 0.02])
@@ -51,7 +52,7 @@ def _pattern(regions: Array, estimate: Array) -> float:
 class EpipolarCalibration:
     """Errors of the rectification, estimated from all stereo pairs so far (recursive weighted least squares).
 
-    `removed` (4,) are the pitch, yaw (always 0), roll [rad] and row offset (normalised) that `rectify` removes.
+    `removed` (4,) are the pitch, yaw (`correct_yaw`), roll [rad] and row offset (normalised) that `rectify` removes.
     """
 
     def __init__(self) -> None:
