@@ -2,6 +2,8 @@
 
 import re
 import runpy
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -63,3 +65,8 @@ def test_commands_are_those_of_shell_blocks_without_those_that_ran_already():
     script = runpy.run_path(str(ROOT / "tests" / "readme_commands.py"))["script"]
     page = "```sh\nmake demo # a\ntwin plan reef\n```\n\n    twin doctor\n\n```toml\na = 1\n```\n\n```sh\nls\n```\n"
     assert script(page, ["make demo"]) == "set -eux\ntwin plan reef\nls\n"
+
+
+def test_every_mutant_changes_a_text_that_stands_once():
+    done = subprocess.run([sys.executable, ROOT / "tests" / "mutants.py", "--check"], capture_output=True, text=True)
+    assert done.returncode == 0, [line for line in done.stdout.splitlines() if " current " not in line]
