@@ -297,6 +297,24 @@ def test_a_linear_problem_is_factorised_once(monkeypatch):
     assert solution.converged and len(calls) == 1
 
 
+def test_a_linear_problem_with_a_shared_parameter_is_factorised_once(monkeypatch):
+    """The minimum of (x - 1)^2 + (x + s - 3)^2 + s^2 is at x = 5/3, s = 2/3."""
+    factorise, calls = block_cholesky.BlockMatrix.factorise, []
+    monkeypatch.setattr(block_cholesky.BlockMatrix, "factorise", lambda *a: calls.append(1) or factorise(*a))
+    alone = along_x(np.array([1.0]))
+    (distance,) = along_x(np.array([3.0])).binary
+    scaled = distance._replace(
+        residuals=lambda i_from_j, shared: distance.residuals(i_from_j, shared) + shared,
+        by_shared=lambda i_from_j, batch, n_shared: np.ones((1, 1, 1)),
+    )
+    prior = pose_graph.SharedPrior(np.zeros(1), np.ones(1))
+    graph = alone._replace(binary=[*alone.binary, scaled], shared=prior)
+    solution = pose_graph.optimise(graph, start_at(100.0)._replace(shared=np.zeros(1)))
+    assert solution.state.poses[1, 0, 3] == pytest.approx(5 / 3, abs=1e-4)
+    assert solution.state.shared[0] == pytest.approx(2 / 3, abs=1e-4)
+    assert solution.converged and len(calls) == 1
+
+
 def test_damping_reaches_the_minimum_where_gauss_newton_diverges(monkeypatch):
     """For the cost arctan(x)^2, Gauss-Newton steps from beyond 1.39 increase |x|."""
     factorise, buffers = block_cholesky.BlockMatrix.factorise, []
