@@ -5,6 +5,7 @@ import pytest
 
 from twin.core import geometry
 from twin.estimate.vision import observation_equations, two_view_motion
+from twin.estimate.vision.motion_filter import MotionFilter
 from twin.estimate.vision.observation_equations import PairMeasurements
 
 BASELINE_M = 0.15
@@ -76,6 +77,36 @@ def test_too_few_points_give_no_motion():
     a, b = measure(points, np.eye(4))
     assert pair_motion(a, b, np.full(3, 1e-3), np.eye(4)) is None
     assert two_view_motion.exact_depth_motion(a, b, BASELINE_M, np.eye(4)) is None
+
+
+@pytest.mark.parametrize("seed", [94, 322, 472, 643, 1617, 2697, 2731, 4896])
+def test_wrong_matches_give_no_motion_that_is_not_finite(seed):
+    # seeds with which the iteration diverged, or met a singular matrix
+    rng = np.random.default_rng(seed)
+    n, spread = int(rng.integers(12, 40)), rng.choice([0.01, 0.1, 0.3])
+    b = np.column_stack([rng.uniform(-spread, spread, (n, 2)), rng.uniform(0.03, 0.15, n)])
+    a = b + rng.normal(0, rng.choice([1e-3, 1e-2, 0.1]), (n, 3))
+    n_wrong = rng.integers(0, n + 1)
+    a[:n_wrong, :2] = rng.uniform(-0.5, 0.5, (n_wrong, 2))
+    cov_b = np.tile(np.eye(3) * 1e-6, (n, 1, 1))
+    cov_a, n_measured = cov_b.copy(), 3
+    if rng.random() < 0.5:
+        cov_a[:, 2, 2], a[:, 2], n_measured = 1.0, 0.0, 2
+    guess = geometry.exp(np.concatenate([rng.normal(0, 0.2, 3), rng.normal(0, 0.3, 3)]))
+    settings = two_view_motion.PairMotionSettings(n_measured=n_measured)
+    with np.errstate(all="ignore"):
+        motion = two_view_motion.pair_motion(PairMeasurements(a, b, cov_a, cov_b), BASELINE_M, guess, settings)
+        closed_form = two_view_motion.exact_depth_motion(a, b, BASELINE_M, guess)
+    assert motion is None or np.isfinite(motion.cov).all()
+    assert closed_form is None or np.isfinite(closed_form).all()
+
+
+def test_a_pose_that_is_not_finite_is_not_fused():
+    tracker = MotionFilter()
+    tracker.predict(0.1)
+    before = tracker.pose.copy()
+    assert not tracker.correct(np.full((4, 4), np.nan), np.eye(6) * 1e-6)
+    np.testing.assert_array_equal(tracker.pose, before)
 
 
 def test_jacobians_of_the_transfer_agree_with_finite_differences():

@@ -159,7 +159,7 @@ class PoseFilter:
         Returns the decrease (6, 6); None if the measurement was rejected as an outlier.
         """
         chi2, pose, decrease = _correct(self.world_from_camera, self.cov, measured, cov, motion_cov)
-        if chi2 > _GATE:
+        if not chi2 <= _GATE:  # nor if it is NaN
             return None
         self.reset(pose, self.cov - decrease)
         return decrease

@@ -54,7 +54,7 @@ class MotionFilter:
         """Fuses a measured pose (4, 4) with its covariance (6, 6); returns whether it agrees with the prediction."""
         innovation = geometry.log(geometry.inverse(self.pose) @ measured)
         gain = np.linalg.solve(self._cov[:6, :6] + cov, self._cov[:6]).T
-        if innovation @ np.linalg.solve(self._cov[:6, :6] + cov, innovation) > _GATE:
+        if not innovation @ np.linalg.solve(self._cov[:6, :6] + cov, innovation) <= _GATE:  # nor if it is NaN
             return False
         self._blind_s = 0.0
         update = gain @ innovation

@@ -78,8 +78,16 @@ def exact_depth_motion(a: Array, b: Array, baseline_m: float, guess: Array) -> A
 
     Iterates the closed form, eq. (2), from `guess` (4, 4), with Huber weights that are 0 beyond five standard
     deviations. Depth errors bias the estimate. Points (n, 3) are normalised (x, y, disparity); the disparity in a is
-    not used. None if there are too few points or inliers, or a point is behind camera a.
+    not used. None if there are too few points or inliers, a point is behind camera a, or the iteration diverges.
     """
+    try:
+        motion = _iterate_closed_form(a, b, baseline_m, guess)
+    except np.linalg.LinAlgError:  # singular normal equations
+        return None
+    return motion if motion is not None and np.isfinite(motion).all() else None
+
+
+def _iterate_closed_form(a: Array, b: Array, baseline_m: float, guess: Array) -> Array | None:
     points = np.column_stack([b[:, :2], np.ones(len(b))]) * baseline_m / b[:, 2:]
     b_from_a, weight = geometry.inverse(guess), np.zeros(len(b))
     for _ in range(_CLOSED_FORMS if len(b) >= _MIN_POINTS else 0):
@@ -110,10 +118,24 @@ def pair_motion(
     `CUTOFF`. `guess` (4, 4) is the initial pose of b in a.
 
     If the amplitude of pixel locking is not plausible (`MAX_LOCKING_PX`), as over a level floor where all points have
-    nearly the same sub-pixel position, the motion is estimated without it. None if too few points or inliers.
+    nearly the same sub-pixel position, the motion is estimated without it. None if too few points or inliers, or if the
+    iteration diverges, as it may if most points are wrong.
     """
     if len(measured.a) < _MIN_POINTS:
         return None
+    try:
+        motion = _adjust_pair(measured, baseline_m, guess, settings)
+    except np.linalg.LinAlgError:  # singular normal equations
+        return None
+    if motion is None or not (np.isfinite(motion.a_from_b).all() and np.isfinite(motion.cov).all()):
+        return None
+    return motion
+
+
+def _adjust_pair(
+    measured: PairMeasurements, baseline_m: float, guess: Array, settings: PairMotionSettings
+) -> Motion | None:
+    """Returns the motion of `pair_motion`, which is not finite if the Gauss-Newton iteration diverges."""
     a_from_b, amplitude_px, structure = guess, 0.0, measured.b.copy()
     normals = None
     for _ in range(_ITERATIONS):
@@ -126,7 +148,7 @@ def pair_motion(
         a_from_b = a_from_b @ geometry.exp(update[:6])
         amplitude_px += float(update[6:].sum())
     if abs(amplitude_px) > MAX_LOCKING_PX:
-        return pair_motion(measured, baseline_m, guess, settings._replace(locking=None))
+        return _adjust_pair(measured, baseline_m, guess, settings._replace(locking=None))
     if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
         return None
     motion = Motion(a_from_b, _pair_cov(normals, settings), int(np.count_nonzero(normals.weight)), normals.scale)
