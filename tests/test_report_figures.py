@@ -10,6 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 
+from twin.core.georeference import Georeference
 from twin.report import plotting, survey_figures
 from twin.report.number_formats import DASH, angle, length, milliradians, percent, with_unit
 from twin.report.style import COLOURS, FIGURE_STYLE
@@ -83,3 +84,26 @@ def test_bounds_of_a_range_have_no_exponent():
 def test_numbers_are_written_in_their_unit(function, value, text):
     assert function(value) == text
     assert function(None) == DASH
+
+
+@pytest.mark.parametrize("metres_per_unit", [1.0, 0.3048])
+def test_a_map_of_a_floor_in_a_crs_has_axes_of_easting_and_northing(metres_per_unit):
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure, axes = plotting.one_panel(4.0)
+        axes.set(xlim=(-2.0, 3.0), ylim=(-1.0, 1.5))
+        plotting.add_coordinates(axes, Georeference(412_349.25, 8_345_674.5, metres_per_unit=metres_per_unit))
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+    east, north = axes.child_axes
+    k = metres_per_unit
+    np.testing.assert_allclose(east.get_xlim(), [412_349.25 - 2 / k, 412_349.25 + 3 / k])
+    np.testing.assert_allclose(north.get_ylim(), [8_345_674.5 - 1 / k, 8_345_674.5 + 1.5 / k])
+    shown = [label.get_text() for label in north.get_yticklabels() if label.get_text()]
+    assert all(text.startswith("83456") for text in shown) and len(shown) > 2
+    assert north.get_ylabel() == f"northing [{'m' if k == 1 else '0.3048 m'}]"
+
+
+def test_a_map_of_a_scene_without_coordinates_has_no_other_axes():
+    _, axes = plotting.one_panel(4.0)
+    plotting.add_coordinates(axes, None)
+    assert not axes.child_axes

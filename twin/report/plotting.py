@@ -12,8 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LightSource, Normalize
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator
+from matplotlib.ticker import LogLocator, MaxNLocator
 
+from twin.core.georeference import Georeference
 from twin.report.style import FIGURE_STYLE
 
 WIDTH_IN = 9.6
@@ -40,6 +41,24 @@ def one_panel(height_in: float) -> tuple[Figure, Axes]:
 
 def legend_beside(axes: Axes) -> None:
     axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1))
+
+
+def add_coordinates(axes: Axes, origin: Georeference | None) -> None:
+    """Adds axes of easting and northing above and on the right of a map of a scene whose origin is in a CRS."""
+    if origin is None:
+        return
+    unit, k = "m" if origin.metres_per_unit == 1 else f"{origin.metres_per_unit:.7g} m", origin.metres_per_unit
+    east = axes.secondary_xaxis("top", functions=_linear(origin.easting, k))
+    north = axes.secondary_yaxis("right", functions=_linear(origin.northing, k))
+    for axis, name in ((east.xaxis, "easting"), (north.yaxis, "northing")):
+        axis.set_label_text(f"{name} [{unit}]")
+        axis.set_major_locator(MaxNLocator(4))
+        axis.set_major_formatter(lambda value, _: f"{value:.10g}")
+        axis.set_tick_params(labelsize=7, labelrotation=90 if name == "northing" else 0)
+
+
+def _linear(first: float, metres_per_unit: float) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
+    return lambda m: first + m / metres_per_unit, lambda c: (c - first) * metres_per_unit
 
 
 def log_scale(axes: Axes) -> None:

@@ -19,7 +19,7 @@ from twin.judge.verdict import numbers_of
 from twin.report.headline import badge, first_lines
 from twin.report.html import render_page
 from twin.report.number_formats import DASH, length, milliradians, percent, plain, ratio
-from twin.report.plotting import WIDTH_IN, drawn, legend_beside, log_axis, log_scale, one_panel
+from twin.report.plotting import WIDTH_IN, add_coordinates, drawn, legend_beside, log_axis, log_scale, one_panel
 from twin.report.run_folder import Run, load_run
 from twin.report.style import COLOURS
 
@@ -223,6 +223,8 @@ def path_curves(runs: Styled) -> Figure | None:
             x, y, _ = run.trajectories["final"].positions.T
             axes.plot(x, y, linewidth=1.1, **style)
     axes.set(xlabel="x (east) [m]", ylabel="y (north) [m]")
+    origins = {run.georeference for run, _ in runs}
+    add_coordinates(axes, origins.pop() if len(origins) == 1 else None)
     legend_beside(axes)
     return figure
 

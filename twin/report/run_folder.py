@@ -10,10 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.georeference import Georeference
 from twin.core.records import Array, Trajectory
 from twin.core.user_files import is_file, path_problem, read_json, read_text, reading
 from twin.errors import TwinError
-from twin.exchange.geotiff import Raster, read_mosaic, read_raster
+from twin.exchange.geotiff import Raster, read_georeference, read_mosaic, read_raster
 from twin.judge.recorded import ALIGNMENTS, AlignmentName, recorded_errors
 from twin.judge.trajectory_errors import PathErrors, path_errors
 from twin.report.run_files import (
@@ -60,6 +61,7 @@ class Run:
     rasters: dict[str, Raster]
     network: Network
     keyframes: Keyframes
+    georeference: Georeference | None = None
 
     @property
     def finished(self) -> bool:
@@ -100,6 +102,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         | _read_existing({"mosaic": folder / "mosaic.tif"}, read_mosaic),
         _read_existing({"": folder / "posegraph.g2o"}, lambda f: _network(read_text(f))).get("", _network("")),
         _read_keyframes(folder / "keyframes" / "index.json"),
+        _read_existing({"": folder / "dem.tif"}, read_georeference).get(""),
     )
 
 

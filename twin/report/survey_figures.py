@@ -13,7 +13,17 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from twin.report.number_formats import improvement, length
-from twin.report.plotting import WIDTH_IN, drawn, height_scale, hillshade, legend_beside, log_axis, log_scale, one_panel
+from twin.report.plotting import (
+    WIDTH_IN,
+    add_coordinates,
+    drawn,
+    height_scale,
+    hillshade,
+    legend_beside,
+    log_axis,
+    log_scale,
+    one_panel,
+)
 from twin.report.run_folder import Raster, Run
 from twin.report.stage_tables import PROCESSING_STAGES, stage_rows, stage_times
 from twin.report.style import COLOURS, ESTIMATES, LABELS
@@ -42,7 +52,7 @@ def plan_view(run: Run) -> Figure | None:
     if not run.trajectories:
         return None
     figure, axes = one_panel(5.2)
-    _map_axes(axes)
+    _map_axes(axes, run)
     if "dem_truth" in run.rasters:
         floor = run.rasters["dem_truth"]
         axes.imshow(hillshade(subsampled(floor), "gray"), extent=_extent(floor), alpha=0.35)
@@ -166,7 +176,7 @@ def elevation_maps(run: Run) -> Figure | None:
     figure = Figure(figsize=(WIDTH_IN, 4.0))
     panels = figure.subplots(1, len(rasters), squeeze=False, sharex=True, sharey=True)[0]
     for axes, (raster, title) in zip(panels, rasters, strict=True):
-        _map_axes(axes).imshow(hillshade(subsampled(raster), "viridis", scale), extent=_extent(raster))
+        _map_axes(axes, run).imshow(hillshade(subsampled(raster), "viridis", scale), extent=_extent(raster))
         axes.set_title(title)
     figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=panels, label="height [m]", shrink=0.8)
     return figure
@@ -180,16 +190,16 @@ def error_maps(run: Run) -> Figure | None:
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
     limit = float(np.nanpercentile(np.abs(run.rasters["dem_error"].values), 98)) or 1e-3
     title = "Height error (estimated minus true)"
-    _scalar_map(left, run.rasters["dem_error"], title, "RdBu_r", Normalize(-limit, limit))
+    _scalar_map(_map_axes(left, run), run.rasters["dem_error"], title, "RdBu_r", Normalize(-limit, limit))
     if "dem_sigma" in run.rasters:
         title = "Estimated standard deviation (sigma)"
-        _scalar_map(right, run.rasters["dem_sigma"], title, "magma", Normalize(0, limit))
+        _scalar_map(_map_axes(right, run), run.rasters["dem_sigma"], title, "magma", Normalize(0, limit))
     return figure
 
 
 def _scalar_map(axes: Axes, raster: Raster, title: str, cmap: str, norm: Normalize) -> None:
     """Draws a raster with one band and its colour bar; cells without data are light grey."""
-    image = _map_axes(axes).imshow(subsampled(raster), cmap=cmap, norm=norm, extent=_extent(raster))
+    image = axes.imshow(subsampled(raster), cmap=cmap, norm=norm, extent=_extent(raster))
     axes.set_title(title)
     axes.set_facecolor("#dfe6ea")
     figure = axes.get_figure()
@@ -222,7 +232,7 @@ def network_plot(run: Run) -> Figure | None:
     if len(positions) == 0:
         return None
     figure, axes = one_panel(4.4)
-    _map_axes(axes)
+    _map_axes(axes, run)
     axes.set_adjustable("datalim")  # a network along a line fills the figure too
     links = list(positions[edges][:, :, :2])
     axes.add_collection(LineCollection(links, colors=COLOURS["link"], linewidths=0.5, alpha=0.6))
@@ -261,8 +271,9 @@ def _extent(raster: Raster) -> tuple[float, float, float, float]:
     return (grid.west_m, grid.west_m + grid.cols * grid.cell_m, grid.north_m - grid.rows * grid.cell_m, grid.north_m)
 
 
-def _map_axes(axes: Axes) -> Axes:
+def _map_axes(axes: Axes, run: Run) -> Axes:
     axes.set_aspect("equal")
     axes.grid(visible=False)
     axes.set(xlabel="east [m]", ylabel="north [m]")
+    add_coordinates(axes, run.georeference)
     return axes
