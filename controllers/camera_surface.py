@@ -1,85 +1,105 @@
-"""Planned height of the camera on a path that follows the floor: a smooth surface z(x, y)."""
+"""Planned height of the camera on a path that follows the floor: a smooth surface over the axes (u, v) of the legs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.interpolate import RectBivariateSpline
 from scipy.ndimage import gaussian_filter, map_coordinates, uniform_filter1d
 
-from twin.controllers.segments import Reference
+from twin.controllers.segments import Point, Reference
+from twin.controllers.survey_area import SurveyArea
 from twin.core.geometry import Array
 from twin.kernels import kernel
+
+_NODES = 8  # nodes of the surface along the shorter side of an image
+_MOST_SAMPLES = 1_000_000  # of the floor
+_SLOPE_SAMPLES = 100  # of the slope along a line
 
 
 @dataclass(frozen=True)
 class CameraSurface:
-    """Planned height z of the camera as a function of x and y: a bicubic spline with continuous second derivatives."""
+    """Planned height z of the camera as a function of u and v: a bicubic spline with continuous second derivatives."""
 
-    spline: RectBivariateSpline  # z [m] as a function of x and y [m]; constant beyond the outermost knots
+    spline: RectBivariateSpline  # z [m] as a function of u and v [m]; constant beyond the outermost knots
+    area: SurveyArea  # its axes are u and v
+    max_climb: float  # greatest slope (rise over run) of a path at cruise speed
 
     def height_at(self, x_m: Array, y_m: Array) -> Array:
-        return self.spline.ev(x_m, y_m)
+        return self.spline.ev(*self.area.to_legs(x_m, y_m))
 
     def follow(self, level: Reference) -> Reference:
         """Lifts the references of a level path, given at n times, to the surface; returns the new references.
 
-        With the surface z(x, y), horizontal velocity v and acceleration a, the vertical velocity is grad(z)' v and the
-        vertical acceleration grad(z)' a + v' H(z) v, with the Hessian H.
+        With the surface z(u, v), horizontal velocity w and acceleration a, the vertical velocity is grad(z)' w and the
+        vertical acceleration grad(z)' a + w' H(z) w, with the Hessian H.
         """
-        x, y = level.position[:, 0], level.position[:, 1]
-        slope = np.stack([self.spline.ev(x, y, dx=1), self.spline.ev(x, y, dy=1)], axis=1)
-        xx, xy, yy = (self.spline.ev(x, y, dx=i, dy=2 - i) for i in (2, 1, 0))
-        v, a = level.velocity[:, :2], level.acceleration[:, :2]
-        bend = xx * v[:, 0] ** 2 + 2 * xy * v[:, 0] * v[:, 1] + yy * v[:, 1] ** 2
-        climb, lift = (slope * v).sum(axis=1), (slope * a).sum(axis=1) + bend
+        u, v = self.area.to_legs(level.position[:, 0], level.position[:, 1])
+        slope = np.stack([self.spline.ev(u, v, dx=1), self.spline.ev(u, v, dy=1)], axis=1)
+        uu, uv, vv = (self.spline.ev(u, v, dx=i, dy=2 - i) for i in (2, 1, 0))
+        w, a = (self.area.vectors_to_legs(part[:, :2]) for part in (level.velocity, level.acceleration))
+        bend = uu * w[:, 0] ** 2 + 2 * uv * w[:, 0] * w[:, 1] + vv * w[:, 1] ** 2
+        climb, lift = (slope * w).sum(axis=1), (slope * a).sum(axis=1) + bend
         return level._replace(
-            position=np.column_stack([x, y, self.height_at(x, y)]),
-            velocity=np.column_stack([v, climb]),
-            acceleration=np.column_stack([a, lift]),
+            position=np.column_stack([level.position[:, :2], self.spline.ev(u, v)]),
+            velocity=np.column_stack([level.velocity[:, :2], climb]),
+            acceleration=np.column_stack([level.acceleration[:, :2], lift]),
         )
+
+    def pace(self, start: Point, end: Point) -> float:
+        """Returns the share of the cruise speed, at most 1, at which a line climbs no faster than with `max_climb`."""
+        x, y = np.linspace(start[:2], end[:2], _SLOPE_SAMPLES).T
+        rise_m, run_m = np.abs(np.diff(self.height_at(x, y))).max(), np.hypot(x[1] - x[0], y[1] - y[0])
+        return min(1.0, self.max_climb * run_m / rise_m) if rise_m > 0 else 1.0
 
 
 def surface_above_floor(
-    height_m: NDArray[np.floating],
+    height_at: Callable[[Array, Array], Array],
+    area: SurveyArea,
     spacing_m: float,
-    corner_m: tuple[float, float],
     altitude_m: float,
     footprint_m: tuple[float, float],
-    max_slope: float,
+    max_slope: tuple[float, float],
 ) -> CameraSurface:
     """Returns the surface that the camera follows at an altitude above the smoothed floor.
 
-    The floor is averaged twice over the footprint, along x and y, and sampled at nodes about 1/8 of the shorter side of
+    The floor is averaged twice over the footprint, along u and v, and sampled at nodes about 1/8 of the shorter side of
     the footprint apart, but not closer than `spacing_m`. Around steep parts it is raised, by as little as possible,
     until its slope is at most `max_slope`; a Gaussian filter of one node distance then rounds the edges.
 
     Args:
-        height_m: (ny, nx) heights of the floor, at least 4 x 4, row 0 = south.
-        corner_m: position (x, y) of node (0, 0).
-        footprint_m: extent of an image on the floor along x and y.
-        max_slope: greatest slope (rise over run) of the surface along x, y and the diagonals.
+        height_at: height of the floor [m] at arrays x and y [m], also around the terrain.
+        spacing_m: distance between the samples of the floor.
+        footprint_m: extent of an image on the floor along u and v.
+        max_slope: greatest slope (rise over run) of the surface along u, which is that of paths at cruise speed, and
+            along v.
     """
-    size = [max(1, round(side / spacing_m)) for side in footprint_m[::-1]]
-    smooth = np.asarray(height_m, np.float64)
+    reach_m = np.array(area.size_m) / 2 + footprint_m
+    step_m = max(min(spacing_m, min(footprint_m) / _NODES), float(np.sqrt(4 * reach_m.prod() / _MOST_SAMPLES)))
+    shape = np.ceil(2 * reach_m / step_m).astype(int) + 1
+    u, v = (np.linspace(-reach, reach, n) for reach, n in zip(reach_m, shape, strict=True))
+    smooth = height_at(*area.to_scene(u[:, None], v))
     for _ in range(2):
-        for axis, side in enumerate(size):
-            smooth = np.asarray(uniform_filter1d(smooth, side, axis, mode="nearest"), np.float64)
-    ny, nx = height_m.shape
-    step_m = max(min(footprint_m) / 8, spacing_m)
-    rows, cols = (np.linspace(0, n - 1, max(4, round((n - 1) * spacing_m / step_m) + 1)) for n in (ny, nx))
+        for axis, (side_m, along) in enumerate(zip(footprint_m, (u, v), strict=True)):
+            size = 2 * round(side_m / (along[1] - along[0]) / 2) + 1
+            smooth = np.asarray(uniform_filter1d(smooth, size, axis, mode="nearest"), np.float64)
+    n_nodes = np.maximum(4, np.round(2 * reach_m / max(min(footprint_m) / _NODES, step_m)).astype(int) + 1)
+    rows, cols = (np.linspace(0, n - 1, k) for n, k in zip(shape, n_nodes, strict=True))
     coarse = map_coordinates(smooth, np.meshgrid(rows, cols, indexing="ij"), order=1)
-    coarse = _limit_slope(coarse, rows[1] * spacing_m, cols[1] * spacing_m, max_slope)
+    u, v = np.interp(rows, np.arange(len(u)), u), np.interp(cols, np.arange(len(v)), v)
+    coarse = _limit_slope(coarse, max_slope[0] * (u[1] - u[0]), max_slope[1] * (v[1] - v[0]))
     coarse = gaussian_filter(coarse, 1.0, mode="nearest")
-    x, y = corner_m[0] + cols * spacing_m, corner_m[1] + rows * spacing_m
-    return CameraSurface(RectBivariateSpline(x, y, coarse.T + altitude_m))
+    return CameraSurface(RectBivariateSpline(u, v, coarse + altitude_m), area, max_slope[0])
 
 
 @kernel
-def _limit_slope(height_m, step_y_m, step_x_m, max_slope):
-    """Returns heights raised as little as possible to limit slopes to 8 neighbours (chamfer sweeps, Borgefors 1986)."""
+def _limit_slope(height_m, rise_u_m, rise_v_m):
+    """Returns heights raised as little as possible to limit slopes to 8 neighbours (chamfer sweeps, Borgefors 1986).
+
+    `rise_u_m` and `rise_v_m` are the greatest differences between neighbours along u (rows) and v (columns).
+    """
     result = height_m.copy()
     rows, cols = result.shape
     for sweep in range(2):
@@ -91,6 +111,6 @@ def _limit_slope(height_m, step_y_m, step_x_m, max_slope):
                 for dr, dc in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
                     nr, nc = r + back * dr, c + back * dc
                     if 0 <= nr < rows and 0 <= nc < cols:
-                        least = result[nr, nc] - max_slope * np.hypot(dr * step_y_m, dc * step_x_m)
+                        least = result[nr, nc] - np.hypot(dr * rise_u_m, dc * rise_v_m)
                         result[r, c] = max(result[r, c], least)
     return result

@@ -32,6 +32,8 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     area = request.area or SurveyArea("disc", request.area_m)
     if request.turns != "reverse":
         raise TwinError("plan.turns", f"{request.turns!r} has no effect on loops", '"reverse"')
+    if request.cross_lines:
+        raise TwinError("plan.cross_lines", f"{request.cross_lines}: has no effect on loops", "0")
     loop_diameter_m = _disc_diameter_m(request.area_m) / 2
     shorter_m = min(request.footprint_m)
     max_spacing_m = (1 - request.overlap_across) * shorter_m * request.across_scale
@@ -40,6 +42,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
     n_filling = math.ceil(math.pi / math.asin(min(1.0, max_spacing_m / loop_diameter_m)) - 1e-9)
     n_tracks = n_tracks_to_fly(request, n_filling)
     speed_mps = min(request.speed_mps, max_circle_speed_mps(loop_diameter_m / 2, request.acceleration_mps2))
+    spacing_m = loop_diameter_m * math.sin(math.pi / n_filling)
     return SurveyPlan(
         request,
         paths=tuple((_loop(request, area, loop_diameter_m, 2 * math.pi * k / n_filling),) for k in range(n_tracks)),
@@ -47,10 +50,11 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         speed_mps=speed_mps,
         n_frames_per_keyframe=frames_per_keyframe(request, speed_mps),
         swath_length_m=math.pi * loop_diameter_m,
-        swath_spacing_m=loop_diameter_m * math.sin(math.pi / n_filling),
+        swath_spacing_m=spacing_m,
         n_tracks_to_fill=n_filling,
         side_along_m=shorter_m,
         side_across_m=shorter_m,
+        least_spacing_m=spacing_m,
     )
 
 

@@ -42,7 +42,11 @@ class SurveyRequest(NamedTuple):
     #: Factors on the spacing of keyframes and of swaths on the reference plane; below 1 if the floor is nearer.
     along_scale: float = 1.0
     across_scale: float = 1.0
+    #: pairs of v [m], ascending, and the factor on the spacing of legs there; between them it is interpolated. Empty:
+    #: the legs are equally spaced.
+    leg_spacing: tuple[tuple[float, float], ...] = ()
     surface: CameraSurface | None = None  # planned height z of the camera; None: `altitude_m` everywhere
+    cross_lines: int = 0  # number of lines across the legs of a lawnmower, flown after them
 
     @property
     def footprint_m(self) -> tuple[float, float]:
@@ -62,26 +66,42 @@ class SurveyPlan:
     n_frames_per_keyframe: int  # N, frames from one keyframe to the next
     swath_length_m: float  # length of a swath: the mean over all legs that fill the area, or that of a loop
     swath_spacing_m: float  # greatest distance between neighbouring swaths
-    n_tracks_to_fill: int  # number of tracks that fill the area, of which the first `n_tracks` are planned
+    n_tracks_to_fill: int  # number of tracks that fill the area, of which the first are planned
     #: Sides of the footprint along which keyframes and neighbouring swaths are displaced; the shorter one for loops.
     side_along_m: float
     side_across_m: float
+    least_spacing_m: float  # least distance between neighbouring swaths
+    covered_to_m: float = math.inf  # greatest v of the part of the area that the planned legs have to cover
 
     def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point of the scene lies in the asked area, which the planned tracks have to cover.
 
-        This is the whole area if they fill it; otherwise the part of it up to half of `swath_spacing_m` beyond the last
-        planned leg of a lawnmower, or within half of `swath_spacing_m` of a planned loop.
+        This is the whole area if they fill it; otherwise the part of it in the strips of the planned legs of a
+        lawnmower, or within half of `swath_spacing_m` of a planned loop.
         """
         x_m, y_m = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(y_m, np.float64))
         inside = self.area.contains(x_m, y_m)
-        if self.n_tracks >= self.n_tracks_to_fill:
-            return inside
         circles = [segment for path in self.paths for segment in path if isinstance(segment, Circle)]
-        if circles:
+        if circles and self.n_tracks < self.n_tracks_to_fill:
             return inside & self._near_loop(circles, x_m, y_m)
+        if math.isinf(self.covered_to_m):
+            return inside
         _, across = self.area.to_legs(x_m, y_m)
-        return inside & (across <= 2 * self.n_tracks * self.swath_spacing_m - self.area.size_m[1] / 2 + _EDGE_M)
+        return inside & (across <= self.covered_to_m + _EDGE_M)
+
+    @property
+    def n_leg_tracks(self) -> int:
+        """Returns the number of tracks of legs or loops: all but that of the cross lines."""
+        return self.n_tracks - (self.cross_track is not None)
+
+    @property
+    def cross_track(self) -> int | None:
+        """Returns the number of the track of the cross lines, from 1; None without cross lines."""
+        return self.n_tracks if self.request.cross_lines else None
+
+    @property
+    def follows_floor(self) -> bool:
+        return self.request.surface is not None
 
     @property
     def turns_on_the_spot(self) -> bool:

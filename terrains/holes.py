@@ -32,14 +32,14 @@ def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: s
             )  # fmt: skip
 
 
-def fill_holes(height_m: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
-    """Replaces values that are not finite by the nearest height; returns the heights and the number of these."""
+def fill_holes(height_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns heights with the nearest one in place of values that are not finite."""
     holes = ~np.isfinite(height_m)
     if not holes.any():
-        return height_m, 0
+        return height_m
     nearest = ndimage.distance_transform_edt(holes, return_distances=False, return_indices=True)
     assert nearest is not None
-    return height_m[tuple(nearest)], int(holes.sum())
+    return height_m[tuple(nearest)]
 
 
 def known_nodes(given: NDArray[np.bool_]) -> NDArray[np.bool_] | None:

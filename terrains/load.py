@@ -45,7 +45,8 @@ def load(
     _check(given, file)
     upward_m = upward_sign(given, axis, z, file) * axis.metres_per_unit
     values = given[::-1] * upward_m
-    (raw, n_filled), known = fill_holes(values), known_nodes(np.isfinite(values))
+    has_height = np.isfinite(values)
+    raw, known = fill_holes(values), known_nodes(has_height)
     if (most_m := float(np.abs(raw).max())) > _MOST_HEIGHT_M:  # larger than any on Earth
         raise height_error(file, f"has a height of {most_m:g} m", f"heights within {_MOST_HEIGHT_M:g} m of zero")
     lowest_m = raw.min()
@@ -69,7 +70,8 @@ def load(
         share = float(covered.mean())
     walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
-    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, n_filled, georeference, share, walls, known)
+    filled = None if has_height.all() else ~has_height
+    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, filled, georeference, share, walls, known)
 
 
 def _read_heights(

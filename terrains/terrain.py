@@ -51,7 +51,8 @@ class Terrain:
         west_m, south_m: position of node (0, 0).
         texture: (h, w, 3) uint8 RGB albedo that covers the rectangle exactly; row 0 = NORTH.
         texture_px_m: side of a texel along x; along y, it may differ by rounding.
-        n_filled: number of nodes without a height in the source, filled with the nearest height, for rendering.
+        filled: (ny, nx) bool, nodes without a height in the source, which have the nearest height, for rendering; None:
+            no node.
         georeference: position of the scene in the CRS of the source; None for a floor without coordinates.
         orthophoto_share: share of the texels that an orthophoto covers; None without an orthophoto.
         walls: texture of the steep parts; None: the texture is projected from above everywhere.
@@ -65,7 +66,7 @@ class Terrain:
     south_m: float
     texture: NDArray[np.uint8]
     texture_px_m: float
-    n_filled: int = 0
+    filled: NDArray[np.bool_] | None = None
     georeference: Georeference | None = None
     orthophoto_share: float | None = None
     walls: Walls | None = None
@@ -93,6 +94,19 @@ class Terrain:
         return float(self.height_m.max())
 
     @property
+    def n_filled(self) -> int:
+        return 0 if self.filled is None else int(self.filled.sum())
+
+    @property
+    def unknown_share(self) -> float:
+        """Returns the share of the nodes that are not `known`."""
+        return 0.0 if self.known is None else float(np.mean(~self.known))
+
+    @property
+    def _in_small_hole(self) -> NDArray[np.bool_] | None:
+        return self.filled if self.filled is None or self.known is None else self.filled & self.known
+
+    @property
     def extent(self) -> str:
         """Returns the extent as text, for errors."""
         return f"x {self.west_m:.2f} to {self.east_m:.2f}, y {self.south_m:.2f} to {self.north_m:.2f} m"
@@ -100,7 +114,7 @@ class Terrain:
     @property
     def hole_notes(self) -> list[str]:
         n, n_unknown = self.height_m.size, 0 if self.known is None else int((~self.known).sum())
-        n_small = self.n_filled - n_unknown
+        n_small = 0 if self._in_small_hole is None else int(self._in_small_hole.sum())
         unknown = (
             f"{n_unknown} of {n} cells of the floor ({100 * n_unknown / n:.3g} %) have no height: they are"
             " neither planned over nor judged, and drawn with the nearest height."
@@ -115,6 +129,17 @@ class Terrain:
             return np.zeros(inside.shape, np.bool_)
         whole = self.known[1:, 1:] & self.known[1:, :-1] & self.known[:-1, 1:] & self.known[:-1, :-1]
         return inside & ~whole[r, c]
+
+    def in_filled(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
+        """Returns whether the node that is nearest to each point lies in a small hole, filled with a height."""
+        r, c, u, v, inside = self._cells(x_m, y_m)
+        if (small := self._in_small_hole) is None:
+            return np.zeros(inside.shape, np.bool_)
+        return inside & small[r + (v >= 0.5), c + (u >= 0.5)]
+
+    def height_near(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
+        """Returns the height of the floor at points, or at the nearest point of the terrain if they lie outside it."""
+        return self.height_at(np.clip(x_m, self.west_m, self.east_m), np.clip(y_m, self.south_m, self.north_m))
 
     def height_at(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.float64]:
         """Returns the height of the floor at points (x, y) of any shape [m]; NaN outside the terrain."""

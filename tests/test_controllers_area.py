@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
 from twin.controllers import lawnmower, loops
 from twin.controllers.forecast import least_clearance
 from twin.controllers.segments import Turn
-from twin.controllers.survey_area import SurveyArea, polygon_area
+from twin.controllers.survey_area import SurveyArea, polygon_area, polygons_area
 from twin.controllers.survey_plan import TURN_PER_KEYFRAME, TURN_RATE, SurveyRequest
 from twin.errors import TwinError
 
@@ -43,6 +44,12 @@ def legs_of(p):
     """Returns the end points (n, 2, 2) of the legs of a plan, in the axes of the legs."""
     tracks = [np.column_stack(p.area.to_legs(*p.waypoints(t)[:, :2].T)) for t in range(1, p.n_tracks + 1)]
     return np.array([points[k : k + 2] for points in tracks for k in (0, 2)])
+
+
+TWO_PARTS = [
+    [[(-3.0, -3.0), (0.0, -3.0), (0.0, -1.5), (-3.0, -1.5)]],
+    [[(-1.0, 0.5), (3.0, 0.5), (3.0, 3.0), (-1.0, 3.0)], [(0.0, 1.0), (2.0, 1.0), (2.0, 2.5), (0.0, 2.5)]],
+]
 
 
 def distance_to_legs(u, v, legs):
@@ -96,6 +103,36 @@ def test_every_point_of_a_polygon_lies_within_half_a_spacing_of_a_leg(corners, h
     assert 300 < inside.sum() < 2500
     distance = distance_to_legs(*p.area.to_legs(x[inside], y[inside]), legs_of(p))
     assert distance.max() <= p.swath_spacing_m / 2 + 1e-9
+
+
+@pytest.mark.parametrize("heading_deg", [0.0, 30.0])
+def test_an_area_of_two_parts_with_a_hole_is_that_of_shapely_and_its_legs_fill_both_parts(heading_deg):
+    area = polygons_area(TWO_PARTS, np.deg2rad(heading_deg))
+    x, y = np.meshgrid(np.arange(-400, 400) * 0.01 + 0.005, np.arange(-400, 400) * 0.01 + 0.005)
+    inside = area.contains(x, y)
+    truth = shapely.MultiPolygon([(outline, holes) for outline, *holes in TWO_PARTS])
+    assert inside.sum() * 1e-4 == pytest.approx(truth.area, rel=1e-3) and truth.area == 4.5 + 10 - 3
+    np.testing.assert_array_equal(inside[::40, ::40], shapely.contains_xy(truth, x, y)[::40, ::40])
+    assert [len(ring) for ring in area.outlines()] == [5, 5, 5]
+    p = plan(area)
+    legs = legs_of(p)
+    distance = distance_to_legs(*area.to_legs(x[inside][::7], y[inside][::7]), legs)
+    assert distance.max() <= p.swath_spacing_m / 2 + 1e-9
+    if heading_deg == 0:  # no leg between the parts
+        assert len(area.bands()) == 2
+        assert not ((legs[:, 0, 1] > -1.4 - area.centre_m[1]) & (legs[:, 0, 1] < 0.4 - area.centre_m[1])).any()
+
+
+def test_parts_that_touch_or_overlap_are_one():
+    touching = polygons_area([[L_SHAPE], [[(3.0, 0.0), (4.0, 0.0), (4.0, 1.0), (3.0, 1.0)]]], 0.0)
+    assert len(touching.outlines()) == 1 and touching.contains(3.0, 0.5)
+    overlapping = polygons_area([[L_SHAPE], [[(2.0, 0.2), (4.0, 0.2), (4.0, 0.8), (2.0, 0.8)]]], 0.0)
+    assert len(overlapping.outlines()) == 1 and overlapping.size_m == (4.0, 2.5)
+
+
+def test_a_hole_outside_its_polygon_is_rejected():
+    with pytest.raises(TwinError, match="Hole lies outside shell"):
+        polygons_area([[L_SHAPE, [(5.0, 5.0), (6.0, 5.0), (6.0, 6.0)]]], 0.0)
 
 
 @pytest.mark.parametrize("corners", [L_SHAPE, SPIKE])
@@ -191,10 +228,41 @@ def test_turns_alternate_so_that_a_tether_is_not_twisted():
     assert p.track_duration_s(1) == pytest.approx(plan().track_duration_s(1) + 2 * (180 / 15 + 1))  # trapezoid
 
 
-def test_loops_have_no_turns():
+@pytest.mark.parametrize("change", [{"turns": "bow_first"}, {"cross_lines": 2}])
+def test_loops_have_no_turns_and_no_cross_lines(change):
     with pytest.raises(TwinError, match="no effect on loops") as caught:
-        loops.plan(SurveyRequest(**REQUEST | {"area_m": (3.0, 3.0), "turns": "bow_first"}))
-    assert caught.value.field == "plan.turns"
+        loops.plan(SurveyRequest(**REQUEST | {"area_m": (3.0, 3.0)} | change))
+    assert caught.value.field == f"plan.{next(iter(change))}"
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("changes", [{}, {"tracks": 1}, {"turns": "bow_first"}])
+def test_cross_lines_are_flown_after_the_legs_at_equal_distances_over_all_of_them(n, changes):
+    area = rectangle(heading_deg=30)
+    without, p = plan(area, **changes), plan(area, cross_lines=n, **changes)
+    assert p.paths[:-1] == without.paths and p.cross_track == p.n_tracks == without.n_tracks + 1
+    corners = np.column_stack(area.to_legs(*p.waypoints(p.n_tracks)[:, :2].T))
+    steps = np.diff(corners, axis=0)
+    assert (np.abs(steps).min(axis=1) < 1e-9).all()  # along or across the legs
+    lines = corners[:-1][np.abs(steps[:, 1]) > 1e-9]
+    np.testing.assert_allclose(lines[:, 0], (np.arange(n) + 0.5) / n * 4.0 - 2.0, atol=1e-9)
+    legs_v = legs_of(without)[:, 0, 1]
+    np.testing.assert_allclose(np.abs(steps[np.abs(steps[:, 1]) > 1e-9, 1]), np.ptp(legs_v), atol=1e-9)
+    last, first = p.reference(p.n_tracks - 1, 1e6), p.reference(p.n_tracks, 0.0)
+    np.testing.assert_allclose(first.position, last.position, atol=1e-9)
+    times, _ = p.frames_of_track(p.n_tracks)
+    np.testing.assert_allclose(np.asarray(p.references(p.n_tracks, times).yaw), last.yaw)
+    x, y = np.random.default_rng(0).uniform(-3, 3, (2, 500))
+    np.testing.assert_array_equal(p.inside_area(x, y), without.inside_area(x, y))
+
+
+def test_cross_lines_of_a_polygon_span_the_legs_that_they_cross():
+    p = plan(polygon_area(L_SHAPE, 0.0), cross_lines=3)
+    corners = np.column_stack(p.area.to_legs(*p.waypoints(p.n_tracks)[:, :2].T)) + p.area.centre_m
+    x = corners[:-1, 0][np.abs(np.diff(corners[:, 1])) > 1e-9]
+    np.testing.assert_allclose(np.unique(x.round(9)), [0.5, 1.5, 2.5])
+    tops = [corners[np.abs(corners[:, 0] - u) < 1e-9, 1].max() for u in (0.5, 2.5)]
+    assert tops[0] > 2.2 and tops[1] < 1.2  # a strip at the edge
 
 
 def test_clearance_of_a_turned_plan_is_that_of_the_turned_floor():

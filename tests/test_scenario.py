@@ -19,8 +19,8 @@ from twin.studies.study_file import load_study
 from twin.studies.surveys import surveys
 
 PLAN_KEYS = (
-    "pattern, area_m, centre_m, centre_crs, heading_deg, polygon, turns, altitude_m, speed_mps, overlap_along, "
-    "overlap_across, overlap_reference, height, tracks, clearance_m"
+    "pattern, area_m, centre_m, centre_crs, heading_deg, along_contours, polygon, turns, altitude_m, speed_mps, "
+    "overlap_along, overlap_across, overlap_reference, height, tracks, cross_lines, clearance_m"
 )
 TOP_KEYS = (
     "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "

@@ -1,11 +1,19 @@
 """Floor without a height: it is neither planned over nor judged, and the user is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import from_origin
 
 from twin import terrains
+from twin.core.records import MapGrid
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
+from twin.planning.drawing import draw
+from twin.planning.summary import as_json, summarise
+from twin.report.style import COLOURS
 from twin.scenario.file import load_scenario
 from twin.session.assembly import open_world
 from twin.survey import run
@@ -93,6 +101,59 @@ def test_the_truth_has_no_height_no_colour_and_no_coverage_in_a_hole(tmp_path):
     on_floor = ~hole & np.isfinite(survey.terrain.height_at(x, y))
     assert truth.seen[on_floor].all() and np.isfinite(truth.height_m[on_floor]).all()
     assert np.isfinite(colours[on_floor]).all()
+
+
+@pytest.mark.parametrize("share", [0.10, 0.50, 0.76])
+def test_the_share_of_nodata_is_that_of_rasterio_in_plan_truth_picture_and_notes(tmp_path, share, monkeypatch):
+    """The hole is a half-plane at an angle, as beside a swath; 40 single cells have no height, too."""
+    file, (x, y) = tmp_path / "floor.tif", np.meshgrid(np.arange(200) * 0.05, np.arange(199, -1, -1) * 0.05)
+    beyond = x + 0.4 * y
+    hole = beyond > np.quantile(beyond, 1 - share)
+    single = np.zeros_like(hole)
+    single[5:-5:24, 5:55:12] = True
+    with rasterio.open(
+        file, "w", "GTiff", 200, 200, 1, "EPSG:32755", from_origin(4e5, 8e6, 0.05, 0.05), "float32", nodata=-9999
+    ) as raster:
+        raster.write(np.where(hole | single, -9999, 0.1 * np.sin(x)).astype(np.float32), 1)
+    with rasterio.open(file) as raster:
+        nodata = float((raster.read_masks(1) == 0).mean())
+    survey = mission(file, "plan.centre_m=[-3.3, 0.0]", "plan.area_m=[1.6, 1.6]", "plan.tracks=0")
+    floor = survey.terrain
+    n_single = int((single & ~hole).sum())
+    assert floor.unknown_share == pytest.approx(nodata - n_single / 40000) and n_single > 20
+    assert f"({100 * floor.unknown_share:.3g} %) have no height" in survey.hole_notes[0]
+    assert survey.hole_notes[1].startswith(f"{n_single} cells of the floor, in small holes")
+    cells = MapGrid(floor.west_m, floor.north_m, 0.05, 199, 199)
+    surface = replace(survey, grid=cells)
+    x, y = np.meshgrid(*cells.centres())
+    assert np.mean(floor.in_hole(x, y)) == pytest.approx(floor.unknown_share, abs=0.01)
+    with open_world(surface, Stopwatch()) as world:
+        world.coverage.seen[:] = True  # pyright: ignore
+        truth = world.truth()
+    assert np.mean(np.isnan(truth.height_m)) == np.mean(~truth.seen) == np.mean(floor.in_hole(x, y))
+    summary = summarise(survey)
+    asked = survey.plan.inside_area(x, y)
+    share_asked = floor.in_hole(x, y)[asked].mean()
+    holes = as_json(summary, "")["holes"]
+    assert holes["floor"] == floor.unknown_share and holes["filled"] == pytest.approx(n_single / 40000)
+    assert holes["asked_area"] == pytest.approx(share_asked, abs=0.02) and (share_asked > 0.03) == (share == 0.76)
+    assert [w for w in summary.warnings if w.endswith("of the asked area has no height and is not part of it")] == [
+        note.removesuffix(".") for note in survey.hole_notes[2:]
+    ]
+    drawn = []
+    monkeypatch.setattr("matplotlib.axes.Axes.imshow", lambda self, shown, **style: drawn.append((shown, style)))
+    draw(summary, tmp_path / "plan.png")
+    shown = {style["cmap"].colors[0]: np.isfinite(mask).mean() for mask, style in drawn if style["cmap"] != "gray"}
+    assert shown[COLOURS["hole"]] == pytest.approx(floor.unknown_share, abs=0.01) and shown[COLOURS["filled"]] > 0
+
+
+def test_an_area_without_any_cell_of_floor_is_refused(tmp_path):
+    file = write(tmp_path / "sparse.npy", lambda x, y: (np.round(x / 0.05) % 2 == 0) | (np.round(y / 0.05) % 2 == 0))
+    message = (
+        r"plan.area_m: no cell of the floor in the area has a height \(7\d.\d % of the floor has none\) \(allowed: an"
+    )
+    with pytest.raises(ScenarioError, match=message):
+        mission(file)
 
 
 @pytest.mark.long

@@ -122,9 +122,19 @@ def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_pat
         tree = {"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": tree}]}
     (tmp_path / "area.geojson").write_text(json.dumps(tree), "utf-8-sig" if form == "byte order mark" else "utf-8")
     terrain = mission(dem).terrain
-    np.testing.assert_allclose(read_geojson(tmp_path / "area.geojson", terrain), CORNERS, atol=1e-3)
+    np.testing.assert_allclose(read_geojson(tmp_path / "area.geojson", terrain)[0][0], CORNERS, atol=1e-3)
     area = survey_area(PlanConfig(polygon=str(tmp_path / "area.geojson"), heading_deg=20), terrain)
     np.testing.assert_allclose(area.outline(), CORNERS, atol=1e-3)
+
+
+def test_holes_and_parts_of_a_geojson_file_are_parts_of_the_area(dem, tmp_path):
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+    rings = [[2 * square - 2.5, square * 0.5 - 2], [square + 1]]
+    tree = {"type": "MultiPolygon", "coordinates": [[(ring + CENTRE).tolist() for ring in part] for part in rings]}
+    (tmp_path / "area.geojson").write_text(json.dumps(tree))
+    m = mission(dem, f"plan.polygon={tmp_path}/area.geojson", "plan.cross_lines=1", "plan.altitude_m=3.0")
+    x, y = np.meshgrid(*m.grid.centres())
+    assert m.asked(x, y).sum() * m.grid.cell_m**2 == pytest.approx(4 - 0.25 + 1, rel=0.02)
 
 
 @pytest.mark.parametrize(

@@ -1,15 +1,18 @@
 """Plans over the true floor: spacing, height, forecast, clearance and thrust."""
 
 import dataclasses
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from twin import terrains
 from twin.controllers.camera_surface import surface_above_floor
+from twin.controllers.survey_area import SurveyArea
 from twin.core.records import SurveyResult, Trajectory, Truth
 from twin.errors import ScenarioError, TwinError
-from twin.judge.swaths import overlap_metrics
+from twin.judge.swaths import overlap_metrics, swath_numbers
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.terrains import Terrain, TextureSource
@@ -167,18 +170,26 @@ def test_the_references_on_a_surface_are_consistent_derivatives(monkeypatch):
     np.testing.assert_allclose(change[smooth][:, 2], r.acceleration[1:-1][smooth][:, 2], atol=5e-3)
 
 
+def surface(height_at, footprint_m, slopes, heading=0.0, spacing_m=0.1):
+    area = SurveyArea("rectangle", (7.9, 5.9), heading=heading)
+    return surface_above_floor(height_at, area, spacing_m, 2.0, footprint_m, slopes)
+
+
 def test_a_surface_above_a_level_floor_is_level_and_a_cliff_is_climbed_before_it():
-    level_floor = np.full((60, 80), 0.3)
-    surface = surface_above_floor(level_floor, 0.1, (-4.0, -3.0), 2.0, (1.7, 2.3), 0.3)
-    np.testing.assert_allclose(surface.height_at(np.array([-4, 0, 3.9]), np.array([0, 1, 2])), 2.3)
-    cliff = np.where(np.arange(80) > 40, 2.0, 0.0) * np.ones((60, 1))
-    x = np.linspace(-4, 3.9, 400)
-    z = surface_above_floor(cliff, 0.1, (-4.0, -3.0), 2.0, (0.6, 0.8), 0.3).height_at(x, np.zeros(400))
+    level = surface(lambda x, y: np.full(np.broadcast(x, y).shape, 0.3), (1.7, 2.3), (0.3, 0.3), heading=0.4)
+    np.testing.assert_allclose(level.height_at(np.array([-3, 0, 3.1]), np.array([0, 1, 2])), 2.3)
+    x, zero = np.linspace(-3.9, 3.9, 400), np.zeros(400)
+
+    def cliff(x, y):
+        return np.where(x > 0, 2.0, 0.0) + 0 * y
+
+    z = surface(cliff, (0.6, 0.8), (0.3, 0.3)).height_at(x, zero)
     assert np.abs(np.diff(z) / np.diff(x)).max() <= 0.3 * 1.02  # the spline between its knots
-    uneven = surface_above_floor(cliff, 0.1, (-4.0, -3.0), 2.0, (1.2, 1.2), 0.3)  # an eighth of the image is 1.5 nodes
-    assert np.abs(np.diff(uneven.height_at(x, np.zeros(400))) / np.diff(x)).max() <= 0.3 * 1.02
     foot = np.interp(-1.0, x, z)  # 1 m before the cliff, whose smoothed top begins about 0.6 m behind its edge
     assert 4.0 - 0.3 * 1.9 < foot < 4.0 - 0.3 * 1.0
+    across = surface(cliff, (0.8, 0.6), (0.3, 1.5), heading=np.pi / 2).height_at(x, zero)  # legs along the cliff
+    assert 1.0 < np.abs(np.diff(across) / np.diff(x)).max() <= 1.5 * 1.02
+    assert np.interp(-1.0, x, across) == pytest.approx(2.0, abs=0.01)  # it is not climbed before it is in view
 
 
 def test_the_clearance_of_a_following_path_is_checked_where_it_flies(monkeypatch):
@@ -195,6 +206,23 @@ def test_a_path_over_a_slope_higher_than_the_altitude_follows_it(grade, monkeypa
     x, y, z = mission.plan.all_references().position.T
     assert np.ptp(z) > 4.9 * abs(grade)
     assert z - slope.height_at(x, y) == pytest.approx(1.2, abs=0.03)
+
+
+def test_cross_lines_belong_to_no_swath_and_change_no_overlap(monkeypatch):
+    """Their long lines are perpendicular to the legs, and the short ones between them parallel."""
+    with_lines, without = (over(raised(0.0), monkeypatch, f"plan.cross_lines={n}") for n in (6, 0))
+    plan, last = with_lines.plan, with_lines.plan.n_tracks
+    assert planned_overlap(with_lines) == planned_overlap(without)
+    swath = planned_keyframes(plan, "lawnmower").swath
+    assert swath.max() + 1 == 2 * without.plan.n_tracks
+    n_cross = plan.frames_of_track(last)[1].sum()
+    assert (swath[-n_cross:] == -1).all() and n_cross > 20
+    position = plan.all_references().position
+    track = np.repeat(np.arange(last) + 1, [len(plan.frames_of_track(k + 1)[0]) for k in range(last)])
+    truth: Any = SimpleNamespace(reference=position, track=track, reference_yaw=None)
+    assert swath_numbers(truth, "lawnmower", plan.cross_track).max() + 1 == 2 * without.plan.n_tracks
+    assert (swath_numbers(truth, "lawnmower", plan.cross_track)[track == last] == -1).all()
+    assert swath_numbers(truth, "lawnmower").max() + 1 > 2 * without.plan.n_tracks
 
 
 def test_a_kinematic_vehicle_cannot_follow_the_floor():

@@ -107,7 +107,7 @@ class Restoration:
 
 def estimated_floor(elevation: ElevationMap) -> height_field.HeightField:
     """Returns the heights of a map, not smoothed, as this tilts facets; a hole has the height of the nearest cell."""
-    height, _ = fill_holes(elevation.height_m.astype(np.float64))
+    height = fill_holes(elevation.height_m.astype(np.float64))
     return height_field.map_height_field(height.astype(np.float32), elevation.grid)
 
 

@@ -43,12 +43,14 @@ def travel_direction(reference: Array) -> Array:
     return step[row] / length[row, None]
 
 
-def swath_numbers(truth: Truth, pattern: str) -> NDArray[np.int64]:
-    """Returns the leg, or the track of loops, of each frame (n,), from 0; -1 between legs and during turns."""
+def swath_numbers(truth: Truth, pattern: str, cross_track: int | None = None) -> NDArray[np.int64]:
+    """Returns the leg, or the track of loops, of each frame (n,), from 0; -1 between legs, on turns and cross lines."""
     if pattern == "loops":
         return truth.track - 1
-    numbers = leg_numbers(truth.reference)
-    return numbers if truth.reference_yaw is None else np.where(is_turning(truth.reference_yaw), -1, numbers)
+    off_leg = truth.track == cross_track
+    if truth.reference_yaw is not None:
+        off_leg |= is_turning(truth.reference_yaw)
+    return np.where(off_leg, -1, leg_numbers(truth.reference))
 
 
 def is_turning(yaw: Array) -> NDArray[np.bool_]:
@@ -63,13 +65,11 @@ def is_turning(yaw: Array) -> NDArray[np.bool_]:
 def leg_numbers(reference: Array) -> NDArray[np.int64]:
     """Returns the number (n,) of the leg of each frame, from 0; -1 on the short segments between legs.
 
-    Legs run along the principal axis of the steps between the reference positions (n, 3). A leg ends where the
-    direction of travel reverses or a short segment begins.
+    Legs are parallel to the first step between the reference positions (n, 3). A leg ends where the direction of travel
+    reverses or a short segment begins.
     """
     direction = travel_direction(reference)
-    steps = np.diff(reference[:, :2], axis=0, prepend=reference[:1, :2])
-    axis = np.linalg.eigh(steps.T @ steps)[1][:, -1]
-    cosine = direction @ axis
+    cosine = direction @ direction[0] if len(direction) else np.zeros(0)
     on_leg = np.where(np.abs(cosine) > ON_LEG_COSINE, np.sign(cosine), 0.0)
     starts = (on_leg != 0) & (np.diff(on_leg, prepend=0.0) != 0)
     return np.where(on_leg != 0, np.cumsum(starts) - 1, -1).astype(np.int64)
@@ -119,14 +119,17 @@ def overlap_metrics(
 
     Args:
         grid: cells of `truth.height_m`; None: the floor is taken to be level, at the mean height.
-        planned: `pattern` of the plan, requested `overlap_along` and `overlap_across`, and `along_median` and
+        planned: `pattern` of the plan, number `cross_track` of the track of its cross lines, whether overlaps count
+            `both_ways` (`image_pairs`), requested `overlap_along` and `overlap_across`, and `along_median` and
             `across_median`, forecast from the planned poses over the floor; 0 to 1.
     """
     rows, pattern = result.keyframe_rows, planned.get("pattern", "lawnmower")
-    travel, swath = travel_direction(truth.reference)[rows], swath_numbers(truth, pattern)[rows]
+    travel = travel_direction(truth.reference)[rows]
+    swath = swath_numbers(truth, pattern, planned.get("cross_track"))[rows]
     poses = KeyframePoses(truth.trajectory.world_from_camera[rows], travel, swath)
     field, found = _true_floor(truth, grid), {}
-    for direction, pairs in zip(("along", "across"), image_pairs(poses), strict=True):
+    both = image_pairs(poses, planned.get("both_ways", False))
+    for direction, pairs in zip(("along", "across"), both, strict=True):
         overlap = np.zeros(0) if field is None else image_overlap(field, pairs.first, pairs.second, rig)
         overlap = overlap[np.isfinite(overlap)]  # not finite if the first image shows no floor
         found |= {
@@ -138,11 +141,19 @@ def overlap_metrics(
     return found
 
 
-def image_pairs(poses: KeyframePoses) -> tuple[ImagePairs, ImagePairs]:
-    """Returns the pairs of consecutive keyframes of a swath, and those of neighbouring swaths (`_across_pairs`)."""
+def image_pairs(poses: KeyframePoses, both_ways: bool = False) -> tuple[ImagePairs, ImagePairs]:
+    """Returns the pairs of consecutive keyframes of a swath, and those of neighbouring swaths (`_across_pairs`).
+
+    With `both_ways`, each pair is returned a second time in the other order: over a slope, the upper image shows more
+    of the lower one than the lower one of the upper one.
+    """
     first = np.flatnonzero((poses.swath[:-1] == poses.swath[1:]) & (poses.swath[1:] >= 0))
     along = ImagePairs(poses.world_from_camera[first], poses.world_from_camera[first + 1])
-    return along, _across_pairs(poses)
+    across = _across_pairs(poses)
+    if not both_ways:
+        return along, across
+    doubled = [ImagePairs(*map(np.concatenate, zip(p, p[::-1], strict=True))) for p in (along, across)]
+    return doubled[0], doubled[1]
 
 
 def _across_pairs(poses: KeyframePoses) -> ImagePairs:

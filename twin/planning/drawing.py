@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import LightSource
+from matplotlib.colors import LightSource, ListedColormap
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Polygon, Rectangle
 
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.core.height_field import cast_pixels
 from twin.planning.summary import OVERLAP_TOLERANCE, PlanSummary, required_overlaps
+from twin.report.plotting import add_coordinates
 from twin.report.style import COLOURS, FIGURE_STYLE, LABELS
 from twin.world.mission import Mission
+from twin.world.planning import floor_of
 
 _SHADE_SAMPLES = 400
+_EDGE_POINTS = 40  #: along each side of the outline of an image
 _LEAST_DRAWN_M = 0.005  #: height above the floor at which the outlines of the objects are drawn
 
 
@@ -27,7 +33,9 @@ def draw(summary: PlanSummary, file: Path) -> Path:
         figure = Figure(figsize=(14, 6.5))
         plan, overlap = figure.subplots(1, 2, sharex=True, sharey=True)
         _draw_floor(plan, summary)
-        _draw_path(plan, mission)
+        _draw_holes(plan, mission)
+        _draw_path(plan, summary)
+        add_coordinates(plan, mission.terrain.georeference)
         _draw_overlap(overlap, summary)
         plan.set(xlabel="x, east [m]", ylabel="y, north [m]", title=f"Plan of {mission.scenario.name}")
         overlap.set(xlabel="x, east [m]", title="Overlap over the floor")
@@ -44,7 +52,7 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
     floor, t = summary.floor, summary.mission.terrain
     along, across = required_overlaps(summary.mission)
     axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))
-    axes.add_patch(_area(summary.mission, ec=COLOURS["limit"], ls="--", fill=False, linewidth=1.4))
+    _draw_area(axes, summary.mission)
     pairs = (
         ("along", "o", 14, floor.along_position_m, floor.overlap_along, along),
         ("across", "D", 9, floor.across_position_m, floor.overlap_across, across),
@@ -67,10 +75,11 @@ def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
     t, top = mission.terrain, summary.floor.surface
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
     hole = t.in_hole(*np.meshgrid(x, y))
-    height, top_m = (np.where(hole, np.nan, surface.height_at(*np.meshgrid(x, y))) for surface in (t, top))
+    height, top_m = (surface.height_at(*np.meshgrid(x, y)) for surface in (t, top))
     steps = (x[1] - x[0], y[0] - y[1])
     shade = LightSource(315, 45).hillshade(top_m, vert_exag=1, dx=steps[0], dy=steps[1])
-    axes.imshow(shade, cmap="gray", vmin=-0.5, vmax=1.1, extent=(t.west_m, t.east_m, t.south_m, t.north_m))
+    axes.imshow(np.where(hole, np.nan, shade), cmap="gray", vmin=-0.5, vmax=1.1, extent=_extent(mission))
+    height, top_m = (np.where(hole, np.nan, heights) for heights in (height, top_m))
     if np.nanmax(height, initial=-np.inf) > np.nanmin(height, initial=np.inf):
         contours = axes.contour(x, y, height, levels=6, cmap="viridis", linewidths=0.8)
         axes.clabel(contours, fmt="%.2f m", fontsize=7)
@@ -79,17 +88,47 @@ def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
         axes.plot([], [], color=COLOURS["truth"], linewidth=0.9, label=f"{len(mission.objects)} objects")
 
 
-def _draw_path(axes: Axes, mission: Mission) -> None:
+def _draw_holes(axes: Axes, mission: Mission) -> None:
+    t = mission.terrain
+    x, y = np.meshgrid(
+        np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
+    )
+    masks = {
+        "hole": (t.in_hole(x, y), f"no height ({100 * t.unknown_share:.3g} % of the floor)"),
+        "filled": (t.in_filled(x, y), "small holes, filled"),
+    }
+    for colour, (mask, label) in masks.items():
+        if mask.any():
+            axes.imshow(np.where(mask, 1.0, np.nan), cmap=ListedColormap([COLOURS[colour]]), extent=_extent(mission))
+            axes.plot([], [], "s", color=COLOURS[colour], label=label)
+
+
+def _extent(mission: Mission) -> tuple[float, float, float, float]:
+    t = mission.terrain
+    return t.west_m, t.east_m, t.south_m, t.north_m
+
+
+def _draw_path(axes: Axes, summary: PlanSummary) -> None:
+    mission = summary.mission
     path = mission.plan.outline()
     axes.plot(path[:, 0], path[:, 1], color=COLOURS["online"], label=f"{LABELS['reference']} path")
     axes.plot(*path[0, :2], "o", color=COLOURS["final"], label="start")
-    across_m, along_m = mission.plan.request.footprint_m
-    first_image = (path[0, 0] - along_m / 2, path[0, 1] - across_m / 2)
-    style = {"fill": False, "linewidth": 1.4}
-    turned = {"angle": np.degrees(mission.plan.area.heading), "rotation_point": "center"}
-    axes.add_patch(Rectangle(first_image, along_m, across_m, ec=COLOURS["f2f"], label="one image", **turned, **style))
-    axes.add_patch(_area(mission, ec=COLOURS["limit"], ls="--", label="area", **style))
+    axes.plot(*_first_image(summary).T, color=COLOURS["f2f"], label="one image, on the floor")
+    _draw_area(axes, mission, label="area")
 
 
-def _area(mission: Mission, **style) -> Patch:
-    return Polygon(mission.plan.area.outline(), closed=True, **style)
+def _first_image(summary: PlanSummary) -> Array:
+    """Returns points (n, 2) around the floor in the first image [m]; NaN where it shows none."""
+    rig, pose = summary.mission.rig, summary.floor.keyframes.world_from_camera[:1]
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]]) * [rig.width_px, rig.height_px] - 0.5
+    pixels = np.concatenate([np.linspace(a, b, _EDGE_POINTS) for a, b in pairwise(corners)])
+    depth_m = cast_pixels(floor_of(summary.floor.surface), pose, rig, pixels)[0]
+    depth_m[np.isinf(depth_m)] = np.nan
+    rays = np.column_stack([rig.normalised(pixels), np.ones(len(pixels))])
+    return geometry.transform(pose[0], depth_m[:, None] * rays)[:, :2]
+
+
+def _draw_area(axes: Axes, mission: Mission, label: str = "_") -> None:
+    for outline in mission.plan.area.outlines():
+        axes.plot(*outline.T, color=COLOURS["limit"], linestyle="--", label=label)
+        label = "_"

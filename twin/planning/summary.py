@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +17,7 @@ from twin.planning.expected_error import ExpectedError, expected_error
 from twin.report.number_formats import length, percent, with_unit
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
+from twin.world.path_checks import unknown_share
 from twin.world.planning import SHORT_PERCENT
 
 #: Standard deviation of the disparity on good texture [px]; the depth error on the reference plane is proportional to
@@ -71,7 +73,7 @@ def summarise(mission: Mission) -> PlanSummary:
     predicted = _predicted_metrics(floor, error)
     known = {f"{section}.{key}" for section, metrics in predicted.items() for key in metrics}
     require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
-    holes = (note.removesuffix(".") for note in mission.terrain.hole_notes)
+    holes = (note.removesuffix(".") for note in mission.hole_notes)
     warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
     return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
 
@@ -138,6 +140,9 @@ def _limits_of_validity(mission: Mission, error: ExpectedError) -> Iterator[str]
         sections.append("[calibration_error]")
     if sections:
         yield f"the expected error does not include the effects of {', '.join(sections)}"
+    window, n_tracks = scenario.estimator_settings().window_tracks, mission.plan.n_leg_tracks
+    if mission.plan.cross_track and window < n_tracks:
+        yield (f"the cross lines are linked with the last {window} of {n_tracks} tracks only (estimate.window_tracks)")
     if mission.objects and scenario.imaging.fidelity != "rendered":
         yield "the surrogate surveys the bare sea floor, and so does this plan: both leave out [[objects]]"
 
@@ -149,8 +154,10 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
     swath, of_track = _SWATHS[mission.scenario.plan.pattern]
     included = "included" if mission.scenario.imaging.fidelity == "rendered" else "not included"
     objects = f"{len(mission.objects)}, {included} in the properties over the floor"
+    n_cross, heading_deg = mission.plan.request.cross_lines, math.degrees(mission.plan.area.heading)
     return [
-        (f"tracks L, {of_track} each", f"{len(mission.tracks)}"),
+        (f"tracks L, {of_track} each", f"{mission.plan.n_leg_tracks}"),
+        *([("cross lines", f"{n_cross}, flown after the {swath}s")] if n_cross else []),
         ("frames per keyframe N", f"{f.n_frames_per_keyframe}"),
         (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
         ("keyframes", f"{f.n_keyframes}"),
@@ -158,7 +165,8 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ("time", f"{f.duration_s + summary.hold_s:.0f} s, of which {summary.hold_s:.0f} s station keeping"),
         ("path", length(f.path_m)),
         ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
-        ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {length(f.swath_spacing_m)} between {swath}s"),
+        ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {_swath_spacing(mission)} between {swath}s"),
+        *([("heading of the legs", f"{heading_deg:.0f} deg")] if heading_deg else []),
         ("on the reference plane: footprint", f"{length(width_m)} across, {length(height_m)} along"),
         ("on the reference plane: overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("on the reference plane: disparity", f"{f.disparity_px:.1f} px"),
@@ -171,6 +179,14 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ),
         ("simulation", _cost_text(summary.cost)),
     ]
+
+
+def _swath_spacing(mission: Mission) -> str:
+    """Returns the distance between swaths as text, or the least and the greatest if legs are unevenly spaced."""
+    plan = mission.plan
+    if not plan.request.leg_spacing:
+        return length(plan.swath_spacing_m)
+    return f"{length(plan.least_spacing_m)} to {length(plan.swath_spacing_m)}"
 
 
 def _cost_text(cost: ComputingCost) -> str:
@@ -193,6 +209,13 @@ def floor_spreads(summary: PlanSummary) -> dict[str, Spread]:
     return {key: spread(values_of(summary)) for key, (_, _, values_of) in _PROPERTIES.items()}
 
 
+def _holes(mission: Mission) -> dict[str, float]:
+    """Returns the shares of floor and asked area without a height, and that of the nodes in small holes."""
+    t = mission.terrain
+    filled = t.n_filled / t.height_m.size - t.unknown_share
+    return {"floor": t.unknown_share, "asked_area": unknown_share(mission.plan, t), "filled": filled}
+
+
 def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
     """Returns the summary as a JSON object, with the path of the drawing of the plan."""
     mission, plane = summary.mission, summary.plane._asdict()
@@ -205,6 +228,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "plan": plane | {"duration_s": plane["duration_s"] + summary.hold_s, "n_frames": mission.n_frames},
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,
+            "holes": _holes(mission),
             "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,
             "cost": summary.cost._asdict(),

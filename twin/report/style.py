@@ -15,6 +15,8 @@ COLOURS = {
     "final": "#009e73",
     "limit": "#cc3311",
     "link": "#7f96a3",
+    "hole": "#e9b8a8",
+    "filled": "#f0b429",
 }
 LABELS = {
     "truth": "true",

@@ -551,13 +551,15 @@ class PlanConfig(Section):
     """centre of the area: easting, northing in the CRS of the DEM, in the unit of the CRS; replaces centre_m"""
     heading_deg: float = Field(default=0.0, ge=-360, le=360)
     """direction of the first leg, and of the bow on it, counter-clockwise from x (east) [deg]"""
+    along_contours: bool = False
+    """true: legs along the contours of the sea floor, across its mean slope in the area; replaces heading_deg"""
     polygon: str | tuple[Vector2, ...] | None = None
-    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with one polygon
-    in a CRS that it names, in longitude and latitude, or in the CRS of the DEM; ${TWIN_DATA} is expanded"""
+    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with polygons,
+    with or without holes, in a CRS that it names, in degrees or in that of the DEM; ${TWIN_DATA} is expanded"""
     turns: Literal["reverse", "bow_first"] = "reverse"
     """reverse: every second leg is flown backwards; bow_first: after each leg the vehicle yaws by 180 deg"""
     altitude_m: float = Field(default=2.2, gt=0, le=100)
-    """height of the cameras above the reference plane z = 0 [m]"""
+    """height of the cameras above the reference plane z = 0 or, with height = "floor", above the sea floor [m]"""
     speed_mps: float = Field(default=0.25, gt=0.01, le=2)
     """speed along legs and loops; lower on tight loops [m/s]"""
     overlap_along: float = Field(default=0.9, gt=0, lt=1)
@@ -570,8 +572,11 @@ class PlanConfig(Section):
     """plane: altitude_m above the reference plane; floor: altitude_m above the smoothed sea floor"""
     tracks: int = Field(default=0, ge=0, le=1000)
     """number of tracks (two legs, or one loop); 0: enough to cover the area"""
+    cross_lines: int = Field(default=0, ge=0, le=100)
+    """number of lines across the legs that are flown after them, as a last track; 0: none"""
     clearance_m: float = Field(default=0.3, ge=0, le=10)
-    """smallest allowed vertical distance from the cameras to the sea floor [m]"""
+    """smallest allowed vertical distance from the cameras to the sea floor in their images or, with height = "floor",
+    within 0.4 m plus this distance around them [m]"""
 
     @field_validator("polygon", mode="before")
     @classmethod

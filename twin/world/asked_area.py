@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import shapely
 
-from twin.controllers.survey_area import Corner, SurveyArea, polygon_area
+from twin.controllers.survey_area import Corner, SurveyArea, polygons_area
 from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.core.user_files import read_json
@@ -19,7 +20,9 @@ from twin.scenario.model import PlanConfig
 from twin.terrains import Terrain
 
 _MAX_GEOJSON_BYTES = 10_000_000
-_ONE_POLYGON = "GeoJSON with one Polygon without holes"
+_POLYGONS = "GeoJSON with one Polygon or more"
+_MOST_NODES = 1_000_000  #: of the floor, from which its mean slope is computed
+_LEAST_SLOPE = 1e-3  #: below it, a floor counts as level
 #: CRS of a GeoJSON file without a member "crs", if its coordinates are longitude and latitude (RFC 7946).
 _LONGITUDE_LATITUDE = "OGC:CRS84"
 
@@ -30,18 +33,45 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
     Raises TwinError if keys of the plan contradict each other, the polygon is invalid, or the terrain lacks the
     coordinates that the plan needs or does not contain the polygon or the centre.
     """
+    if plan.along_contours:
+        for key, given in (("pattern", plan.pattern == "loops"), ("heading_deg", plan.heading_deg != 0)):
+            if given:
+                raise TwinError(
+                    f"plan.{key}", f"{getattr(plan, key)!r} contradicts plan.along_contours", "one of the two"
+                )
     heading = math.radians(plan.heading_deg)
     if plan.polygon is None:
         shape = "disc" if plan.pattern == "loops" else "rectangle"
-        return SurveyArea(shape, plan.area_m, _centre(plan, terrain), heading)
+        area = SurveyArea(shape, plan.area_m, _centre(plan, terrain), heading)
+        return replace(area, heading=_contour_heading(area, terrain)) if plan.along_contours else area
     for key, given in (("pattern", plan.pattern == "loops"), ("centre_m", any(plan.centre_m)),
                        ("centre_crs", plan.centre_crs is not None)):  # fmt: skip
         if given:
             raise TwinError(f"plan.{key}", f"{getattr(plan, key)!r} has no effect with plan.polygon", "one of the two")
-    corners = plan.polygon if not isinstance(plan.polygon, str) else read_geojson(Path(plan.polygon), terrain)
-    area = polygon_area(corners, heading)
+    polygons = [[plan.polygon]] if not isinstance(plan.polygon, str) else read_geojson(Path(plan.polygon), terrain)
+    area = polygons_area(polygons, heading)
     _check_inside("plan.polygon", area.outline(), terrain)
-    return area
+    return polygons_area(polygons, _contour_heading(area, terrain)) if plan.along_contours else area
+
+
+def _contour_heading(area: SurveyArea, terrain: Terrain) -> float:
+    """Returns the direction of the contours of the plane that fits the floor of an area best, -pi/2 to pi/2 [rad].
+
+    The plane is fitted to the known nodes of the terrain in the area; 0 if they are fewer than three, or level.
+    """
+    known = np.ones(terrain.height_m.shape, np.bool_) if terrain.known is None else terrain.known
+    rows, cols = np.nonzero(known)
+    x, y = terrain.west_m + cols * terrain.spacing_m, terrain.south_m + rows * terrain.spacing_m
+    inside = np.flatnonzero(area.contains(x, y))
+    inside = inside[:: max(1, len(inside) // _MOST_NODES)]
+    if len(inside) < 3:
+        return 0.0
+    points = np.column_stack([x, y, terrain.height_m[rows, cols]])[inside].astype(np.float64)
+    points -= points.mean(axis=0)
+    (east, north), *_ = np.linalg.lstsq(points[:, :2], points[:, 2])
+    if math.hypot(east, north) < _LEAST_SLOPE:
+        return 0.0
+    return math.atan(-east / north) if north != 0 else math.pi / 2
 
 
 def _centre(plan: PlanConfig, terrain: Terrain) -> Corner:
@@ -75,37 +105,40 @@ def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
         raise TwinError(field, f"({x:.2f}, {y:.2f}) lies outside the terrain", terrain.extent)
 
 
-def read_geojson(file: Path, terrain: Terrain) -> Array:
-    """Returns the corners (n, 2) of the polygon in a GeoJSON file, in the scene [m], in the order of the file.
+def read_geojson(file: Path, terrain: Terrain) -> list[list[Array]]:
+    """Returns, for each polygon of a GeoJSON file, the corners (n, 2) of its outline and of its holes in the scene [m].
 
     The coordinates are in the CRS of the member "crs". Without it they are longitude and latitude (RFC 7946) if the DEM
     names its CRS, all lie within +-180 and +-90 degrees and, read in the CRS of the DEM, none lies on the DEM;
-    otherwise they are in the CRS of the DEM. Raises TwinError unless the file contains exactly one polygon without
-    holes, whose coordinates can be transformed, and the terrain has coordinates.
+    otherwise they are in the CRS of the DEM. Raises TwinError unless the file contains polygons only, whose
+    coordinates can be transformed, and the terrain has coordinates.
     """
-    tree = read_json(file, "plan.polygon", _ONE_POLYGON, _MAX_GEOJSON_BYTES)
-    corners = shapely.get_coordinates(_polygon(tree, file).exterior)
+    tree = read_json(file, "plan.polygon", _POLYGONS, _MAX_GEOJSON_BYTES)
+    rings = [[p.exterior, *p.interiors] for p in _polygons(tree, file)]
+    corners = shapely.get_coordinates([ring for polygon in rings for ring in polygon])
     if not np.isfinite(corners).all():
-        raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _ONE_POLYGON)
+        raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _POLYGONS)
     origin = _georeference("plan.polygon", terrain)
     crs = _named_crs(tree)
     if crs is None and _is_longitude_latitude(corners, terrain, origin):
         crs = _LONGITUDE_LATITUDE
     if crs is not None:
         corners = _projected(corners, crs, origin)
-    return np.column_stack(origin.to_scene(*corners.T))
+    lengths = [len(ring.coords) for polygon in rings for ring in polygon]
+    in_scene = iter(np.split(np.column_stack(origin.to_scene(*corners.T)), np.cumsum(lengths)[:-1]))
+    return [[next(in_scene) for _ in polygon] for polygon in rings]
 
 
-def _polygon(tree: Any, file: Path) -> shapely.Polygon:
+def _polygons(tree: Any, file: Path) -> list[shapely.Polygon]:
     try:
         parts = shapely.get_parts(shapely.get_parts(shapely.from_geojson(json.dumps(tree))))
     except shapely.errors.ShapelyError:
-        raise TwinError("plan.polygon", f"{file.name!r} is not valid GeoJSON", _ONE_POLYGON) from None
-    if len(parts) != 1 or not isinstance(parts[0], shapely.Polygon):
-        raise TwinError("plan.polygon", f"{file.name!r} does not hold exactly one polygon", _ONE_POLYGON)
-    if parts[0].is_empty or len(parts[0].interiors):
-        raise TwinError("plan.polygon", f"{file.name!r} has a polygon with holes or without corners", _ONE_POLYGON)
-    return parts[0]
+        raise TwinError("plan.polygon", f"{file.name!r} is not valid GeoJSON", _POLYGONS) from None
+    if len(parts) == 0 or not all(isinstance(part, shapely.Polygon) for part in parts):
+        raise TwinError("plan.polygon", f"{file.name!r} does not hold polygons only", _POLYGONS)
+    if any(part.is_empty for part in parts):
+        raise TwinError("plan.polygon", f"{file.name!r} has a polygon without corners", _POLYGONS)
+    return cast(list[shapely.Polygon], list(parts))
 
 
 def _named_crs(tree: Any) -> str | None:

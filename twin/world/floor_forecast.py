@@ -67,7 +67,8 @@ def planned_surface(mission: Mission) -> Terrain:
 def planned_overlap(mission: Mission, most_pairs: int = sys.maxsize) -> PlannedOverlap:
     """Returns the median overlaps forecast from at most `most_pairs` along and across swaths; None without one."""
     keyframes = planned_keyframes(mission.plan, mission.scenario.plan.pattern)
-    pairs, field = (thinned(p, most_pairs) for p in image_pairs(keyframes)), floor_of(planned_surface(mission))
+    pairs = (thinned(p, most_pairs) for p in image_pairs(keyframes, mission.plan.follows_floor))
+    field = floor_of(planned_surface(mission))
     return PlannedOverlap(*(spread(image_overlap(field, *p, mission.rig)).median for p in pairs))
 
 
@@ -84,7 +85,7 @@ def forecast_over_floor(mission: Mission) -> FloorForecast:
     depth[np.isinf(depth)] = np.nan
     median, nearest = _row_statistic(np.nanmedian, depth), _row_statistic(np.nanmin, depth)
     x, y, z = keyframes.position_m.T
-    along, across = image_pairs(keyframes)
+    along, across = image_pairs(keyframes, mission.plan.follows_floor)
     return FloorForecast(
         surface=surface,
         keyframes=keyframes,

@@ -174,6 +174,6 @@ def _terrain(height_m: Layer, grid: MapGrid, texture: Image, covered: NDArray[np
     heights = np.ascontiguousarray(height_m[::-1], np.float32)
     texel_m = (grid.cols - 1) * grid.cell_m / texture.shape[1]
     return terrains.Terrain(
-        heights, grid.cell_m, west_m, south_m, np.ascontiguousarray(texture), texel_m, int((~covered).sum()),
-        known=known_nodes(covered[::-1]),
+        heights, grid.cell_m, west_m, south_m, np.ascontiguousarray(texture), texel_m,
+        None if covered.all() else ~covered[::-1], known=known_nodes(covered[::-1]),
     )  # fmt: skip

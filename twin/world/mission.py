@@ -31,7 +31,15 @@ from twin.world.height_floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
 from twin.world.pace import SAME_TIME_S, Pace
-from twin.world.path_checks import check_floor_below, check_lamp, check_objects, check_speed, check_thrust
+from twin.world.path_checks import (
+    check_floor_below,
+    check_lamp,
+    check_objects,
+    check_speed,
+    check_thrust,
+    highest_near,
+    unknown_share,
+)
 from twin.world.planning import check_map_size, plan_survey
 from twin.world.scenario_checks import contradictions, floor_contradictions
 
@@ -104,6 +112,13 @@ class Mission:
     def asked(self, x_m: Array, y_m: Array) -> NDArray[np.bool_]:
         """Returns whether each point (x, y) [m] lies in the asked area, over floor with a height."""
         return self.plan.inside_area(x_m, y_m) & ~self.terrain.in_hole(x_m, y_m)
+
+    @property
+    def hole_notes(self) -> list[str]:
+        """Returns sentences on floor without a height: how much of the floor, and of the asked area."""
+        share = unknown_share(self.plan, self.terrain)
+        area = [f"{100 * share:.3g} % of the asked area has no height and is not part of it."] if share > 0 else []
+        return self.terrain.hole_notes + area
 
     @property
     def tracks(self) -> range:
@@ -228,14 +243,23 @@ def _check_path(
 
 def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
     """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
-    highest_m = plan.request.altitude_m if plan.request.surface is None else plan.all_references().position[:, 2].max()
-    widest = max(1.0, float(highest_m - terrain.lowest_m) / plan.request.altitude_m)
+    widest = max(1.0, _greatest_altitude_m(plan, terrain) / plan.request.altitude_m)
     corners, margin = plan.outline()[:, :2], np.array(_half_extent_m(plan)) * widest + 0.5
     west, south = np.floor((corners.min(axis=0) - margin) / cell_m) * cell_m
     east, north = np.ceil((corners.max(axis=0) + margin) / cell_m) * cell_m
     grid = MapGrid(float(west), float(north), cell_m, round((north - south) / cell_m), round((east - west) / cell_m))
     check_map_size(grid)
     return grid
+
+
+def _greatest_altitude_m(plan: SurveyPlan, terrain: terrains.Terrain) -> float:
+    """Returns the greatest height of the camera above the lowest floor or, on a surface, above that in its image."""
+    if not plan.follows_floor:
+        return plan.request.altitude_m - terrain.lowest_m
+    x, y, z = plan.all_references().position.T
+    reach_m = max(plan.request.footprint_m)
+    lowest_m = -highest_near(replace(terrain, height_m=-terrain.height_m), x, y, reach_m)
+    return float((z - lowest_m).max())
 
 
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:

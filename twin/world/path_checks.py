@@ -24,6 +24,7 @@ VEHICLE_REACH_M = 0.4  #: horizontal distance from the cameras to the farthest p
 #: Distance between the points of the path at which the height of a lamp above the floor is checked, and the largest
 #: number of these points; on longer paths they are farther apart.
 LAMP_STEP_M, LAMP_POINTS = 0.02, 1_000_000
+_AREA_SAMPLES = 500  # along each side of an area
 #: Share of the greatest vertical speed at which a path over the floor may climb; the rest is for the controller.
 _CLIMB_SHARE = 0.5
 #: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.
@@ -34,41 +35,59 @@ def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> 
     """Raises TwinError if the area exceeds the terrain, or the path leaves the terrain or is too near the floor."""
     size, outline = terrain.size_m, plan.area.outline()
     extent = f"{size[0]:.2f} x {size[1]:.2f} m"
+    heading_deg = round(float(np.degrees(plan.area.heading)), 2)
     # a tolerance: rotation rounds the corners of an area as large as the terrain
     if (np.ptp(outline, axis=0) > np.array(size) + 1e-9).any():
         shown = " x ".join(f"{a:g}" for a in asked.area_m)
-        turned = f" at a heading of {asked.heading_deg:g} deg" if asked.heading_deg else ""
+        turned = f" at a heading of {heading_deg:g} deg" if heading_deg else ""
         raise TwinError("plan.area_m", f"{shown} m{turned} is larger than the terrain", f"up to {extent}")
-    clearance = _clearance(plan, terrain)
+    clearance = _clearance(plan, asked, terrain)
     field = "plan.area_m" if asked.polygon is None else "plan.polygon"
     if not clearance.inside:
         raise TwinError(field, "the path leaves the terrain", f"a path inside {extent}")
     _check_over_heights(field, terrain, plan)
     if clearance.least_m < asked.clearance_m:
         needed = asked.altitude_m - clearance.least_m + asked.clearance_m
+        near = f"come within {clearance.least_m:.2f} m of" if clearance.least_m >= 0 else "lie below"
+        remedy = ', or plan.height = "floor"' if not plan.follows_floor else ""
         raise TwinError(
             "plan.altitude_m",
-            f"{asked.altitude_m:g}: the cameras come within {clearance.least_m:.2f} m of the floor"
-            f" at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
-            f"at least {needed:.2f} for {asked.clearance_m:g} m of clearance",
+            f"{asked.altitude_m:g}: the cameras {near} the floor at x {clearance.x_m:.1f}, y {clearance.y_m:.1f}",
+            f"at least {needed:.2f} for {asked.clearance_m:g} m of clearance{remedy}",
         )
 
 
-def _clearance(plan: SurveyPlan, terrain: Terrain) -> Clearance:
-    """Returns the least clearance of the planned path; if it follows the floor, the position is that of the camera."""
-    if plan.request.surface is None:
+def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearance:
+    """Returns the least clearance of the planned path.
+
+    A level path must be clear of the floor in its images and between its swaths; a path that follows the floor, of the
+    floor within VEHICLE_REACH_M and `plan.clearance_m` of the cameras horizontally: beside a wall, images may show
+    floor that is higher than the cameras. Its position is that of the camera.
+    """
+    if not plan.follows_floor:
         return least_clearance(plan, terrain.height_at)
-    across_m, along_m = plan.request.footprint_m
-    turned = plan.area.heading != 0 or plan.turns_on_the_spot
-    footprint_m = (np.hypot(across_m, along_m),) * 2 if turned else (across_m, along_m)  # along y and x
-    sides = [2 * round(side / 2 / terrain.spacing_m) + 1 for side in footprint_m]
-    nearby = np.asarray(maximum_filter(terrain.height_m, sides, mode="nearest"))
     x, y, z = plan.all_references().position.T
     inside = bool(np.isfinite(terrain.height_at(x, y)).all())
-    rows, cols = _nodes(terrain, x, y)
-    gap = z - nearby[np.clip(rows, 0, nearby.shape[0] - 1), np.clip(cols, 0, nearby.shape[1] - 1)]
+    gap = z - highest_near(terrain, x, y, VEHICLE_REACH_M + asked.clearance_m)
     k = int(gap.argmin())
     return Clearance(float(gap[k]), float(x[k]), float(y[k]), inside)
+
+
+def highest_near(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array:
+    """Returns the height (n,) of the highest floor within a horizontal distance of each of n points.
+
+    From the nodes in three rectangles that together nearly fill the circle, and from points on it.
+    """
+    rows, cols = _nodes(terrain, x_m, y_m)
+    rows, cols = (np.clip(k, 0, n - 1) for k, n in zip((rows, cols), terrain.height_m.shape, strict=True))
+    highest = terrain.height_near(x_m, y_m)
+    for angle in np.pi / 8 * np.arange(1, 4):
+        sides = [2 * int(reach_m * side / terrain.spacing_m) + 1 for side in (np.sin(angle), np.cos(angle))]
+        highest = np.maximum(highest, maximum_filter(terrain.height_m, sides, mode="nearest")[rows, cols])
+    for angle in np.pi / 4 * np.arange(8):
+        east_m, north_m = reach_m * np.cos(angle), reach_m * np.sin(angle)
+        highest = np.maximum(highest, terrain.height_near(x_m + east_m, y_m + north_m))
+    return highest
 
 
 def _nodes(terrain: Terrain, x: Array, y: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -77,10 +96,21 @@ def _nodes(terrain: Terrain, x: Array, y: Array) -> tuple[NDArray[np.intp], NDAr
     return np.rint(rows).astype(np.intp), np.rint(cols).astype(np.intp)
 
 
+def unknown_share(plan: SurveyPlan, terrain: Terrain) -> float:
+    """Returns the share of the asked area that lies over floor without a height, from samples of it."""
+    if terrain.known is None:
+        return 0.0
+    steps = (np.arange(_AREA_SAMPLES) + 0.5) / _AREA_SAMPLES - 0.5
+    x, y = np.moveaxis(plan.area.at_fractions(np.stack(np.meshgrid(steps, steps), axis=-1)), -1, 0)
+    asked = plan.inside_area(x, y)
+    return float(terrain.in_hole(x, y)[asked].mean()) if asked.any() else 0.0
+
+
 def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
-    """Raises TwinError if the path is over a hole, farther from the next height than an image shows."""
+    """Raises TwinError if the path is farther from the next height than an image shows, or the area has no floor."""
     if terrain.known is None:
         return
+    allowed = "another plan.centre_m, plan.area_m or plan.polygon"
     x, y, _ = plan.all_references().position.T
     away_m = np.asarray(distance_transform_edt(~terrain.known)) * terrain.spacing_m
     away_m = away_m[_nodes(terrain, x, y)]
@@ -89,8 +119,11 @@ def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
         raise TwinError(
             field, f"the path leads over floor without a height, up to {away_m[k]:.2f} m from the next height"
             f" (at x {x[k]:.1f}, y {y[k]:.1f})",
-            f"a path within {limit_m:.2f} m of heights: another plan.centre_m, plan.area_m or plan.polygon",
+            f"a path within {limit_m:.2f} m of heights: {allowed}",
         )  # fmt: skip
+    if unknown_share(plan, terrain) == 1:
+        share = f"{100 * terrain.unknown_share:.3g} % of the floor has none"
+        raise TwinError(field, f"no cell of the floor in the area has a height ({share})", allowed)
 
 
 def check_objects(objects: Sequence[PlacedObject], plan: SurveyPlan, clearance_m: float) -> None:
@@ -133,10 +166,11 @@ def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain
 
 
 def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> None:
-    """Raises TwinError if a cruise speed exceeds the top speed, for loops in the slowest direction."""
+    """Raises TwinError if a cruise speed exceeds the top speed, for loops and cross lines in the slowest direction."""
     if vehicle.dynamics == "kinematic":
         return
-    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if asked.pattern == "loops" else np.zeros(1)
+    around = asked.pattern == "loops" or asked.cross_lines > 0
+    bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if around else np.zeros(1)
     directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
     reach = min(top_speed_mps(vehicle, direction) for direction in directions)
     if speed_mps > reach:
@@ -149,7 +183,7 @@ def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float]
     A kinematic vehicle, and a path at constant height without current, are not checked.
     """
     current = np.array(current_mps)
-    if vehicle.dynamics == "kinematic" or not (current.any() or plan.request.surface is not None):
+    if vehicle.dynamics == "kinematic" or not (current.any() or plan.follows_floor):
         return
     planned = plan.all_references()
     rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity]), 3)

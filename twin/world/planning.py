@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
+from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -27,12 +29,16 @@ _PAIRS = 250
 _ITERATIONS = 25
 _TOLERANCE = 0.005  # of 1 - overlap, relative
 _LEAST_SCALE = 0.05  # of the spacing relative to that over the reference plane
+_ACROSS_SLOPE = 2.0  # greatest slope of a path that follows the floor across the legs, where it is flown more slowly
+_SPACING_POINTS = 200  #: largest number of points of `_leg_spacing` along the legs, and across them
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
 
 #: Largest number of frames (18 hours at 30 Hz; about 1 kB of memory each), of keyframes, and of cells of the map
 #: (about 100 bytes of memory each).
 MAX_FRAMES, MAX_KEYFRAMES, MAX_MAP_CELLS = 2_000_000, 200_000, 25_000_000
+
+_EQUAL: tuple[tuple[float, float], ...] = ()  #: `SurveyRequest.leg_spacing` of equally spaced legs
 
 _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 
@@ -49,11 +55,10 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     if terrain is None or not _lies_over(plan, terrain):
         return plan
     if scenario.plan.height == "floor":
-        request = request._replace(surface=_surface(scenario, request, terrain))
+        request = request._replace(surface=_surface(scenario, request, plan.area, terrain))
         plan = _PATTERNS[pattern](request)
     if scenario.plan.overlap_reference == "floor" and _lies_above(plan, terrain):
-        request = _keep_overlap(request, pattern, floor_of(terrain), scenario.believed_rig())
-        plan = _PATTERNS[pattern](request)
+        plan = _over_floor(plan, pattern, terrain, scenario.believed_rig())
         check_plan_size(plan, scenario.control.hold_s)
     return plan
 
@@ -92,6 +97,7 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
     return SurveyRequest(
         p.area_m if area is None else area.size_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across,
         p.tracks, rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz, area=area, turns=p.turns,
+        cross_lines=p.cross_lines,
     )  # fmt: skip
 
 
@@ -104,18 +110,64 @@ def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
     return bool((terrain.height_at(x, y) < z).all())
 
 
-def _surface(scenario: Scenario, request: SurveyRequest, terrain: Terrain) -> CameraSurface:
+def _surface(scenario: Scenario, request: SurveyRequest, area: SurveyArea, terrain: Terrain) -> CameraSurface:
     if scenario.vehicle.dynamics == "kinematic":
         raise TwinError("plan.height", "'floor': a kinematic vehicle moves in a horizontal plane", '"plane"')
-    if min(terrain.height_m.shape) < 4:
-        shape = " x ".join(map(str, terrain.height_m.shape))
-        raise TwinError("plan.height", f"'floor': the terrain has {shape} nodes", "at least 4 x 4 nodes")
     across_m, along_m = request.footprint_m
-    along_x = scenario.plan.pattern == "lawnmower" and not scenario.plan.heading_deg
-    footprint_m = (along_m, across_m) if along_x else (across_m, across_m)
     slope = climb_slope(scenario.vehicle, scenario.plan.speed_mps)
-    corner_m = (terrain.west_m, terrain.south_m)
-    return surface_above_floor(terrain.height_m, terrain.spacing_m, corner_m, request.altitude_m, footprint_m, slope)
+    footprint_m, slopes = (across_m, across_m), (slope, slope)
+    if scenario.plan.pattern == "lawnmower":
+        footprint_m, slopes = (along_m, across_m), (slope, _ACROSS_SLOPE)
+    return surface_above_floor(terrain.height_near, area, terrain.spacing_m, request.altitude_m, footprint_m, slopes)
+
+
+def _over_floor(plan: SurveyPlan, pattern: str, terrain: Terrain, rig: StereoRig) -> SurveyPlan:
+    """Returns the plan of the same survey with the spacing that keeps the required overlap over the floor.
+
+    Legs are equally spaced unless fewer tracks fill the area if they are nearer to each other where the camera is
+    nearer to the floor. Raises TwinError if no spacing keeps the overlap.
+    """
+    make, field, spacings = _PATTERNS[pattern], floor_of(terrain), [_EQUAL]
+    if pattern == "lawnmower":
+        spacings.append(_leg_spacing(plan, terrain))
+    found, errors = list[SurveyPlan](), list[TwinError]()
+    for spacing in spacings:
+        request = plan.request._replace(leg_spacing=spacing)
+        try:  # the overlap over the floor can only add tracks
+            if not found or make(request._replace(tracks=0)).n_tracks_to_fill < found[0].n_tracks_to_fill:
+                found.append(make(_keep_overlap(request, pattern, field, rig)))
+        except TwinError as error:
+            errors.append(error)
+    if not found:
+        raise errors[0]
+    return min(found, key=lambda kept: kept.n_tracks_to_fill)
+
+
+def _leg_spacing(plan: SurveyPlan, terrain: Terrain) -> tuple[tuple[float, float], ...]:
+    """Returns pairs of v [m] and the extent across the legs of images there, relative to that over the plane.
+
+    At a height h above a floor with the slope g across the legs, the floor that rises reaches h t / (1 + g t) into an
+    image, with t the tangent of half the angle of view. The floor is averaged over half an image, and the extent is the
+    SHORT_PERCENT percentile along the legs.
+    """
+    request, area = plan.request, plan.area
+    half_m = request.footprint_m[0] / 2
+    reach_m = [side / 2 + half_m for side in area.size_m]
+    u, v = (np.linspace(-r, r, min(_SPACING_POINTS, round(8 * r / half_m))) for r in reach_m)
+    x, y = area.to_scene(u[:, None], v)
+    floor_m = terrain.height_near(x, y)
+    for axis, along in enumerate((u, v)):
+        size = 2 * round(half_m / (along[1] - along[0]) / 2) + 1
+        floor_m = np.asarray(uniform_filter1d(floor_m, size, axis, mode="nearest"))
+    height_m = plan.camera_height_at(x.ravel(), y.ravel()).reshape(x.shape) - floor_m
+    slope = np.abs(np.gradient(floor_m, v, axis=1))
+    extent = height_m / request.altitude_m / (1 + slope * half_m / request.altitude_m)
+    extent = np.where(area.contains(x, y), np.maximum(extent, _LEAST_SCALE), np.nan)
+    known = np.isfinite(extent).any(axis=0)
+    if not known.any():
+        return _EQUAL  # the area is smaller than the distance between the points
+    least = np.interp(v, v[known], np.nanpercentile(extent[:, known], SHORT_PERCENT, axis=0))
+    return tuple(zip(v.tolist(), least.tolist(), strict=True))
 
 
 def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig: StereoRig) -> SurveyRequest:
@@ -129,15 +181,15 @@ def _keep_overlap(request: SurveyRequest, pattern: str, field: HeightField, rig:
     """
     make = _PATTERNS[pattern]
     rough_tracks = max(request.area_m) / make(request._replace(tracks=1)).swath_spacing_m
-    whole = request._replace(tracks=0) if rough_tracks <= _MOST_TRACKS else request
-    level = _non_overlap(make(whole._replace(surface=None)), pattern, _level_floor(request), rig)
+    whole = request._replace(tracks=0, cross_lines=0) if rough_tracks <= _MOST_TRACKS else request
+    level = _non_overlap(make(whole._replace(surface=None, leg_spacing=_EQUAL)), pattern, _level_floor(request), rig)
     allowed = np.maximum(level, [1 - request.overlap_along, 1 - request.overlap_across])
     plan, scale, unchanged = make(whole), np.ones(2), np.zeros(2)
     for _ in range(_ITERATIONS):
         found = _non_overlap(plan, pattern, field, rig)
         short = found > allowed * (1 + _TOLERANCE)
         if not short.any():
-            return whole._replace(tracks=request.tracks)
+            return whole._replace(tracks=request.tracks, cross_lines=request.cross_lines)
         step = np.maximum(np.minimum(allowed / np.where(short, found, 1), 1 - 0.01 * 2**unchanged), 0.3)
         scale = np.where(short, scale * step, scale)
         whole = whole._replace(along_scale=float(scale[0]), across_scale=float(scale[1]))
@@ -166,7 +218,7 @@ def _spacing(plan: SurveyPlan) -> tuple[int, float]:
 
 def _non_overlap(plan: SurveyPlan, pattern: str, field: HeightField, rig: StereoRig) -> Array:
     """Returns the percentiles (2,), along and across, of 1 - overlap of a plan over a floor; 0 without pairs."""
-    pairs = image_pairs(planned_keyframes(plan, pattern))
+    pairs = image_pairs(planned_keyframes(plan, pattern), plan.follows_floor)
     missed = [1 - image_overlap(field, *thinned(p, _PAIRS), rig) for p in pairs]
     known = [m[np.isfinite(m)] for m in missed]
     return np.array([np.percentile(m, 100 - SHORT_PERCENT) if len(m) else 0.0 for m in known])
@@ -178,7 +230,8 @@ def planned_keyframes(plan: SurveyPlan, pattern: str) -> KeyframePoses:
     position, _, yaw, _ = plan.all_references()
     keyframe, yaw = np.concatenate(are_keyframes), np.asarray(yaw)
     track = np.repeat(np.arange(plan.n_tracks), [len(part) for part in are_keyframes])
-    swath = track if pattern == "loops" else np.where(is_turning(yaw), -1, leg_numbers(position))
+    off_leg = is_turning(yaw) | (track + 1 == plan.cross_track)
+    swath = track if pattern == "loops" else np.where(off_leg, -1, leg_numbers(position))
     poses = np.tile(np.eye(4), (int(keyframe.sum()), 1, 1))
     poses[:, :3, :3] = geometry.rotations_of_down_camera(yaw[keyframe])
     poses[:, :3, 3] = position[keyframe]

@@ -105,13 +105,10 @@ def with_objects(floor: Terrain, objects: Sequence[PlacedObject]) -> Terrain:
     spacing_m = floor.spacing_m / divisions
     rows, cols = ((n - 1) * divisions + 1 for n in floor.height_m.shape)
     nodes = MapGrid(floor.west_m - spacing_m / 2, floor.north_m + spacing_m / 2, spacing_m, rows, cols)
-
-    def height_at(x: Array, y: Array) -> Array:  # rounding may place nodes of the border outside
-        return floor.height_at(np.clip(x, floor.west_m, floor.east_m), np.clip(y, floor.south_m, floor.north_m))
-
-    heights = top_surface(nodes, TopSurface(true_heights(nodes, height_at)), objects).height_m
+    # rounding may place nodes of the border outside
+    heights = top_surface(nodes, TopSurface(true_heights(nodes, floor.height_near)), objects).height_m
     known = None if floor.known is None else ~floor.in_hole(*np.meshgrid(*nodes.centres()))[::-1]
-    return replace(floor, height_m=np.ascontiguousarray(heights[::-1]), spacing_m=spacing_m, known=known)
+    return replace(floor, height_m=np.ascontiguousarray(heights[::-1]), spacing_m=spacing_m, filled=None, known=known)
 
 
 def true_albedo(terrain: Terrain, grid: MapGrid) -> NDArray[np.float32]:
