@@ -103,6 +103,7 @@ def test_the_truth_has_no_height_no_colour_and_no_coverage_in_a_hole(tmp_path):
     assert np.isfinite(colours[on_floor]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("share", [0.10, 0.50, 0.76])
 def test_the_share_of_nodata_is_that_of_rasterio_in_plan_truth_picture_and_notes(tmp_path, share, monkeypatch):
     """The hole is a half-plane at an angle, as beside a swath; 40 single cells have no height, too."""

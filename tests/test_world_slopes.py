@@ -54,7 +54,7 @@ def test_over_a_ridge_along_the_legs_the_path_is_lower_by_the_mean_of_a_triangle
     assert altitudes(mission).min() > 1.8 - 0.4 * width_m / 3 - 0.03
 
 
-@pytest.mark.parametrize("steps", ["plane", "terrace"])
+@pytest.mark.parametrize("steps", ["plane", pytest.param("terrace", marks=pytest.mark.long)])
 def test_a_wall_of_60_deg_is_flown_along_its_contours_and_slowly_between_them(steps, monkeypatch):
     def wall(x, y):
         height = WALL * (y + 0.3 * x) / np.hypot(1, 0.3)  # its contours have a heading of -16.7 deg
@@ -120,7 +120,7 @@ def test_over_a_level_floor_the_legs_are_equally_spaced(monkeypatch):
     assert plan.request.leg_spacing == () and plan.least_spacing_m == plan.swath_spacing_m
 
 
-@pytest.mark.parametrize("direction_deg", [0.0, 20.0, 90.0, 130.0])
+@pytest.mark.parametrize("direction_deg", [20.0, 130.0])
 def test_contours_are_perpendicular_to_the_slope_of_the_floor_that_has_heights(direction_deg, monkeypatch):
     east, north = np.cos(np.deg2rad(direction_deg)), np.sin(np.deg2rad(direction_deg))
     known = np.ones((241, 241), np.bool_)
