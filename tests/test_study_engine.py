@@ -12,7 +12,7 @@ import pytest
 import study_tasks
 
 from twin.engines.engine import LocalEngine, open_engine
-from twin.engines.worker import TaskLimits, WorkerPool
+from twin.engines.worker import OUT_OF_TIME, TaskLimits, WorkerPool
 from twin.errors import TwinError
 
 
@@ -54,6 +54,15 @@ def test_a_task_that_hangs_is_killed_after_its_timeout(engine):
     by_task = outcomes(engine, [("hang", ""), ("go", "")], TaskLimits(timeout_s=1.5))
     assert by_task["hang", ""].failure == "did not finish within 1.5 s"
     assert by_task["go", ""].result == "go"
+    assert time.monotonic() - start < 20
+
+
+def test_at_the_end_of_the_time_running_tasks_are_stopped_and_no_more_are_started(engine):
+    start = time.monotonic()
+    limits = TaskLimits(timeout_s=600, end_s=time.time() + 1.5)
+    by_task = outcomes(engine, [("hang", str(k)) for k in range(6)], limits)
+    assert [outcome.failure for outcome in by_task.values()] == 6 * [OUT_OF_TIME]
+    assert sorted(outcome.attempts for outcome in by_task.values()) == [0, 0, 0, 0, 1, 1]
     assert time.monotonic() - start < 20
 
 

@@ -24,7 +24,7 @@ def _no_report(monkeypatch):
             1,
             [
                 "The required 90 % is not met.",
-                "pass at plan.altitude_m 1.6 to 1.9 and 2.5 to 3; fewer pass at 1 to 1.6 and 1.9 to 2.5.",
+                "pass at plan.altitude_m 1.64 to 1.86 and 2.54 to 3; fewer pass at 1 to 1.6 and 1.9 to 2.5;",
             ],
         ),
         ("one sample", 0, ["(95 % confidence interval: 20.7 % to 100 %)", "not decided with 1 survey (about 34 more"]),

@@ -13,11 +13,11 @@ def test_wilsons_interval_equals_that_of_scipy(passed, count):
     reference = stats.binomtest(passed, count).proportion_ci(0.95, method="wilson")
     estimate = statistics.wilson_interval(passed, count)
     assert estimate.value == passed / count
-    np.testing.assert_allclose(estimate[1:], reference, atol=1e-12)
+    np.testing.assert_allclose(estimate[1:3], reference, atol=1e-12)
 
 
 def test_without_surveys_the_interval_is_0_to_1():
-    assert statistics.wilson_interval(0, 0)[1:] == (0.0, 1.0)
+    assert statistics.wilson_interval(0, 0)[1:3] == (0.0, 1.0)
 
 
 def test_identical_surveys_of_a_cluster_count_as_one():
@@ -36,10 +36,21 @@ def test_the_effective_number_is_that_of_the_unbiased_variance_of_the_means_of_c
 
 def test_trials_of_unknown_outcome_count_as_failures_at_the_lower_and_as_successes_at_the_upper_bound():
     found = statistics.clustered_proportion([1, 1, 1, 0, 0, 0], np.arange(6), unknown=[0, 0, 0, 0, 1, 1])
-    assert found.value == 0.75
-    assert found[1:] == (statistics.wilson_interval(3, 6).low, statistics.wilson_interval(5, 6).high)
+    assert (found.value, found.most) == (3 / 6, 5 / 6)
+    assert found[1:3] == (statistics.wilson_interval(3, 6).low, statistics.wilson_interval(5, 6).high)
     assert statistics.wilson_interval(3, 4, unknown=2) == found
-    assert statistics.wilson_interval(0, 0, unknown=3)[1:] == (0.0, 1.0)
+    assert statistics.wilson_interval(0, 0, unknown=3) == (0.0, 0.0, 1.0, 1.0)
+
+
+def test_unknown_values_may_be_anything_in_the_interval_of_a_median():
+    values, clusters = np.arange(40.0), np.arange(40)
+    few, many = (
+        statistics.bootstrap_with_unknown(values, statistics.median, clusters, np.arange(40, 40 + n)) for n in (10, 50)
+    )
+    known = statistics.bootstrap_interval(values, statistics.median)
+    assert few.value == known.value and few.low < known.low < known.high < few.high
+    assert few.low < 15 and few.high > 24  # the medians with all ten below, and above, the known values
+    assert many[1:] == (-np.inf, np.inf)
 
 
 def test_uncorrelated_surveys_of_a_cluster_count_individually():

@@ -6,6 +6,7 @@ Each task therefore runs in a worker process that can be killed and replaced.
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import pickle
@@ -35,11 +36,15 @@ SINGLE_THREADED = {
 }
 
 
+OUT_OF_TIME = "the time of all tasks was used up"  #: failure of a task that `TaskLimits.end_s` stopped or prevented
+
+
 class TaskLimits(NamedTuple):
     """Maximum run time of a task [s], and largest number of retries if its process ends or is killed."""
 
     timeout_s: float = 3600.0
     retries: int = 2
+    end_s: float = math.inf  #: time [s since the epoch] at which running tasks are stopped, and no more are started
 
 
 class Outcome(NamedTuple, Generic[Task, Result]):
@@ -137,8 +142,11 @@ class WorkerPool:
         request = pickle.dumps((function, task))
         attempts = 0
         while True:
-            attempts += 1
-            reply = self._run_once(request, limits.timeout_s)
+            left_s = limits.end_s - time.time()
+            attempts += left_s > 0
+            reply = self._run_once(request, min(limits.timeout_s, left_s)) if left_s > 0 else Reply("timeout")
+            if reply.kind == "timeout" and left_s <= limits.timeout_s:
+                return Outcome(task, None, OUT_OF_TIME, attempts)
             if reply.kind != "killed" or attempts > limits.retries or self._closed:
                 return Outcome(task, reply.value, reply.reason, attempts)
 

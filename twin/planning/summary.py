@@ -78,6 +78,12 @@ def summarise(mission: Mission) -> PlanSummary:
     return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
 
 
+def run_time_s(mission: Mission) -> float:
+    """Returns the expected processor time of a survey on an idle machine [s]."""
+    plane = forecast(mission.plan, mission.rig.baseline_m, DISPARITY_SIGMA_PX)
+    return computing_cost(mission, plane.n_keyframes).wall_s
+
+
 def _predicted_metrics(floor: FloorForecast, error: ExpectedError) -> dict[str, dict[str, float | None]]:
     """Returns the metrics that can be predicted before the survey, by section and key of metrics.json."""
     covered = floor.coverage * error.completeness

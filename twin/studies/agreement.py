@@ -16,9 +16,9 @@ from twin.judge.map_error import INFINITE_WITH_HOLES
 from twin.report.number_formats import percent, plain
 from twin.studies import sentences
 from twin.studies.analysis import StudyAnalysis
-from twin.studies.statistics import LEVEL, RESAMPLES, UNDEFINED, Array, Interval, wilson_interval
+from twin.studies.statistics import LEVEL, RESAMPLES, UNDEFINED, Array, Interval, Proportion, wilson_interval
+from twin.studies.study_file import FIDELITY
 
-FIDELITY = "imaging.fidelity"
 MEDIAN_LIMIT = 0.2  #: largest amount by which the ratio of medians, or its inverse, may exceed 1
 P_LIMIT = 0.01  #: smallest p-value of the Kolmogorov-Smirnov test
 PASS_LIMIT = 0.9  #: smallest fraction of pairs with the same verdict
@@ -57,7 +57,7 @@ class Agreement(NamedTuple):
     pairs: int  #: number of pairs in which both surveys have a result
     metrics: list[MetricAgreement]
     #: fraction of the pairs in which both surveys pass or both do not pass, with its confidence interval
-    verdicts: Interval
+    verdicts: Proportion
     only_rendered: int  #: number of pairs in which only the rendered survey passes
     only_surrogate: int  #: number of pairs in which only the surrogate survey passes
 

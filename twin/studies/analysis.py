@@ -15,9 +15,20 @@ from numpy.typing import NDArray
 from twin.judge.map_error import with_completeness
 from twin.judge.verdict import more_is_better
 from twin.studies import statistics
-from twin.studies.answers import Answer, PassRecord, answers_of_ranges, answers_of_values, range_text
-from twin.studies.statistics import UNDEFINED, Array, Interval, SobolIndex
-from twin.studies.study_file import Study
+from twin.studies.answers import (
+    Answer,
+    KeyLimit,
+    KeyRegression,
+    PassRecord,
+    answers_of_ranges,
+    answers_of_values,
+    limit_of_key,
+    range_text,
+    regress,
+)
+from twin.studies.passing_map import PassingMap, passing_map
+from twin.studies.statistics import UNDEFINED, Array, Interval, Proportion, SobolIndex
+from twin.studies.study_file import FIDELITY, Study
 
 _MAX_REASONS = 12
 _MAX_LISTED = 12  # a key with more distinct numbers is treated as continuous, even if the study lists them
@@ -25,6 +36,8 @@ Mask = NDArray[np.bool_]
 
 
 class MetricSummary(NamedTuple):
+    """Median and bound of a metric; unknown values may be anything, so that an end of an interval may be infinite."""
+
     name: str
     surveys: int  #: number of surveys in these statistics; see `StudyAnalysis.included`
     median: Interval
@@ -65,8 +78,9 @@ class StudyAnalysis:
     """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
 
     Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Those
-    that only the surrogate refuses (`unmodelled`) also count in pass probabilities, as unknown results. Surveys of the
-    same scenario with the same seed are identical and count once, except in `sobol`.
+    that only the surrogate refuses (`unmodelled`) count in pass probabilities, as unknown results, and in the bounds of
+    metrics, as values that may be anything. Surveys of the same scenario with the same seed are identical and count
+    once, except in `sobol`.
 
     `planned` is the number of surveys of the study; None: all of them are in the table.
     """
@@ -131,26 +145,27 @@ class StudyAnalysis:
     def clusters(self) -> Array:
         return self.numbers(self.cluster_name)
 
+    @property
+    def n_rendered(self) -> int:
+        """Returns the number of surveys flown rendered because the surrogate refuses them."""
+        fidelity = self._texts("fidelity")
+        return (
+            int((fidelity == "rendered").sum()) if (fidelity == "surrogate").any() and FIDELITY not in self.keys else 0
+        )
+
     @cached_property
-    def pass_probability(self) -> Interval:
-        """Returns the fraction of the evaluated surveys that passed; unknown results widen its confidence interval."""
+    def pass_probability(self) -> Proportion:
         return self.proportion(self.counted)
 
-    def proportion(self, chosen: Mask | NDArray[np.int64]) -> Interval:
+    def proportion(self, chosen: Mask | NDArray[np.int64]) -> Proportion:
         """Returns the pass probability of the chosen surveys, which are all in `counted`."""
         return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unmodelled[chosen])
-
-    @property
-    def possible_fractions(self) -> tuple[float, float]:
-        """Returns the fraction that passed if none, and if all, of the unknown results are passes."""
-        n, passed = max(int(self.counted.sum()), 1), int(self.passed.sum())
-        return passed / n, (passed + int(self.unmodelled.sum())) / n
 
     @property
     def requirement_missed(self) -> bool:
         """Returns whether the fraction that passed (unknown counts as not) is below the required one, or not known."""
         required = self.required_probability
-        return required is not None and not (self.evaluated.any() and self.possible_fractions[0] >= required)
+        return required is not None and not (self.evaluated.any() and self.pass_probability.value >= required)
 
     def key_numbers(self, key: str) -> Array | None:
         """Returns the value of a key in each survey (n,), or None if the values are not numbers."""
@@ -174,9 +189,11 @@ class StudyAnalysis:
     def _metric_summary(self, name: str) -> MetricSummary:
         included = self.included(name)
         data, clusters = self.numbers(name)[included], self.clusters[included]
-        percent = 5.0 if more_is_better(name) else 95.0
-        median = statistics.bootstrap_interval(data, statistics.median, clusters)
-        bound = statistics.bootstrap_interval(data, lambda v: statistics.percentile(v, percent), clusters)
+        further = self.clusters[self.unmodelled]
+        median, bound = (
+            statistics.bootstrap_with_unknown(data, lambda v, q=q: statistics.percentile(v, q), clusters, further)
+            for q in (50.0, 5.0 if more_is_better(name) else 95.0)
+        )
         return MetricSummary(name, len(data), median, bound, self.limits.get(name))
 
     @cached_property
@@ -223,19 +240,61 @@ class StudyAnalysis:
         """
         if self.required_probability is None or not self.evaluated.any():
             return {}
-        return {key: self._answers(key, self.required_probability) for key in self.keys}
+        return {key: self._answers(key) for key in self.keys}
 
-    def _answers(self, key: str, required: float) -> list[Answer]:
-        chosen = self.counted
-        record = PassRecord(self.passed[chosen], self.clusters[chosen], required, unknown=self.unmodelled[chosen])
+    @cached_property
+    def pass_record(self) -> PassRecord:
+        """Returns the results of the surveys that count in pass probabilities, in the order of the table."""
+        chosen, required = self.counted, self.required_probability
+        required = np.nan if required is None else required
+        return PassRecord(self.passed[chosen], self.clusters[chosen], required, self.unmodelled[chosen])
+
+    @cached_property
+    def regressions(self) -> dict[str, KeyRegression]:
+        """Returns the regression of each key that is continuous, or has many listed numbers."""
+        values = {key: x[self.counted] for key in self.keys if (x := self._continuous(key)) is not None}
+        return {key: regress(x, self.pass_record) for key, x in values.items()}
+
+    def _continuous(self, key: str) -> Array | None:
+        """Returns the value of a key in each survey (n,); None if its values are listed, or text."""
         x, distribution = self.key_numbers(key), self.study.vary.get(key)
         if x is None:
-            return answers_of_values(self._texts(f"vary.{key}")[chosen].astype(str), record)
+            return None
         is_listed = distribution is None or distribution.kind in ("choice", "grid")
-        n_different = len(np.unique(x[chosen]))
-        if n_different == 1 or (is_listed and n_different <= _MAX_LISTED):
-            return answers_of_values(x[chosen], record)
-        return answers_of_ranges(x[chosen], record)
+        n_different = len(np.unique(x[self.counted]))
+        return None if n_different <= 1 or (is_listed and n_different <= _MAX_LISTED) else x
+
+    def _answers(self, key: str) -> list[Answer]:
+        if key in self.regressions:
+            return answers_of_ranges(self.regressions[key])
+        numbers = self.key_numbers(key)
+        names = self._texts(f"vary.{key}").astype(str) if numbers is None else numbers
+        return answers_of_values(names[self.counted], self.pass_record)
+
+    @cached_property
+    def key_limits(self) -> dict[str, KeyLimit]:
+        """Returns the limit of each continuous key with which the pass probability rises or falls; see `answers`."""
+        found = {
+            key: limit_of_key(self.regressions[key], self.answers[key]) for key in self.regressions if self.answers
+        }
+        return {key: limit for key, limit in found.items() if limit is not None}
+
+    @cached_property
+    def passing_map(self) -> PassingMap | None:
+        """Returns the map of the two most influential keys of `key_limits`; None if there are fewer."""
+        curves = {key: self.regressions[key].worst[0][0][1] for key in self.key_limits}
+        ranked = sorted(curves, key=lambda key: -curves[key].deviance)[:2]
+        if len(ranked) < 2:
+            return None
+        results = [self.pass_record.results(worst).astype(float) for worst in (True, False)]
+        first, second = (curves[key] for key in ranked)
+        return passing_map(
+            (ranked[0], ranked[1]),
+            np.array([self.regressions[key].x for key in ranked]),
+            (first.rises, second.rises),
+            (results[0], results[1]),
+            max(first.design_effect, second.design_effect),
+        )
 
     @cached_property
     def refused_samples(self) -> list[RefusedSample]:

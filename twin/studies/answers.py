@@ -1,4 +1,4 @@
-"""Verdicts on ranges of a key: whether the pass probability reaches the required value, or this is undecided."""
+"""Verdicts on ranges of a key: where the pass probability is shown to reach, or to miss, the required one."""
 
 from __future__ import annotations
 
@@ -8,78 +8,89 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri, xlogy
+from scipy.special import xlogy
 
-from twin.studies.statistics import LEVEL, Array, Interval, clustered_proportion, effective_number, surveys_to_decide
+from twin.studies.monotone import FallingCurve, falling_curve
+from twin.studies.statistics import Array, Proportion, clustered_proportion, surveys_to_decide
 
 Verdict = Literal["passes", "fails", "undecided"]
-_BIN_SURVEYS = 12  # smallest number of surveys in a bin of a continuous key
-_MAX_BINS = 20
-_DIVIDING_DEVIANCE = 15.0  # exceeded in less than 1 % of samples with one pass probability
+Mask = NDArray[np.bool_]
+_INFLUENCE_DEVIANCE = 10.0  # exceeded in 2 to 5 % of studies by a key without influence
+_TURNING_DEVIANCE = 15.0  # exceeded in less than 1 % of samples with one pass probability
 
 
 class Answer(NamedTuple):
     """Verdict on the pass probability for one range of values of a scenario key, or for one of its listed values."""
 
     #: "passes" if the lower confidence bound of the pass probability reaches the required value, "fails" if the upper
-    #: bound is below it, else "undecided". The bounds of ranges are corrected for multiple comparisons.
+    #: bound is below it, else "undecided"; for a range, the regression must show the same at each of its values
     verdict: Verdict
     label: str  #: the range or the value as text, e.g. "1.6 to 1.9".
     low: float  #: smallest value in the range; NaN for text
     high: float  #: largest value in the range; NaN for text
     surveys: int
-    probability: Interval  #: pass probability in the range, with its 95 % confidence interval
+    probability: Proportion  #: pass probability in the range, with its 95 % confidence interval
     #: number of further surveys that would decide the verdict if the observed fractions stay the same; 0 if it is
-    #: decided, infinite if the observed fraction equals the required one or the required one is 1, or if the verdict
-    #: depends on the unknown results
+    #: decided; NaN if the surveys of the range differ, so that more of them only narrow it; infinite if the observed
+    #: fraction equals the required one or the required one is 1, or if the verdict depends on the unknown results
     more_surveys: float
     unknown: int = 0  #: number of these surveys whose result is unknown; see `PassRecord`
+
+
+class KeyLimit(NamedTuple):
+    """Value of a key at which the pass probability crosses the required one, with its 95 % confidence interval.
+
+    A number is infinite if it lies beyond the flown values.
+    """
+
+    value: float  #: NaN if it depends on the unknown results
+    low: float
+    high: float
+    rises: bool  #: whether the pass probability rises with the key
 
 
 class PassRecord(NamedTuple):
     """Pass or fail of n surveys with their cluster labels, and the required pass probability."""
 
-    passed: NDArray[np.bool_]  #: (n,)
+    passed: Mask  #: (n,)
     clusters: Array  #: (n,)
     required: float
-    pass_level: float = LEVEL  #: confidence level of the lower bound for the verdict "passes"
-    fail_level: float = LEVEL  #: confidence level of the upper bound for the verdict "fails"
     #: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at the lower
     #: bound of the pass probability, and as one that passed at the upper bound
-    unknown: NDArray[np.bool_] | np.bool_ = np.False_
+    unknown: Mask | np.bool_ = np.False_
 
-    def answer(self, chosen: NDArray[np.bool_], label: str, low: float = np.nan, high: float = np.nan) -> Answer:
+    def results(self, worst: bool) -> Mask:
+        """Returns the passes (n,) if no unknown result is one (`worst`), or if every one is."""
+        return self.passed & ~self.unknown if worst else self.passed | self.unknown
+
+    def answer(self, chosen: Mask, label: str, low: float = np.nan, high: float = np.nan) -> Answer:
         """Returns the answer for the surveys of the mask `chosen` (n,), of which there is at least one."""
         clusters, unknown = self.clusters[chosen], (self.unknown & chosen)[chosen]
-        passed = self.passed[chosen] & ~unknown
+        passed = self.results(worst=True)[chosen]
+        probability = clustered_proportion(passed, clusters, unknown)
         verdict: Verdict = "undecided"
-        if clustered_proportion(passed, clusters, unknown, self.pass_level).low >= self.required:
+        if probability.low >= self.required:
             verdict = "passes"
-        elif clustered_proportion(passed, clusters, unknown, self.fail_level).high < self.required:
+        elif probability.high < self.required:
             verdict = "fails"
         more = 0.0 if verdict != "undecided" else self._more_surveys(passed, clusters, unknown)
-        probability = clustered_proportion(passed, clusters, unknown)
         return Answer(verdict, label, low, high, len(passed), probability, more, int(unknown.sum()))
 
-    def _more_surveys(self, passed: NDArray[np.bool_], clusters: Array, unknown: NDArray[np.bool_]) -> float:
+    def _more_surveys(self, passed: Mask, clusters: Array, unknown: Mask) -> float:
         """Returns `Answer.more_surveys` of surveys (n,) that do not decide the verdict."""
         if passed.mean() >= self.required:  # even if no unknown result is a pass
-            return surveys_to_decide(passed, clusters, self.required, self.pass_level)
+            return surveys_to_decide(passed, clusters, self.required)
         if (passed | unknown).mean() < self.required:
-            return surveys_to_decide(passed | unknown, clusters, self.required, self.fail_level)
+            return surveys_to_decide(passed | unknown, clusters, self.required)
         return math.inf
 
-    def for_ranges(self, n_bins: int) -> PassRecord:
-        """Returns the record with the confidence levels for ranges that are searched among `n_bins` bins.
-
-        The error probability is divided by the number of disjoint ranges that could get the verdict (Bonferroni). For
-        "fails", this is `n_bins`, because the surveys of one bin can be enough. For "passes", a range needs at least
-        z^2 r / (1 - r) effective surveys, even if all of them passed; r is the required probability and z = 1.96 the
-        normal quantile for 95 % confidence.
-        """
-        smallest = float(ndtri(0.5 + LEVEL / 2)) ** 2 * self.required / max(1 - self.required, 1e-9)
-        n_passing = max(1, min(n_bins, int(effective_number(self.passed, self.clusters) / max(smallest, 1e-9))))
-        return self._replace(pass_level=1 - (1 - LEVEL) / n_passing, fail_level=1 - (1 - LEVEL) / n_bins)
+    def of_range(self, x: Array, chosen: Mask, allowed: tuple[Verdict, ...]) -> Answer:
+        """Returns the answer for a range of values x (n,), "undecided" unless its verdict is an allowed one."""
+        low, high = float(x[chosen].min()), float(x[chosen].max())
+        found = self.answer(chosen, range_text(x[chosen]) if high > low else f"{low:.4g}", low, high)
+        if found.verdict == "undecided" or found.verdict in allowed:
+            return found
+        return found._replace(verdict="undecided", more_surveys=math.inf if found.unknown else math.nan)
 
 
 def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
@@ -90,104 +101,139 @@ def answers_of_values(names: ArrayLike, record: PassRecord) -> list[Answer]:
     return [record.answer(values == value, str(value)) for value in np.unique(values)]
 
 
-def answers_of_ranges(x: Array, record: PassRecord) -> list[Answer]:
-    """Returns the answers for a continuous key with the values x (n,), as ranges in ascending order.
+Piece = tuple[Mask, FallingCurve]  #: surveys (n,) between two turning points, and their regression
 
-    The surveys are sorted by the key and divided into bins, see `pass_bins`. A decided range is a run of consecutive
-    bins that is decided as a whole, begins and ends with bins whose observed fraction agrees with the verdict, and
-    contains no run with the opposite verdict. The pass probability need not be monotonic in the key. Runs with the most
-    surveys are chosen first; the bins between them form undecided ranges. The confidence levels allow for this search,
-    see `PassRecord.for_ranges`. A range extends from the smallest to the largest value of the key in its surveys; no
-    claim is made beyond them.
+
+class KeyRegression(NamedTuple):
+    """Monotone regressions of n surveys with values x of a continuous key, each in pieces that rise or fall.
+
+    There is one of each kind, or two if the directions in which the pass probability changes depend on the unknown
+    results; none if no influence of the key is shown.
     """
-    bins = pass_bins(x, np.where(record.unknown, 2, record.passed))
-    n_bins = int(bins.max()) + 1
-    searched = record.for_ranges(n_bins)
 
-    def of_run(first: int, last: int) -> Answer:
-        chosen = (bins >= first) & (bins <= last)
-        low, high = float(x[chosen].min()), float(x[chosen].max())
-        return searched.answer(chosen, range_text(x[chosen]) if high > low else f"{low:.4g}", low, high)
-
-    runs = {(i, j): of_run(i, j) for i in range(n_bins) for j in range(i, n_bins)}
-    return [runs[run] for run in _decided_runs(runs, 0, n_bins - 1, record.required)]
+    x: Array  #: (n,)
+    record: PassRecord
+    worst: list[list[Piece]]  #: if no unknown result is a pass
+    best: list[list[Piece]]  #: if every unknown result is a pass
 
 
-def value_bins(x: Array) -> NDArray[np.int64]:
-    """Returns the bin of each value (n,), numbered in ascending order; equal values share a bin."""
-    values, counts = np.unique(x, return_counts=True)
-    size = max(_BIN_SURVEYS, math.ceil(len(x) / _MAX_BINS))
-    of_value, filled = np.zeros(len(values), np.int64), 0
-    for k in range(len(values)):
-        of_value[k] = of_value[k - 1] if k else 0
-        if filled >= size and counts[k:].sum() >= size:  # the last bin takes the remaining values
-            of_value[k] += 1
-            filled = 0
-        filled += counts[k]
-    return of_value[np.searchsorted(values, x)]
+def regress(x: Array, record: PassRecord) -> KeyRegression:
+    results = [record.results(worst) for worst in (True, False)]
+    shapes = [monotone_pieces(x, passed) for passed in results]
+    same = [[(one.tobytes(), rises) for one, rises in shape] for shape in shapes]
+    different = [shape for shape in (shapes if same[0] != same[1] else shapes[:1]) if shape]
+    worst, best = (
+        [
+            [(one, falling_curve(x[one], passed[one], record.clusters[one], rises)) for one, rises in shape]
+            for shape in different
+        ]
+        for passed in results
+    )
+    return KeyRegression(x, record, worst, best)
 
 
-def pass_bins(x: Array, outcomes: ArrayLike) -> NDArray[np.int64]:
-    """Returns the bin of each survey (n,), numbered in ascending order of its value x (n,): `value_bins`, divided.
+def answers_of_ranges(regression: KeyRegression) -> list[Answer]:
+    """Returns the answers for a continuous key, as ranges in ascending order.
 
-    Bins are divided where the fractions of the outcomes (n,) change, so that no bin mixes two pass probabilities; an
-    outcome is 0: did not pass, 1: passed, or 2: unknown.
+    A range passes or fails if the regression shows it at each of its values, and its surveys show it for their mean; if
+    no influence of the key is shown, all values are one range, for which the mean is enough. Unknown results count as
+    not passed where a range is to pass, and as passed where it is to fail. A range extends from the smallest to the
+    largest value of the key in its surveys; no claim is made beyond them.
     """
-    order, bins = np.argsort(x, kind="stable"), value_bins(x)
-    changes = _changes(x[order], np.asarray(outcomes)[order, None] == np.arange(3))
-    starts = [float(x[bins == k].min()) for k in range(int(bins.max()) + 1)]
-    return np.searchsorted(np.unique([*starts, *changes]), x, side="right") - 1
+    x, record = regression.x, regression.record
+    codes = _shown(regression, reached=True) + 2 * _shown(regression, reached=False)
+    ranges: list[tuple[Mask, Answer]] = []
+    for chosen in _runs(x, codes):
+        code = int(codes[chosen][0])
+        allowed: tuple[Verdict, ...] = (("passes",) if code & 1 else ()) + (("fails",) if code & 2 else ())
+        found = record.of_range(x, chosen, allowed)
+        if ranges and found.verdict == ranges[-1][1].verdict == "undecided":
+            chosen |= ranges.pop()[0]
+            found = record.of_range(x, chosen, ())
+        ranges.append((chosen, found))
+    return [found for _, found in ranges]
 
 
-def _changes(x: Array, is_outcome: NDArray[np.bool_]) -> list[float]:
-    """Returns the values in x (n,), ascending, at which the fractions of the outcomes (n, 3) change.
+def limit_of_key(regression: KeyRegression, answers: list[Answer]) -> KeyLimit | None:
+    """Returns the limit of a key, given its answers; None unless the pass probability only rises, or falls, with it.
 
-    The surveys are divided where this reduces the binomial deviance most, if by `_DIVIDING_DEVIANCE` or more, and both
-    parts likewise, as in a classification tree (Breiman et al. 1984).
+    The interval extends from the end of the range that passes to that of the range that fails.
     """
-    counts = np.cumsum(is_outcome, axis=0, dtype=np.int64)
-    before, total = counts[:-1], counts[-1]
-    gain = _deviance(total) - _deviance(before) - _deviance(total - before)
+    if [len(pieces) for pieces in regression.worst] != [1]:
+        return None
+    curves = [pieces[0][1] for pieces in (regression.worst[0], regression.best[0])]
+    rises, first, last = curves[0].rises, answers[0], answers[-1]
+    low_verdict, high_verdict = ("fails", "passes") if rises else ("passes", "fails")
+    low = first.high if first.verdict == low_verdict else -math.inf
+    high = last.low if last.verdict == high_verdict else math.inf
+    at_worst, at_best = (curve.crossing(regression.record.required) for curve in curves)
+    return KeyLimit(at_worst if at_worst == at_best else math.nan, low, high, rises)
+
+
+def _shown(regression: KeyRegression, reached: bool) -> NDArray[np.int64]:
+    """Returns 1 for surveys (n,) at whose value every regression shows the required probability, or a smaller one.
+
+    To be reached, it must be shown at worst; to be missed, at best. Without a regression, 1 for all.
+    """
+    shown, required = np.ones(len(regression.x), bool), regression.record.required
+    for pieces in regression.worst if reached else regression.best:
+        part = np.zeros(len(regression.x), bool)
+        for chosen, curve in pieces:
+            n_reached, first_missed = curve.shown(required)
+            part |= chosen & np.isin(regression.x, curve.values[:n_reached] if reached else curve.values[first_missed:])
+        shown &= part
+    return shown.astype(np.int64)
+
+
+def _runs(x: Array, codes: NDArray[np.int64]) -> Iterator[Mask]:
+    """Yields the surveys (n,) of each run of values x (n,), in ascending order, with the same code (n,)."""
+    order = np.argsort(x, kind="stable")
+    starts = np.flatnonzero(np.diff(codes[order], prepend=codes[order][0] + 1))
+    for indices in np.split(order, starts[1:]):
+        yield np.isin(np.arange(len(x)), indices)
+
+
+def monotone_pieces(x: Array, passed: Mask) -> list[tuple[Mask, bool]]:
+    """Divides surveys (n,) where their pass fraction turns from rising to falling with x (n,), or the other way.
+
+    Returns the surveys (n,) of each piece, in ascending order, and whether its fraction rises; none if the fraction
+    does not change. The turning points are the middles of the segments between changes (`_changes`) whose fraction is
+    larger, or smaller, than those of both neighbours.
+    """
+    order = np.argsort(x, kind="stable")
+    changes = _changes(x[order], passed[order])
+    if not changes:
+        return []
+    segment = np.searchsorted(changes, x, side="right")
+    fractions = np.bincount(segment, passed) / np.bincount(segment)
+    rises = np.diff(fractions) > 0
+    turning = np.flatnonzero(np.diff(rises)) + 1
+    cuts = [float(np.median(x[segment == k])) for k in turning]
+    piece = np.searchsorted(cuts, x, side="right")
+    directions = rises[[0, *turning]]
+    return [(piece == k, bool(directions[k])) for k in range(len(cuts) + 1)]
+
+
+def _changes(x: Array, passed: Mask, least: float = _INFLUENCE_DEVIANCE) -> list[float]:
+    """Returns the values in x (n,), ascending, at which the fraction that passed changes.
+
+    The surveys are divided where this reduces the binomial deviance most, if by `least` or more, and both parts
+    likewise, if by `_TURNING_DEVIANCE`, as in a classification tree (Breiman et al. 1984).
+    """
+    n, passes = np.arange(1, len(x) + 1), np.cumsum(passed)
+    gain = _deviance(passes[-1], n[-1]) - _deviance(passes, n)[:-1] - _deviance(passes[-1] - passes, n[-1] - n)[:-1]
     gain[np.diff(x) == 0] = 0.0  # equal values stay together
-    if gain.max(initial=0.0) < _DIVIDING_DEVIANCE:
+    if gain.max(initial=0.0) < least:
         return []
     first = int(np.argmax(gain)) + 1
-    return [*_changes(x[:first], is_outcome[:first]), float(x[first]), *_changes(x[first:], is_outcome[first:])]
+    before, after = (_changes(x[part], passed[part], _TURNING_DEVIANCE) for part in (slice(first), slice(first, None)))
+    return [*before, float(x[first]), *after]
 
 
-def _deviance(counts: NDArray[np.int64]) -> Array:
-    """Returns -2 ln L (...) of the counts (..., 3) of outcomes, with the largest likelihood L of their fractions."""
-    n = counts.sum(axis=-1)
-    return 2 * (xlogy(n, n) - xlogy(counts, counts).sum(axis=-1))
-
-
-def _decided_runs(
-    runs: dict[tuple[int, int], Answer], first: int, last: int, required: float
-) -> Iterator[tuple[int, int]]:
-    """Divides the bins `first` to `last` into decided and undecided runs; yields (first, last) of each, ascending."""
-    if first > last:
-        return
-    inside = [(i, j) for i in range(first, last + 1) for j in range(i, last + 1)]
-    decided = [run for run in inside if _is_consistent(runs, run, required)]
-    if not decided:
-        yield first, last
-        return
-    i, j = max(decided, key=lambda run: (runs[run].surveys, -run[0]))
-    yield from _decided_runs(runs, first, i - 1, required)
-    yield i, j
-    yield from _decided_runs(runs, j + 1, last, required)
-
-
-def _is_consistent(runs: dict[tuple[int, int], Answer], run: tuple[int, int], required: float) -> bool:
-    verdict = runs[run].verdict
-    if verdict == "undecided":
-        return False
-    first, last = run
-    ends = [runs[end, end].probability.value for end in run]
-    if not all(end >= required if verdict == "passes" else end < required for end in ends):  # none is NaN
-        return False
-    opposite = "fails" if verdict == "passes" else "passes"
-    return all(runs[i, j].verdict != opposite for i in range(first, last + 1) for j in range(i, last + 1))
+def _deviance(passes: ArrayLike, n: ArrayLike) -> Array:
+    """Returns -2 ln L (...) of numbers of passes (...) among n surveys (...), with the largest likelihood L."""
+    k, total = np.asarray(passes, float), np.asarray(n, float)
+    return 2 * (xlogy(total, total) - xlogy(k, k) - xlogy(total - k, total - k))
 
 
 def rounded(value: float) -> str:

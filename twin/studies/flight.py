@@ -93,6 +93,14 @@ def has_passed(row: Row) -> bool:
     return row["status"] == "complete" and all(verdicts)
 
 
+def failure_reason(row: Row) -> str:
+    """Returns why a survey did not pass, with its limits that were not met; "" if it passed."""
+    if has_passed(row):
+        return ""
+    verdicts = {name[8:-7]: value for name, value in row.items() if name.startswith("require.") and ".passed" in name}
+    return row["reason"] or "requirement not met: " + " and ".join(name for name, met in verdicts.items() if not met)
+
+
 def flatten(metrics: Mapping[str, Any]) -> Row:
     """Returns the values in sections of metrics.json by dotted name, e.g. "map.le90_m"; run times begin "timing."."""
     row = dict(_leaves({name: section for name, section in metrics.items() if isinstance(section, Mapping)}, ""))

@@ -1,28 +1,38 @@
-"""Progress of a study on stderr: a progress bar on a terminal, and one line per survey on request."""
+"""Progress of a study on stderr: a bar on a terminal, one line a minute elsewhere, and one per survey on request."""
 
 from __future__ import annotations
 
+import math
 import sys
+import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Event, Thread
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn
 from rich.progress import Progress as ProgressBar
 
 from twin.report.number_formats import plain
 from twin.studies.flight import Row, has_passed
+from twin.studies.run_time import duration
 from twin.studies.statistics import wilson_interval
+
+_INTERVAL_S = 60.0  # between two lines where there is no terminal
 
 
 class StudyProgress:
-    """Display of finished, failed and refused surveys and pass probability: a bar, or lines of `print_surveys`."""
+    """Display of finished, failed and refused surveys, pass probability and time left.
 
-    def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False):
+    `end_s` is the time [s since the epoch] at which the surveys are stopped.
+    """
+
+    def __init__(self, bar: ProgressBar | None = None, print_surveys: bool = False, end_s: float = math.inf):
         self.total, self.ended = 0, Counter[str]()
-        self.bar, self.print_surveys = bar, print_surveys
+        self.bar, self.print_surveys, self.end_s = bar, print_surveys, end_s
+        self._begin = time.monotonic(), 0  # of the present surveys: time, and number of surveys done before
         self._task: Any = bar.add_task("", total=None, note="starting workers") if bar else None
 
     @property
@@ -30,7 +40,7 @@ class StudyProgress:
         return self.ended["all"]
 
     def begin(self, total: int) -> None:
-        self.total = total
+        self.total, self._begin = total, (time.monotonic(), self.done)
         self._update_bar()
 
     def print_line(self, text: str) -> None:
@@ -47,9 +57,27 @@ class StudyProgress:
             self.print_line(line if self.bar else f"{self.done}/{self.total} {line}; {self}")
         self._update_bar()
 
+    def time_left_s(self) -> float:
+        """Returns the expected time until the planned surveys are done or stopped [s]; infinite if not known."""
+        begin_s, done_before = self._begin
+        n_done = self.done - done_before
+        pace_s = (time.monotonic() - begin_s) / n_done if n_done else math.inf
+        n_left = self.total - self.done
+        return max(0.0, min(pace_s * n_left if n_left else 0.0, self.end_s - time.time()))
+
+    def state(self) -> str:
+        """Returns the number of surveys done, the results so far and the time left as one line."""
+        left_s = self.time_left_s()
+        left = f"about {duration(left_s)} left" if math.isfinite(left_s) else "time left not known yet"
+        return ", ".join(filter(None, (f"{self.done} of {self.total} surveys", str(self), left)))
+
     def _update_bar(self) -> None:
         if self.bar:
-            self.bar.update(self._task, total=self.total, completed=self.done, note=str(self))
+            self.bar.update(self._task, total=self.total, completed=self.done, note=self._note())
+
+    def _note(self) -> str:
+        left_s = self.time_left_s()
+        return ", ".join(filter(None, (f"{duration(left_s)} left" if math.isfinite(left_s) else "", str(self))))
 
     def __str__(self) -> str:
         failures = ", ".join(f"{n} {status}" for status in ("failed", "refused") if (n := self.ended[status]))
@@ -57,19 +85,31 @@ class StudyProgress:
         if not evaluated:
             return failures
         estimate = wilson_interval(self.ended["passed"], evaluated, unknown=self.ended["unmodelled"])
-        passing = f"{100 * estimate.value:.0f} % pass ({100 * estimate.low:.0f} to {100 * estimate.high:.0f} %)"
+        most = f" to {100 * estimate.most:.0f}" if estimate.most > estimate.value else ""
+        passing = f"{100 * estimate.value:.0f}{most} % pass ({100 * estimate.low:.0f} to {100 * estimate.high:.0f} %)"
         return f"{passing}, {failures}" if failures else passing
 
 
 @contextmanager
-def study_progress(print_surveys: bool) -> Iterator[StudyProgress]:
+def study_progress(print_surveys: bool, end_s: float = math.inf) -> Iterator[StudyProgress]:
     console = Console(stderr=True)
-    if not console.is_terminal:
-        yield StudyProgress(print_surveys=print_surveys)
+    if console.is_terminal:
+        columns = (TextColumn("surveys"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+        with ProgressBar(*columns, console=console) as bar:
+            yield StudyProgress(bar, print_surveys, end_s)
         return
-    columns = (TextColumn("surveys"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with ProgressBar(*columns, TextColumn("{task.fields[note]}"), console=console) as bar:
-        yield StudyProgress(bar, print_surveys)
+    progress, stopped = StudyProgress(print_surveys=print_surveys, end_s=end_s), Event()
+    lines = Thread(target=_print_regularly, args=(progress, stopped), daemon=True)
+    lines.start()
+    try:
+        yield progress
+    finally:
+        stopped.set()
+
+
+def _print_regularly(progress: StudyProgress, stopped: Event) -> None:
+    while not stopped.wait(_INTERVAL_S):
+        progress.print_line(progress.state())
 
 
 def survey_line(row: Row) -> str:

@@ -14,8 +14,8 @@ from twin.studies.analysis import Mask, StudyAnalysis
 from twin.studies.flight import has_passed
 from twin.studies.results_log import key_of
 from twin.studies.runner import Fleet, check_results, open_folder
-from twin.studies.statistics import Array, Interval, wilson_interval
-from twin.studies.surveys import Survey, samples, surveys
+from twin.studies.statistics import Array, Proportion, wilson_interval
+from twin.studies.surveys import rendered, samples, surveys
 
 FOLDER = "rendered"  #: subfolder of the results folder
 
@@ -35,7 +35,7 @@ class RenderedCheck(NamedTuple):
         return 130 if self.interrupted else int(self.has_limits and not self.agrees)
 
     @property
-    def pass_probability(self) -> Interval:
+    def pass_probability(self) -> Proportion:
         return wilson_interval(float(self.rendered.sum()), len(self.rendered))
 
     @property
@@ -79,7 +79,7 @@ def check(analysis: StudyAnalysis, n: int, folder: Path, fleet: Fleet) -> Render
     keys = [(int(analysis.numbers("sample")[k]), int(analysis.numbers("seed")[k])) for k in nearest]
     others = {sample.number for sample in samples(study)} - {number for number, _ in keys}  # some may be refused
     found = surveys(study, folder / FOLDER, without=others)
-    chosen = {survey.key: _rendered(survey) for survey in found if survey.key in keys}
+    chosen = {survey.key: rendered(survey) for survey in found if survey.key in keys}
     with open_folder(folder / FOLDER, True) as log:
         check_results(log, {key: survey.scenario_hash for key, survey in chosen.items()})
         done = log.done()
@@ -129,9 +129,3 @@ def _excess(values: Array, limit: float) -> Array:
     ascending = np.sort(values)
     rank = (np.searchsorted(ascending, values, "left") + np.searchsorted(ascending, values, "right")) / 2
     return rank - np.searchsorted(ascending, limit, "right")
-
-
-def _rendered(survey: Survey) -> Survey:
-    imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
-    scenario = survey.scenario.model_copy(update={"imaging": imaging})
-    return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint())

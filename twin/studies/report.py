@@ -86,6 +86,7 @@ def summary(analysis: StudyAnalysis, identity: Mapping[str, Any]) -> dict[str, A
                 "metrics": {one.metric: _metric(one) for one in compared.metrics},
             },
             "answers": analysis.answers,
+            "key_limits": analysis.key_limits,
             "metrics": {
                 metric.name: {"surveys": metric.surveys, "median": metric.median, "bound_95_percent": metric.bound}
                 for metric in analysis.metric_summaries

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
+import math
 import shutil
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 from typing import NamedTuple
 
 from twin.core.output_folder import LOCK_FILE, NEW_FOLDER, sole_writer
 from twin.engines.engine import Engine
-from twin.engines.worker import Outcome, TaskLimits
+from twin.engines.worker import OUT_OF_TIME, Outcome, TaskLimits
 from twin.errors import TwinError
 from twin.studies.analysis import StudyAnalysis
 from twin.studies.flight import Row, fly, refused_row, row_of
 from twin.studies.progress import StudyProgress
 from twin.studies.report import write_agreement, write_report
 from twin.studies.results_log import JOURNAL_FILE, ResultsLog, key_of, write_parquet
-from twin.studies.study_file import Study
-from twin.studies.surveys import Survey, refusals, samples, seeds_of_sample, survey_keys, surveys
+from twin.studies.run_time import duration, rendered_time
+from twin.studies.study_file import FIDELITY, Study
+from twin.studies.surveys import Survey, refusals, rendered, samples, seeds_of_sample, survey_keys, surveys
 
 
 class Throughput(NamedTuple):
@@ -44,11 +47,23 @@ class Fleet(NamedTuple):
     engine: Engine
     progress: StudyProgress
     function: Callable[[Survey], Row] = fly  #: flies one survey; must be importable by name on the workers
+    end_s: float = math.inf  #: time [s since the epoch] at which the budget is used up and surveys are stopped
+
+    @property
+    def out_of_time(self) -> bool:
+        return time.time() >= self.end_s
 
     def fly(self, study: Study, missing: Iterable[Survey], add_row: Callable[[Row], None]) -> bool:
-        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C."""
+        """Flies surveys of a study and calls `add_row` with the row of each; returns False if interrupted by Ctrl-C.
+
+        At the end of the budget, surveys without a result are left out.
+        """
+        limits = TaskLimits(study.timeout_s, study.retries, self.end_s)
         try:
-            for outcome in self.engine.run_many(self.function, missing, TaskLimits(study.timeout_s, study.retries)):
+            in_time = takewhile(lambda _: not self.out_of_time, missing)
+            for outcome in self.engine.run_many(self.function, in_time, limits):
+                if outcome.failure == OUT_OF_TIME:
+                    continue
                 row = row_of_outcome(outcome)
                 add_row(row)
                 self.progress.add(row)
@@ -57,16 +72,19 @@ class Fleet(NamedTuple):
         return True
 
 
-def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyResult:
+def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet, render_refused: bool = False) -> StudyResult:
     """Flies the surveys for which the folder has no result; writes results.parquet, study.html and any agreement.
 
-    Ctrl-C ends the study early; the results obtained until then are written. Raises TwinError if the folder is not
-    empty and `resume` is not set, is written by another process, cannot be written or belongs to another study, or if
-    the engine lost its connection; ScenarioError, before any flight, if no sample has a valid scenario.
+    With `render_refused`, surveys that only the surrogate refuses are then flown with rendered images. Ctrl-C or the
+    end of the budget ends the study early; the results obtained until then are written. Raises TwinError if the folder
+    is not empty and `resume` is not set, is written by another process, cannot be written or belongs to another study,
+    or if the engine lost its connection; ScenarioError, before any flight, if no sample has a valid scenario.
     """
+    if render_refused and FIDELITY in study.varied_keys:
+        raise TwinError("--render-refused", f"this study varies {FIDELITY}", "a study with the surrogate alone")
     refused, planned, run_times_s = refusals(study), set(survey_keys(study)), []
     with open_folder(folder, resume) as log:
-        missing = _missing(study, folder, refused, log)
+        missing = _missing(study, folder, refused, log, shuffled=math.isfinite(fleet.end_s))
         if refused:
             fleet.progress.print_line(refusal_notice(refused))
         fleet.progress.begin(len(planned - log.done()))
@@ -77,6 +95,8 @@ def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyRe
 
         start = time.perf_counter()
         interrupted = not fleet.fly(study, missing, add_row)
+        if render_refused and not interrupted:
+            interrupted = not _render_refused(study, folder, log, fleet, add_row)
         throughput = Throughput(len(run_times_s), time.perf_counter() - start, sum(run_times_s))
         analysis, page = StudyAnalysis(log.table(planned), study, len(planned)), folder / "study.html"
         write_errors = _write_errors(
@@ -88,7 +108,35 @@ def run_study(study: Study, folder: Path, resume: bool, fleet: Fleet) -> StudyRe
         return StudyResult(analysis, page, write_errors, interrupted, throughput)
 
 
-def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLog) -> Iterator[Survey]:
+def _render_refused(study: Study, folder: Path, log: ResultsLog, fleet: Fleet, add_row: Callable[[Row], None]) -> bool:
+    """Flies rendered what only the surrogate refused, after the time it takes; returns False if interrupted by Ctrl-C.
+
+    The row of a survey keeps its scenario hash, that of the study. A survey that fails stays unknown.
+    """
+    rows = {key_of(row): row for row in log.rows()}
+    refused = {key: row["scenario_hash"] for key, row in rows.items() if row.get("unmodelled")}
+    if not refused:
+        return True
+    samples_of = {sample for sample, _ in refused}
+    others = {sample.number for sample in samples(study)} - samples_of
+    chosen = [rendered(survey) for survey in surveys(study, folder, others, shuffled=True) if survey.key in refused]
+    longest_s = max((row.get("timing.simulated_s") or 0.0 for row in rows.values()), default=0.0)
+    survey_s, source = rendered_time(rows.values(), chosen[0].scenario, longest_s)
+    time_told = f"about {duration(survey_s)} on one core each ({source}), {duration(survey_s * len(chosen))} in total"
+    fleet.progress.print_line(
+        f"Flying rendered the {len(chosen)} surveys that the surrogate refuses: "
+        + (time_told if longest_s else "their time is not known before the first one")
+    )
+    fleet.progress.begin(fleet.progress.done + len(chosen))
+
+    def add_known(row: Row) -> None:
+        if row["status"] != "failed":
+            add_row(row | {"scenario_hash": refused[key_of(row)]})
+
+    return fleet.fly(study, chosen, add_known)
+
+
+def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLog, shuffled: bool) -> Iterator[Survey]:
     """Logs the refused surveys and returns the others that have no result; refuses the log of another study."""
     hashes = {survey.key: survey.scenario_hash for survey in surveys(study, folder, without=refused)}
     refusals_of = [sample for sample in samples(study) if sample.number in refused]
@@ -101,7 +149,7 @@ def _missing(study: Study, folder: Path, refused: dict[int, str], log: ResultsLo
     for row in rows:
         if key_of(row) not in done:
             log.add(row)
-    return (survey for survey in surveys(study, folder, without=refused) if survey.key not in done)
+    return (survey for survey in surveys(study, folder, refused, shuffled) if survey.key not in done)
 
 
 def refusal_notice(refused: dict[int, str]) -> str:

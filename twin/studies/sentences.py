@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from twin.judge.verdict import more_is_better
 from twin.report.number_formats import DASH, length, percent, with_unit
 from twin.studies.analysis import StudyAnalysis, count_similar
-from twin.studies.answers import Answer
-from twin.studies.statistics import LEVEL, Interval
+from twin.studies.answers import Answer, KeyLimit, rounded
+from twin.studies.statistics import LEVEL, Interval, Proportion
 from twin.studies.study_file import Study
 
 _METRIC_NAMES = {
@@ -50,9 +52,9 @@ def metric_value(metric: str, value: float | None) -> str:
 
 
 def metric_interval(metric: str, interval: Interval) -> str:
-    """Returns the estimate of a metric, with its confidence interval in brackets if it is finite."""
-    value, low, high = (metric_value(metric, number) for number in interval)
-    return f"{value} ({low} to {high})" if np.isfinite(interval.low) else value
+    """Returns the estimate of a metric, with its confidence interval in brackets if it has one."""
+    value, low, high = ("unbounded" if np.isinf(number) else metric_value(metric, number) for number in interval)
+    return f"{value} ({low} to {high})" if not np.isnan(interval.low) else value
 
 
 def correlation(interval: Interval) -> str:
@@ -61,12 +63,18 @@ def correlation(interval: Interval) -> str:
     return f"{interval.value:+.2f} ({interval.low:+.2f} to {interval.high:+.2f})"
 
 
-def percent_interval(interval: Interval, label: str = "") -> str:
+def fraction(proportion: Interval | Proportion) -> str:
+    """Returns a proportion in percent; if some outcomes are unknown, its smallest and largest possible value."""
+    most = proportion.most if isinstance(proportion, Proportion) else proportion.value
+    return percent(proportion.value) + (f" to {percent(most)}" if most > proportion.value else "")
+
+
+def percent_interval(interval: Interval | Proportion, label: str = "") -> str:
     """Returns a fraction in percent with its confidence interval, after a label, in brackets."""
-    return f"{percent(interval.value)} ({label}{percent(interval.low)} to {percent(interval.high)})"
+    return f"{fraction(interval)} ({label}{percent(interval.low)} to {percent(interval.high)})"
 
 
-def confidence(interval: Interval) -> str:
+def confidence(interval: Interval | Proportion) -> str:
     return percent_interval(interval, f"{percent(LEVEL)} confidence interval: ")
 
 
@@ -89,16 +97,40 @@ def headline(analysis: StudyAnalysis) -> str:
         f"The pass probability is {confidence(analysis.pass_probability)}: "
         f"{int(analysis.passed.sum())} of {n} surveys {completed}."
     )
-    sought = {key: found for key, found in analysis.answers.items() if key == study.seek}
-    answers = [answer_sentence(key, found, study.probability) for key, found in sought.items()]
+    answers = answer_lines(analysis, [study.seek] if study.seek else [])
     conclusions = [*_requirement(analysis), *_main_reason(analysis)]
     return " ".join([*answers, result, *conclusions, *left_out, *_warnings(analysis)])
 
 
-def answer_lines(analysis: StudyAnalysis) -> list[str]:
-    """Returns `answer_sentence` for each varied key; empty without a required pass probability."""
-    required = analysis.required_probability
-    return [answer_sentence(key, answers, required) for key, answers in analysis.answers.items()]
+def answer_lines(analysis: StudyAnalysis, keys: Sequence[str] | None = None) -> list[str]:
+    """Returns the answer for each key (None: every varied one); empty without a required pass probability."""
+    required, limits = analysis.required_probability, analysis.key_limits
+    idle = {key for key, regression in analysis.regressions.items() if not regression.worst}
+    return [
+        " ".join(
+            [
+                *([f"No influence of {key} is shown."] if key in idle else []),
+                answer_sentence(key, answers, required),
+                *limit_sentences(limits.get(key), required),
+            ]
+        )
+        for key, answers in analysis.answers.items()
+        if keys is None or key in keys
+    ]
+
+
+def limit_sentences(limit: KeyLimit | None, required: float | None) -> list[str]:
+    """Returns a sentence on the limit of a key, if it has one, with its confidence interval."""
+    if limit is None or (np.isinf(limit.low) and np.isinf(limit.high)):
+        return []
+    ends = (limit.low, limit.high)
+    if np.isfinite(ends).all():
+        interval = f"{rounded(limit.low)} to {rounded(limit.high)}"
+    else:
+        interval = f"below {rounded(limit.high)}" if np.isfinite(limit.high) else f"above {rounded(limit.low)}"
+    value = f"is {rounded(limit.value)}, with" if np.isfinite(limit.value) else "lies in"
+    side = "above" if limit.rises else "below"
+    return [f"The limit, {side} which {percent(required)} pass, {value} the {percent(LEVEL)} interval {interval}."]
 
 
 def answer_sentence(key: str, answers: list[Answer], required: float | None) -> str:
@@ -117,7 +149,7 @@ def answer_sentence(key: str, answers: list[Answer], required: float | None) -> 
         n, verb = sum(answer.surveys for answer in undecided), "is" if len(undecided) == 1 else "are"
         unknown = sum(answer.unknown for answer in undecided)
         of_them = f", {unknown} of them unknown" if unknown else ""
-        more = _more(undecided)
+        more = more_needed(undecided)
         parts.append(f"{_labels(undecided)} {verb} not decided with {counted(n, 'survey')}{of_them} ({more})")
     text = "; ".join(parts) + "."
     return constant + text[:1].upper() + text[1:]
@@ -128,12 +160,16 @@ def _labels(answers: list[Answer]) -> str:
     return f"{', '.join(first)} and {last}" if first else last
 
 
-def _more(undecided: list[Answer]) -> str:
-    total = sum(answer.more_surveys for answer in undecided)
-    if np.isinf(total):
+def more_needed(undecided: list[Answer]) -> str:
+    """Returns what would decide some ranges or values that are not decided."""
+    numbers = np.array([answer.more_surveys for answer in undecided])
+    if np.isinf(numbers).any():
         if any(answer.unknown for answer in undecided):
-            return "no number of surveys by the surrogate is expected to decide it: some of the results are unknown"
+            return "some of the results are unknown: --render-refused flies them"
         return "no finite number of surveys is expected to decide it: the observed fraction equals the required one"
+    if np.isnan(numbers).any():
+        return "more surveys there narrow it"
+    total = float(numbers.sum())
     digit = 10 ** max(0, len(f"{total:.0f}") - 2)
     return f"about {int(np.ceil(total / digit)) * digit} more needed there"
 
@@ -149,7 +185,7 @@ def requirement_verdict(analysis: StudyAnalysis) -> str:
     """Returns whether the required fraction of the surveys passed; "not decided" if unknown results matter."""
     if not analysis.requirement_missed:
         return "met"
-    is_possible = analysis.evaluated.any() and analysis.possible_fractions[1] >= (analysis.required_probability or 0.0)
+    is_possible = analysis.evaluated.any() and analysis.pass_probability.most >= (analysis.required_probability or 0.0)
     return "not decided" if is_possible else "not met"
 
 
@@ -181,9 +217,11 @@ def _refused(analysis: StudyAnalysis) -> list[str]:
         n, verb, reason = _refusals(analysis, analysis.unmodelled)
         sentences.append(
             f"{n} {verb} unknown, because the surrogate cannot simulate them: they count as not passed at the lower "
-            'bound and as passed at the upper bound of the confidence intervals; imaging.fidelity = "rendered" flies '
-            f"them; e.g.: {reason}."
+            "bound and as passed at the upper bound of the confidence intervals; --render-refused flies them rendered; "
+            f"e.g.: {reason}."
         )
+    if n := analysis.n_rendered:
+        sentences.append(f"{counted(n, 'survey')} that the surrogate refuses {'is' if n == 1 else 'are'} rendered.")
     return sentences
 
 

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import math
 import warnings
+from bisect import bisect_left
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
-from scipy.special import ndtri
+from scipy.special import betaincinv, ndtri
 
 Array = NDArray[np.float64]
 LEVEL = 0.95  #: confidence level of every interval
 RESAMPLES = 2000  #: number of resamples of every bootstrap
+_Z = float(ndtri(0.5 + LEVEL / 2))
 _MIN_CLUSTERS = 5  # smallest number of clusters for a bootstrap interval
+_EXTREME = 1e100  # stands for an infinite value: percentiles between infinite values are not defined
 _MAX_DISCRETE = 12  # a key with at most this many distinct values is grouped by value; other keys are binned
 
 
@@ -29,30 +34,62 @@ class Interval(NamedTuple):
 UNDEFINED = Interval(np.nan, np.nan, np.nan)
 
 
-def wilson_interval(successes: float, n: float, level: float = LEVEL, unknown: int = 0) -> Interval:
+class Proportion(NamedTuple):
+    """Proportion of successes among trials, the outcome of some of which may be unknown."""
+
+    value: float  #: proportion if no unknown trial is a success
+    low: float  #: lower confidence bound of `value`
+    high: float  #: upper confidence bound of `most`
+    most: float  #: proportion if every unknown trial is a success; equals `value` if there is none
+
+
+def wilson_interval(successes: float, n: float, unknown: int = 0) -> Proportion:
     """Returns the proportion of successes with Wilson's score interval (Wilson 1927, J. Am. Stat. Assoc. 22, 209).
 
     The bounds are (p + z^2 / (2 n) +- z sqrt(p (1 - p) / n + z^2 / (4 n^2))) / (1 + z^2 / n), with the proportion p
-    and the normal quantile z of (1 + level) / 2. Without trials, the proportion is NaN and the interval is 0 to 1.
-
-    `unknown` further trials, whose outcome is unknown, count as failures at the lower and as successes at the upper
-    bound.
+    and the normal quantile z of (1 + LEVEL) / 2. Without trials, the proportion is NaN and the interval is 0 to 1.
+    `unknown` is the number of further trials, whose outcome is unknown.
     """
     if unknown:
-        worst, best = (wilson_interval(successes + k, n + unknown, level) for k in (0, unknown))
-        return Interval(successes / n if n > 0 else np.nan, worst.low, best.high)
+        worst, best = (wilson_interval(successes + k, n + unknown) for k in (0, unknown))
+        return Proportion(worst.value, worst.low, best.high, best.value)
     if n <= 0:
-        return Interval(np.nan, 0.0, 1.0)
-    z, p = float(ndtri(0.5 + level / 2)), successes / n
+        return Proportion(np.nan, 0.0, 1.0, np.nan)
+    z, p = _Z, successes / n
     centre = (p + z**2 / (2 * n)) / (1 + z**2 / n)
     half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2)) / (1 + z**2 / n)
     low, high = float(max(0.0, centre - half)), float(min(1.0, centre + half))
-    return Interval(p, low if p > 0 else 0.0, high if p < 1 else 1.0)  # exact bounds at 0 and 1
+    return Proportion(p, low if p > 0 else 0.0, high if p < 1 else 1.0, p)  # exact bounds at 0 and 1
 
 
-def clustered_proportion(
-    passed: ArrayLike, clusters: ArrayLike, unknown: ArrayLike | None = None, level: float = LEVEL
-) -> Interval:
+def exact_interval(successes: int, n: int) -> Proportion:
+    """Returns the proportion of successes in independent trials with its interval by Clopper and Pearson (1934)."""
+    if n <= 0:
+        return Proportion(np.nan, 0.0, 1.0, np.nan)
+    low = betaincinv(successes, n - successes + 1, (1 - LEVEL) / 2) if successes else 0.0
+    high = betaincinv(successes + 1, n - successes, (1 + LEVEL) / 2) if successes < n else 1.0
+    return Proportion(successes / n, float(low), float(high), successes / n)
+
+
+@cache
+def trials_to_show(required: float, failures: int) -> float:
+    """Returns the smallest number of trials, of which `failures` fail, whose `exact_interval` is above a proportion.
+
+    Infinite if the required proportion is 1.
+    """
+    if required >= 1:
+        return math.inf
+
+    def is_enough(n: int) -> bool:
+        return exact_interval(n - failures, n).low >= required
+
+    most = failures + 1
+    while not is_enough(most):
+        most *= 2
+    return bisect_left(range(most + 1), True, lo=failures + 1, key=is_enough)
+
+
+def clustered_proportion(passed: ArrayLike, clusters: ArrayLike, unknown: ArrayLike | None = None) -> Proportion:
     """Returns the proportion of successes with Wilson's interval, corrected for correlation within clusters.
 
     Wilson's interval is computed for the effective number of surveys: their number divided by the design effect (Kish
@@ -67,10 +104,10 @@ def clustered_proportion(
         return wilson_interval(0, 0)
     if unknown is not None and np.any(unknown):
         known = ~np.asarray(unknown, dtype=bool)
-        worst, best = (clustered_proportion(np.where(known, success, k), clusters, level=level) for k in (0, 1))
-        return Interval(float(success[known].mean()) if known.any() else np.nan, worst.low, best.high)
-    effective = effective_number(success, clusters)
-    return wilson_interval(float(success.mean()) * effective, effective, level)
+        worst, best = (clustered_proportion(np.where(known, success, k), clusters) for k in (0, 1))
+        return Proportion(worst.value, worst.low, best.high, best.value)
+    value, effective = float(success.mean()), effective_number(success, clusters)
+    return wilson_interval(value * effective, effective)._replace(value=value, most=value)
 
 
 def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:
@@ -86,20 +123,19 @@ def effective_number(passed: ArrayLike, clusters: ArrayLike) -> float:
     return float(min(max(p * (1 - p) / variance, k), n) if variance > 0 else k)
 
 
-def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float, level: float = LEVEL) -> float:
+def surveys_to_decide(passed: ArrayLike, clusters: ArrayLike, required: float) -> float:
     """Returns the number of further surveys after which Wilson's interval would exclude the required proportion r.
 
     For n effective surveys and an observed proportion p, the interval contains r if (p - r)^2 <= z^2 r (1 - r) / n,
-    where z is the normal quantile of (1 + level) / 2. If p stays the same, n = z^2 r (1 - r) / (p - r)^2 effective
+    where z is the normal quantile of (1 + LEVEL) / 2. If p stays the same, n = z^2 r (1 - r) / (p - r)^2 effective
     surveys are therefore needed. The result is at least 1, and infinite if p equals r, if r is 1, or without surveys.
     """
     success = np.asarray(passed, dtype=float)
     difference = float(success.mean()) - required if len(success) else 0.0
     if difference == 0 or required >= 1:
         return float("inf")
-    z = float(ndtri(0.5 + level / 2))
     effective = effective_number(success, clusters)
-    needed = z**2 * required * (1 - required) / difference**2
+    needed = _Z**2 * required * (1 - required) / difference**2
     return float(np.ceil(max(needed - effective, 1.0) * len(success) / effective))
 
 
@@ -129,6 +165,26 @@ def bootstrap_interval(
     if bounds.low == bounds.high:
         return Interval(value, np.nan, np.nan)
     return Interval(value, float(bounds.low), float(bounds.high))
+
+
+def bootstrap_with_unknown(
+    values: Array, statistic: Callable[[Array], Array], clusters: Array, unknown_clusters: Array
+) -> Interval:
+    """Returns `bootstrap_interval` if further values, given by their clusters (m,), may be anything.
+
+    Its ends are those with the further values as small, and as large, as possible; an end may be infinite. The value is
+    that of the known data.
+    """
+    known = bootstrap_interval(values, statistic, clusters)
+    if len(unknown_clusters) == 0 or len(values) == 0:
+        return known
+    labels, ends = np.concatenate([clusters, unknown_clusters]), []
+    for k, extreme in enumerate((-_EXTREME, _EXTREME)):
+        data = np.concatenate([values, np.full(len(unknown_clusters), extreme)])
+        found = bootstrap_interval(data, statistic, labels)
+        end = found[k + 1] if np.isfinite(found[k + 1]) else found.value
+        ends.append(end if abs(end) < 1e-6 * _EXTREME else float(np.copysign(np.inf, end)))
+    return Interval(known.value, *ends)
 
 
 def _by_cluster(values: Array, clusters: NDArray) -> Array:

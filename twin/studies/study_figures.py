@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Sequence
+from itertools import chain
 from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
@@ -17,8 +20,9 @@ from twin.report.plotting import WIDTH_IN, log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.studies import agreement, statistics
 from twin.studies.analysis import Mask, MetricSummary, Sensitivity, StudyAnalysis
+from twin.studies.answers import KeyRegression
 from twin.studies.sentences import metric_name, metric_value
-from twin.studies.statistics import Array, Interval
+from twin.studies.statistics import Array
 
 PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
 _MAX_POINTS = 3000
@@ -29,6 +33,7 @@ def draw_all(analysis: StudyAnalysis, compared: bool) -> dict[str, str]:
     with matplotlib.rc_context(FIGURE_STYLE):
         drawn = {
             "pass_probability": pass_probability(analysis),
+            "passing_map": passing_map(analysis),
             "histograms": metric_histograms(analysis, analysis.metric_summaries),
             "sensitivity": sensitivity(analysis.sensitivities),
             "key_histograms": key_histograms(analysis),
@@ -78,13 +83,47 @@ def pass_probability(analysis: StudyAnalysis) -> Figure | None:
     rows = np.flatnonzero(analysis.counted)
     for key, axes in zip(analysis.keys, panels, strict=True):
         groups, x = _grouped(axes, analysis, key, analysis.counted)
-        proportions = [analysis.proportion(rows[groups == k]) for k in np.unique(groups)]
-        _error_bars(axes, x, proportions)
-        axes.axhline(analysis.pass_probability.value, color=COLOURS["reference"], linestyle="--", linewidth=1)
+        if key in analysis.regressions:
+            _draw_regression(axes, analysis.regressions[key])
+        else:
+            _error_bars(axes, x, [analysis.proportion(rows[groups == k])[:3] for k in np.unique(groups)], line="")
         _shade_answers(axes, analysis, key)
         axes.set(ylim=(-0.03, 1.03), xlabel=key)
         axes.yaxis.set_major_formatter(lambda value, _: percent(value))
     panels[0].set_ylabel("pass probability")
+    return figure
+
+
+def _draw_regression(axes: Axes, regression: KeyRegression) -> None:
+    """Plots surveys as ticks at 0, 1/2 (unknown) and 1, and the monotone regression.
+
+    The regression is drawn twice if results are unknown: all of them not passed, and all passed.
+    """
+    x, record = regression.x, regression.record
+    axes.axhline(float(record.passed.mean()), color=COLOURS["reference"], linestyle="--", linewidth=1)
+    for _, curve in chain(*regression.worst[:1], *regression.best[-1:]):
+        axes.plot(curve.values, curve.fraction, color=COLOURS["online"], linewidth=1.4, drawstyle="steps-mid")
+    results = (record.results(worst=True), PASSED, 1.0), (record.unknown, POINTS, 0.5)
+    for chosen, colour, y in (*results, (~record.results(worst=False), NOT_PASSED, 0.0)):
+        inside = x[np.broadcast_to(chosen, x.shape)]
+        axes.plot(inside, np.full(len(inside), y), "|", color=colour, markersize=7, alpha=0.6)
+
+
+def passing_map(analysis: StudyAnalysis) -> Figure | None:
+    """Plots where the required fraction passes over the two most influential keys: cells, and surveys as dots."""
+    found, required = analysis.passing_map, analysis.required_probability
+    if found is None or required is None:
+        return None
+    figure, (axes,) = make_panels(1, row_in=4.0)
+    colours = ListedColormap([NOT_PASSED, "white", PASSED])
+    axes.pcolormesh(*found.edges, found.verdicts(required).T, cmap=colours, vmin=-1, vmax=1, alpha=0.35)
+    x, y = (analysis.numbers(f"vary.{key}")[analysis.counted] for key in found.keys)
+    record = analysis.pass_record
+    _dots(axes, x, y, record.passed, np.random.default_rng(0))
+    axes.plot(x[record.unknown], y[record.unknown], "x", color=COLOURS["truth"], markersize=3.5)
+    for axis, edges in zip((axes.xaxis, axes.yaxis), found.edges, strict=True):
+        value_axis(axis, edges, ticks=6)
+    axes.set(xlabel=found.keys[0], ylabel=found.keys[1])
     return figure
 
 
@@ -114,11 +153,13 @@ def _grouped(axes: Axes, analysis: StudyAnalysis, key: str, chosen: Mask) -> tup
     return groups, np.array([np.median(values[chosen][groups == k]) for k in np.unique(groups)])
 
 
-def _error_bars(axes: Axes, x: Array, intervals: list[Interval]) -> None:
+def _error_bars(axes: Axes, x: Array, intervals: Sequence[tuple[float, ...]], line: str = "-") -> None:
     y, low, high = np.array(intervals).T
     bars = np.array([y - low, high - y])
     bars = np.where(np.isfinite(bars), np.maximum(bars, 0), 0)
-    axes.errorbar(x, y, bars, fmt="o-", color=COLOURS["online"], markersize=4, capsize=2.5, linewidth=1.2, zorder=4)
+    axes.errorbar(
+        x, y, bars, fmt=f"o{line}", color=COLOURS["online"], markersize=4, capsize=2.5, linewidth=1.2, zorder=4
+    )
 
 
 def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -> Figure | None:
@@ -130,7 +171,7 @@ def metric_histograms(analysis: StudyAnalysis, summaries: list[MetricSummary]) -
     for summary, axes in zip(summaries, panels, strict=True):
         values = analysis.numbers(summary.name)[analysis.included(summary.name)]
         _histogram(axes, [values], values, ticks=4, color=COLOURS["online"], alpha=0.75)
-        if np.isfinite(summary.median.low):
+        if np.isfinite([summary.median.low, summary.median.high]).all():
             axes.axvspan(summary.median.low, summary.median.high, color=PASSED, alpha=0.25, linewidth=0)
         axes.axvline(summary.median.value, color=PASSED, label="median")
         axes.axvline(summary.bound.value, color=NOT_PASSED, linestyle=":", label="95 % bound")

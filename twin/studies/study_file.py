@@ -21,7 +21,10 @@ SamplingMethod = Literal["random", "lhs", "sobol", "saltelli", "grid"]
 KeepLevel = Literal["all", "report", "metrics", "none"]
 #: Largest number of surveys of a study; limited because all scenarios are validated before the first survey is flown.
 MAX_SURVEYS = 100_000
-FIDELITIES = {"rendered", "surrogate"}  #: values of imaging.fidelity in a study with `compare`
+MAX_VERIFY = 1000  #: largest number of rendered surveys of a plan
+_MOST_PROBABLE = 0.996  # pass probability that they show if all of them pass: 0.996^1000 < 0.025
+FIDELITY = "imaging.fidelity"
+FIDELITIES = {"rendered", "surrogate"}  #: its values in a study with `compare`
 DEFAULT_METRICS = (
     "trajectory.final.ate_rmse_m", "map.le90_area_m", "map.completeness_area", "map.le90_m", "map.completeness",
     "vision.points_median", "vision.contrast_median",
@@ -69,9 +72,9 @@ class TuningConfig(Section):
     """candidates proposed at a time, from the results of the earlier batches"""
     confirm: int = Field(default=4, ge=1, le=1000)
     """factor on the number of surveys when a finalist is flown with new seeds"""
-    verify: int = Field(default=3, ge=0, le=1000)
-    """rendered surveys of a plan in each cell of the grids, all of which must pass before the plan is recommended, if
-    the search uses the surrogate; 0: the recommended plan is not verified"""
+    verify: int | None = Field(default=None, ge=0, le=MAX_VERIFY)
+    """most rendered surveys of a plan: a plan is recommended only if the lower bound of its pass probability in them
+    reaches require.probability; default: as many as show it although two fail; 0: none, and no plan is recommended"""
     plans: int = Field(default=3, ge=1, le=100)
     """most plans verified in a round, and cheaper plans at the end"""
     rounds: int = Field(default=2, ge=0, le=10)
@@ -261,7 +264,7 @@ def _metric_rules(study: Study) -> Iterator[Rule]:
 
 def _goal_rules(study: Study) -> Iterator[Rule]:
     """Yields the rules for the comparison of both fidelities, the required probability, and the scenario."""
-    fidelity = study.vary.get("imaging.fidelity")
+    fidelity = study.vary.get(FIDELITY)
     for name in study.compare:
         problem = f"{name} can be negative, but the ratio of its medians is compared"
         yield name in SIGNED, "compare", problem, "metrics that are never negative, such as map.rmse_m"
@@ -276,6 +279,9 @@ def _goal_rules(study: Study) -> Iterator[Rule]:
     if study.probability is not None:
         outside = not 0 <= study.probability <= 1
         yield outside, "require.probability", f"{study.probability:g}: not allowed", "0 to 1"
+        never = study.tune is not None and _MOST_PROBABLE < study.probability <= 1
+        problem = f"{study.probability:g} cannot be shown by {MAX_VERIFY} rendered surveys of a plan"
+        yield never, "require.probability", problem, f"with [tune], up to {_MOST_PROBABLE}"
     try:
         _ = study.scenario_file
     except ScenarioError as error:

@@ -16,6 +16,7 @@ from twin.studies.distribution import Array
 from twin.studies.study_file import SamplingMethod, Study, named_keys
 
 _DESIGN_STREAM = 0x57D1  # separates the random numbers of the design from those of a survey with the same seed
+_ORDER_STREAM = 0x57D2  # the same for the order of the samples
 _MAX_ERRORS = 20
 
 
@@ -105,10 +106,17 @@ class SampleSource(Source):
         return f"{super().describe(in_study)} in sample {self.sample}"
 
 
-def surveys(study: Study, folder: Path, without: Container[int] = ()) -> Iterator[Survey]:
-    """Yields every survey of the study, sample by sample; raises ScenarioError if that of a sample is not valid."""
-    base = read_tree(study.scenario_file)
-    for sample in samples(study):
+def surveys(study: Study, folder: Path, without: Container[int] = (), shuffled: bool = False) -> Iterator[Survey]:
+    """Yields every survey of the study, sample by sample; raises ScenarioError if that of a sample is not valid.
+
+    If `shuffled`, the samples come in random order, so that the first of them represent all.
+    """
+    base, planned = read_tree(study.scenario_file), samples(study)
+    if shuffled:
+        in_order = list(planned)
+        order = np.random.default_rng([study.sampling.seed, _ORDER_STREAM]).permutation(len(in_order))
+        planned = (in_order[k] for k in order)
+    for sample in planned:
         if sample.number not in without:
             yield from surveys_of_sample(study, folder, sample, scenario_of_sample(study, base, sample))
 
@@ -118,6 +126,13 @@ def surveys_of_sample(study: Study, folder: Path, sample: Sample, scenario: Scen
         seeded = scenario.model_copy(update={"seed": seed})
         run_folder = folder / "runs" / f"{sample.number:05d}_s{seed}"
         yield Survey(sample.number, seed, sample.values, seeded, seeded.fingerprint(), run_folder, study.keep)
+
+
+def rendered(survey: Survey) -> Survey:
+    """Returns a survey with rendered images, its number and seed unchanged."""
+    imaging = survey.scenario.imaging.model_copy(update={"fidelity": "rendered"})
+    scenario = survey.scenario.model_copy(update={"imaging": imaging})
+    return survey._replace(scenario=scenario, scenario_hash=scenario.fingerprint())
 
 
 def survey_keys(study: Study) -> Iterator[tuple[int, int]]:
