@@ -157,5 +157,6 @@ def test_the_limit_has_the_direction_of_the_key(sign):
     x = sign * np.arange(100.0)
     found = regress(x, PassRecord(np.arange(100) < 60, np.arange(100), 0.9))
     limit = limit_of_key(found, answers_of_ranges(found))
+    assert limit is not None
     assert (limit.value, limit.rises) == (sign * 59.5, sign < 0)
     assert sorted((limit.low, limit.high)) == sorted((sign * 49, sign * 60))

@@ -1,22 +1,26 @@
-"""A plan found with the surrogate is recommended only if its rendered surveys pass; if not, they improve the search."""
+"""A plan is recommended only if rendered surveys show its pass probability; if they fail, they improve the search."""
 
 import json
 import math
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from study_surveys import SerialEngine, study_of
 
 from twin.app import study_command
 from twin.errors import ScenarioError
+from twin.scenario.file import load_scenario
 from twin.studies.distribution import Distribution
 from twin.studies.flight import row_of
 from twin.studies.progress import StudyProgress
 from twin.studies.runner import Fleet
+from twin.studies.statistics import exact_interval
 from twin.tuning import candidates, tuning_report
 from twin.tuning.candidates import cost_index, tuning_config
 from twin.tuning.correction import NO_CORRECTION, PlanRatio, correction_at, metric_ratio
 from twin.tuning.rounds import tune
+from twin.tuning.verification import Verification
 
 TUNING = """
 scenario = "reef"
@@ -35,14 +39,14 @@ samples = 2
 objectives = ["timing.simulated_s", "map.le90_m"]
 trials = 24
 batch = 6
-verify = 2
+verify = 6
 
 [tune.search]
 plan.altitude_m = { uniform = [1.0, 3.0] }
 plan.speed_mps = { uniform = [0.2, 0.4] }
 
 [require]
-probability = 0.9
+probability = 0.5
 "map.le90_m" = 0.01
 """
 TINY = """
@@ -60,7 +64,6 @@ objectives = ["timing.simulated_s"]
 trials = 4
 batch = 4
 confirm = 2
-verify = 1
 plans = 2
 rounds = 0
 keep = "report"
@@ -123,10 +126,11 @@ def test_the_recommended_plan_passed_rendered_and_is_the_cheapest_that_did(searc
     altitude_m = result.recommended.values["plan.altitude_m"]
     assert 0.8 * RENDERED_LIMIT_M < altitude_m <= RENDERED_LIMIT_M
     assert result.verifications[0].surrogate.values["plan.altitude_m"] > RENDERED_LIMIT_M  # the surrogate's choice
-    assert not result.verifications[0].passed
-    assert result.recommended_verification.n_passed == 2
-    passed = [v.surrogate.objectives[0] for v in result.verifications if v.passed]
-    assert result.recommended.objectives[0] == min(passed)
+    assert not result.verifications[0].shown and result.verifications[0].surveys == 3
+    chosen = result.verification(result.recommended)
+    assert (chosen.n_passed, chosen.surveys, chosen.probability) == (6, 6, exact_interval(6, 6))
+    shown = [v.surrogate.objectives[0] for v in result.verifications if v.shown]
+    assert result.recommended.objectives[0] == min(shown)
 
 
 def quick_when_rendered(survey):
@@ -155,17 +159,17 @@ def test_the_table_distinguishes_rendered_from_surrogate_surveys(searched):
     _, result, folder = searched
     table = pq.read_table(folder / "results.parquet").to_pylist()
     rendered = [row for row in table if row["fidelity"] == "rendered"]
-    assert len(rendered) == 2 * len(result.verifications)
+    assert len(rendered) == sum(v.surveys for v in result.verifications) + result.start.surveys
     assert {row["fidelity"] for row in table} == {"rendered", "surrogate"}
     seeds = {row["seed"] for row in rendered}
-    assert len(seeds) == 2 and not seeds & {row["seed"] for row in table if row["fidelity"] == "surrogate"}
+    assert len(seeds) == 6 and not seeds & {row["seed"] for row in table if row["fidelity"] == "surrogate"}
 
 
 def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(searched):
     _, result, folder = searched
     headline = tuning_report.headline(result)
-    assert "2 of 2 rendered surveys were completed and met every requirement" in headline
-    median = result.recommended_verification.medians["map.le90_m"]
+    assert "6 of 6 rendered surveys passed: with 95 % confidence at least 54.1 % pass, 50 % required" in headline
+    median = result.verification(result.recommended).medians["map.le90_m"]
     assert f"{1e3 * median[1]:.1f} mm ({1e3 * median[0]:.1f} mm)" in headline.replace("1.0 cm", "10.0 mm")
     tuning_report.write_tuning_report(result, folder)
     warnings = tuning_report.warnings(result)
@@ -173,7 +177,7 @@ def test_both_figures_and_all_warnings_reach_headline_page_scenario_and_json(sea
     assert any("the surrogate is wrong about the map height error (LE90)" in text for text in warnings)
     summary = tuning_report.summary(result)
     assert json.loads(json.dumps(summary, allow_nan=False))["warnings"] == warnings
-    assert summary["recommended"]["verified"]
+    assert summary["recommended"]["shown"]
     page, scenario = (folder / "tuning.html").read_text(), (folder / "recommended.toml").read_text()
     for text in warnings:
         assert f"# Warning: {text}" in scenario
@@ -188,7 +192,7 @@ def test_if_no_plan_passes_rendered_nothing_is_recommended_after_the_stated_roun
     assert {v.search_round for v in result.verifications} <= {0, 1, 2}
     assert 1 <= len(result.verifications) <= 9
     headline = tuning_report.headline(result)
-    assert "no plan of the search passed in rendered surveys" in headline
+    assert "none is shown to reach 50 % in rendered surveys" in headline and result.unproven is None
     assert tuning_report.summary(result)["recommended"] is None
 
 
@@ -223,18 +227,67 @@ def test_an_interrupted_verification_ends_with_the_same_plans(searched, tmp_path
     assert not set(engine.flown) & set(again.flown)
 
 
-def test_without_verification_the_plan_is_recommended_with_a_warning_in_every_output(tmp_path):
-    study = study_of(tmp_path, TUNING, ("verify = 2", "verify = 0"))
-    result = search(study, tmp_path / "out")
-    assert result.verifications == []
-    assert result.recommended.values["plan.altitude_m"] > RENDERED_LIMIT_M
+@pytest.mark.parametrize(("verify", "flown"), [(0, 0), (4, 4)])
+def test_a_plan_that_too_few_rendered_surveys_show_is_not_recommended_but_named(tmp_path, verify, flown):
+    study = study_of(tmp_path, TUNING, ("verify = 6", f"verify = {verify}"))
+    result = search(study, tmp_path / "out", flown_well)
+    assert result.recommended is None and result.unproven is not None
+    assert sum(v.surveys for v in result.verifications) == flown
     tuning_report.write_tuning_report(result, tmp_path / "out")
-    summary = tuning_report.summary(result)
-    assert not summary["recommended"]["verified"]
-    assert tuning_report.NOT_VERIFIED in tuning_report.headline(result)
-    assert tuning_report.NOT_VERIFIED in summary["warnings"]
-    assert "Not verified" in (tmp_path / "out" / "tuning.html").read_text()
-    assert f"# Warning: {tuning_report.NOT_VERIFIED}" in (tmp_path / "out" / "recommended.toml").read_text()
+    headline = tuning_report.headline(result)
+    assert headline.startswith("No plan is recommended: none is shown to reach 50 % in rendered surveys. The closest")
+    assert ("4 of 4 rendered surveys passed; 50 % is not shown: lower bound 39.8 %" in headline) == (flown > 0)
+    assert ("6 are needed if none fails" in headline) == (flown > 0)
+    assert not (tmp_path / "out" / "recommended.toml").exists()
+    assert load_scenario(tmp_path / "out" / "candidate.toml").plan.altitude_m
+    assert "no plan is shown to pass" in (tmp_path / "out" / "tuning.html").read_text()
+
+
+def flown_well(survey):
+    return flown(survey, 0.004)
+
+
+def test_the_page_compares_the_plan_with_the_starting_plan_and_the_next_cheaper_one_that_failed(searched):
+    _, result, folder = searched
+    names = [row.name for row in tuning_report.compared_plans(result)]
+    assert names == ["starting plan", "recommended", "next cheaper, not shown"]
+    start, failed = result.start, result.failed_cheaper
+    assert start.surveys == 3 and start.surrogate.values["plan.altitude_m"] == load_scenario("reef").plan.altitude_m
+    assert failed.surrogate.objectives[0] < result.recommended.objectives[0]
+    assert failed.why_not() == "requirement not met: map.le90_m (3 of 3)"
+    tuning_report.write_tuning_report(result, folder)
+    page = (folder / "tuning.html").read_text()
+    assert page.index("starting plan") < page.index("map.<wbr>le90_<wbr>m (3 of 3)") < page.index("<img")
+
+
+@pytest.mark.parametrize(("rate", "most"), [(0.9, 0.07), (0.85, 0.01)])
+def test_a_plan_below_the_required_probability_is_rarely_shown(rate, most):
+    """Looked at after 3, 6, 12, ... surveys: three looks can show 90 %, each wrongly in at most 2.5 % of plans."""
+    rng, shown = np.random.default_rng(0), 0
+    plan = Verification(None, 0.9, 70, 0, 0, 0, {}, None, 0, {}, {})
+    for _ in range(1000):
+        passed, found = np.cumsum(rng.random(70) < rate), plan
+        while (n := found.next_surveys()) > found.surveys:
+            found = found._replace(surveys=n, n_passed=int(passed[n - 1]))
+        shown += found.shown
+    assert shown / 1000 <= most + 3 * np.sqrt(most / 1000)
+
+
+def test_the_budget_ends_a_search_with_what_was_flown_and_resume_continues_it(tmp_path, monkeypatch):
+    """The clock advances by one second per rendered survey."""
+    study, clock = study_of(tmp_path, TUNING), [0.0]
+    monkeypatch.setattr("time.time", lambda: clock[0])
+
+    def ticking(survey):
+        clock[0] += is_rendered(survey)
+        return flown_well(survey)
+
+    result = tune(study, tmp_path / "out", False, Fleet(SerialEngine(), StudyProgress(), ticking, end_s=4.0))
+    assert result.out_of_time and result.recommended is None and not result.interrupted
+    assert result.verification(result.unproven).surveys == 4
+    assert "The budget was used up; --resume continues." in tuning_report.headline(result)
+    resumed = tune(study, tmp_path / "out", True, Fleet(SerialEngine(), StudyProgress(), ticking))
+    assert resumed.recommended.values == result.unproven.values and not resumed.out_of_time
 
 
 @pytest.mark.parametrize(("given", "kept"), [("", "metrics"), ('keep = "report"\n', "report")])
@@ -245,11 +298,11 @@ def test_the_expected_time_is_printed_before_and_the_run_folders_are_kept_on_req
         kept_of.extend([survey.keep] if is_rendered(survey) else [])
         return optimistic(survey)
 
-    study = study_of(tmp_path, TUNING, ("verify = 2", f"{given}verify = 2"))
+    study = study_of(tmp_path, TUNING, ("verify = 6", f"{given}verify = 6"))
     search(study, tmp_path / "out", fly)
     lines = capsys.readouterr().err.splitlines()
-    assert "rendered: 2 surveys of about" in lines[0] and "(a rough estimate)" in lines[0]
-    assert lines[1].endswith(": 0 of 2 rendered surveys passed")
+    assert "rendered: 6 surveys show that 50 % pass, if none fails" in lines[0] and "(a rough estimate)" in lines[0]
+    assert "0 of 3 rendered surveys passed; 50 % is not shown" in lines[1]
     assert "(as measured)" in lines[2]
     assert set(kept_of) == {kept}
 
@@ -366,7 +419,7 @@ def test_a_tuned_plan_of_a_tiny_survey_is_verified_by_rendered_surveys(tmp_path)
     rows = pq.read_table(tmp_path / "out" / "results.parquet").to_pylist()
     rendered = [row for row in rows if row["fidelity"] == "rendered"]
     assert [(row["status"], row["require.map.le90_m.passed"]) for row in rendered[-1:]] == [("complete", True)]
-    assert "1 of 1 rendered surveys" in (tmp_path / "out" / "tuning.html").read_text()
+    assert "6 of 6 rendered surveys passed" in (tmp_path / "out" / "tuning.html").read_text()
     folders = [folder for folder in (tmp_path / "out" / "runs").iterdir() if (folder / "report.html").is_file()]
     assert len(folders) == len(rendered)
 
@@ -378,11 +431,11 @@ def test_cheaper_plans_that_the_surrogate_rejects_are_tried_until_one_does_not_p
         limit_m = SURROGATE_LIMIT_M if is_rendered(survey) else RENDERED_LIMIT_M
         return flown(survey, 0.01 * (survey.values["plan.altitude_m"] / limit_m) ** 4)
 
-    study = study_of(tmp_path, TUNING, ("verify = 2", "verify = 2\nplans = 20"))
+    study = study_of(tmp_path, TUNING, ("verify = 6", "verify = 6\nplans = 20"))
     result = search(study, tmp_path / "out", pessimistic)
     altitude_m = result.recommended.values["plan.altitude_m"]
     assert RENDERED_LIMIT_M < altitude_m <= SURROGATE_LIMIT_M
-    (rejected,) = (v.surrogate.values["plan.altitude_m"] for v in result.verifications if not v.passed)
+    (rejected,) = (v.surrogate.values["plan.altitude_m"] for v in result.verifications if not v.shown)
     assert rejected > SURROGATE_LIMIT_M
     all_m = [c.values["plan.altitude_m"] for c in result.candidates]
     assert not [z for z in all_m if altitude_m < z < rejected]

@@ -161,7 +161,9 @@ def export(run: str | Path | RunResult, formats: str | Sequence[str], out: str |
     return command.export(folder, names, Path(out) if out is not None else folder / "export")
 
 
-def study(file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False) -> StudyResult:
+def study(
+    file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False, budget: str | None = None
+) -> StudyResult:
     """Runs the surveys of a study file and returns their analysis; the folder has tables, figures and a report.
 
     Args:
@@ -169,20 +171,26 @@ def study(file: str | Path, out: str | Path, jobs: int | None = None, resume: bo
         out: folder to write.
         jobs: number of surveys that run at once; default: one per core.
         resume: run only the surveys whose results are missing in the folder.
+        budget: time after which surveys are stopped, e.g. "2h"; default: no limit.
 
     Raises:
-        TwinError: the study is invalid, or the folder has other contents or cannot be written.
+        TwinError: the study is invalid, the budget is too small for one survey, or the folder has other contents or
+            cannot be written.
     """
     from twin.app import study_command
 
-    return study_command.fly_study(str(file), study_command.StudyOptions(Path(out), jobs, resume=resume))[0]
+    options = study_command.StudyOptions(Path(out), jobs, resume=resume, budget=budget)
+    return study_command.fly_study(str(file), options)[0]
 
 
-def tune(file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False) -> TuningResult:
+def tune(
+    file: str | Path, out: str | Path, jobs: int | None = None, resume: bool = False, budget: str | None = None
+) -> TuningResult:
     """Searches the plan that a study file asks for; the arguments and errors are those of `study`."""
     from twin.app import study_command
 
-    return study_command.fly_search(str(file), study_command.StudyOptions(Path(out), jobs, resume=resume))[0]
+    options = study_command.StudyOptions(Path(out), jobs, resume=resume, budget=budget)
+    return study_command.fly_search(str(file), options)[0]
 
 
 def replay(dataset: str | Path, out: str | Path, options: ReplayOptions | None = None) -> ReplayResult:

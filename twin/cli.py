@@ -299,6 +299,16 @@ def _add_study_command(name: str, text: str, verify_text: str) -> None:
         live: Annotated[bool, option("Print a line for each finished survey.", flag="--live")] = False,
         as_json: SummaryJson = False,
         verify: Annotated[int | None, option(verify_text, "N", min=0, max=1000)] = None,
+        render_refused: Annotated[
+            bool,
+            option(
+                "Fly rendered what only the surrogate refuses. Default: these results are unknown.",
+                flag="--render-refused",
+            ),
+        ] = False,
+        budget: Annotated[
+            str | None, option("Stop the surveys after this time, e.g. 45m or 2h; --resume continues.", "TIME")
+        ] = None,
         extrapolate: Extrapolate = False,
         allow_plugins: AllowPlugins = False,
     ) -> None:
@@ -306,7 +316,9 @@ def _add_study_command(name: str, text: str, verify_text: str) -> None:
 
         if not scheduler:
             _require_rendering()
-        options = study_command.StudyOptions(out, jobs, scheduler, resume, live, verify, extrapolate, allow_plugins)
+        options = study_command.StudyOptions(
+            out, jobs, scheduler, resume, live, verify, render_refused, budget, extrapolate, allow_plugins
+        )
         raise typer.Exit({"study": study_command.study, "tune": study_command.tune}[name](file, options, as_json))
 
 
@@ -318,7 +330,7 @@ _add_study_command(
 _add_study_command(
     "tune",
     "Optimise the plan as the tune section of a study defines it, and write the recommended plan as a scenario.",
-    "Rendered surveys of a plan before it is recommended; 0: none. Default: tune.verify of the study.",
+    "Most rendered surveys of a plan; 0: none, and no plan is recommended. Default: tune.verify of the study.",
 )
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,14 +15,23 @@ from twin.app import console
 from twin.app.outputs import file_stem, output_file
 from twin.core.output_folder import sole_writer
 from twin.engines.engine import open_engine
+from twin.errors import ScenarioError, TwinError
+from twin.planning.summary import run_time_s
+from twin.scenario.file import read_tree
+from twin.scenario.model import Scenario
 from twin.studies import agreement, rendered_check, report, sentences
 from twin.studies.progress import study_progress
 from twin.studies.rendered_check import RenderedCheck
+from twin.studies.run_time import duration, parsed_duration
 from twin.studies.runner import Fleet, StudyResult, run_study
 from twin.studies.study_file import Study, load_study
+from twin.studies.surveys import samples, scenario_of_sample
 from twin.tuning import rounds, tuning_report
-from twin.tuning.candidates import tuning_config
+from twin.tuning.candidates import rendered_of, tuning_config
 from twin.tuning.rounds import TuningResult
+from twin.world.mission import prepare
+
+_CHECKED_SAMPLES = 20  # of a study, among which one that can be flown is looked for
 
 
 class StudyOptions(NamedTuple):
@@ -28,25 +40,51 @@ class StudyOptions(NamedTuple):
     scheduler: str | None = None  #: where the surveys run (`open_engine`)
     resume: bool = False  #: run only the surveys whose results are missing in the folder, and those that failed
     live: bool = False  #: print a line for each finished survey
-    #: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune: number of
-    #: rendered surveys of a plan before it is recommended; None: `tune.verify` of the study file
+    #: study: number of surrogate surveys, those closest to the limits, that are also rendered; None: 0. Tune: most
+    #: rendered surveys of a plan; None: `tune.verify` of the study file
     verify: int | None = None
+    #: study: fly rendered what only the surrogate refuses; without it, these surveys have an unknown result
+    render_refused: bool = False
+    budget: str | None = None  #: time after which surveys are stopped, e.g. "2h"; None: no limit
     extrapolate: bool = False  #: fly surrogate surveys outside the fitted range of the error model
     allow_plugins: bool = False  #: fly plug-ins that study or scenario name as module:Class
 
 
 @contextmanager
-def _fleet(options: StudyOptions) -> Iterator[Fleet]:
-    with open_engine(options.jobs, options.scheduler) as engine, study_progress(options.live) as progress:
-        yield Fleet(engine, progress)
+def _fleet(options: StudyOptions, scenarios: Iterator[Scenario]) -> Iterator[Fleet]:
+    """Yields the workers; `scenarios` are some of those to fly, for the time that a survey needs at least."""
+    end_s = time.time() + _budget_s(options.budget, scenarios) if options.budget else math.inf
+    with open_engine(options.jobs, options.scheduler) as engine, study_progress(options.live, end_s) as progress:
+        yield Fleet(engine, progress, end_s=end_s)
+
+
+def _budget_s(budget: str, scenarios: Iterator[Scenario]) -> float:
+    """Returns a budget [s]; raises TwinError if it is too small for the first scenario that can be flown."""
+    budget_s = parsed_duration(budget, "--budget")
+    for scenario in scenarios:
+        with suppress(ScenarioError):
+            needed_s = run_time_s(prepare(scenario))
+            if budget_s < needed_s:
+                problem = f"{duration(budget_s)} is too short for one survey, which takes about {duration(needed_s)}"
+                raise TwinError("--budget", problem, "a longer time")
+            break
+    return budget_s
+
+
+def _scenarios(study: Study) -> Iterator[Scenario]:
+    """Yields the valid scenarios of the first samples of a study."""
+    base = read_tree(study.scenario_file)
+    for sample in islice(samples(study), _CHECKED_SAMPLES):
+        with suppress(ScenarioError):
+            yield scenario_of_sample(study, base, sample)
 
 
 def fly_study(file: str, options: StudyOptions) -> tuple[StudyResult, RenderedCheck | None]:
     """Runs a study, checks it by rendered surveys if asked, writes the results; raises TwinError for invalid input."""
     study = load(file, options)
     folder = _folder(options, "study", study)
-    with _fleet(options) as fleet:
-        result = run_study(study, folder, options.resume, fleet)
+    with _fleet(options, _scenarios(study)) as fleet:
+        result = run_study(study, folder, options.resume, fleet, options.render_refused)
         if not options.verify or result.interrupted:
             return result, None
         return result, rendered_check.check(result.analysis, options.verify, folder, fleet)
@@ -59,7 +97,7 @@ def fly_search(file: str, options: StudyOptions) -> tuple[TuningResult, Path]:
         config = tuning_config(study).model_copy(update={"verify": options.verify})
         study = study.model_copy(update={"tune": config})
     folder = _folder(options, "tune", study)
-    with _fleet(options) as fleet:
+    with _fleet(options, _scenarios(rendered_of(study))) as fleet:
         result = rounds.tune(study, folder, options.resume, fleet)
     with sole_writer(folder, used=True):
         tuning_report.write_tuning_report(result, folder)
@@ -87,6 +125,8 @@ def study(file: str, options: StudyOptions, as_json: bool = False) -> int:
 
 def tune(file: str, options: StudyOptions, as_json: bool = False) -> int:
     """Runs a search and prints its result; returns 130 if interrupted, 1 without a recommended plan, otherwise 0."""
+    if options.render_refused:
+        raise TwinError("--render-refused", "twin tune flies every plan that it recommends rendered", "twin study")
     result, folder = fly_search(file, options)
     if as_json:
         print(json.dumps(tuning_report.summary(result), indent=1))
@@ -95,8 +135,8 @@ def tune(file: str, options: StudyOptions, as_json: bool = False) -> int:
         for text in tuning_report.warnings(result):
             print(f"Warning: {text}")
         print(f"Report: {folder / 'tuning.html'}")
-        if result.recommended:
-            print(f"Plan: {folder / 'recommended.toml'}")
+        if name := tuning_report.plan_file(result):
+            print(f"Plan{'' if result.recommended else ', not shown'}: {folder / name}")
     return 130 if result.interrupted else 0 if result.recommended else 1
 
 

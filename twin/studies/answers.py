@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -53,7 +53,7 @@ class PassRecord(NamedTuple):
     """Pass or fail of n surveys with their cluster labels, and the required pass probability."""
 
     passed: Mask  #: (n,)
-    clusters: Array  #: (n,)
+    clusters: NDArray[Any]  #: (n,)
     required: float
     #: (n,) whether the result of each survey is unknown; such a survey counts as one that did not pass at the lower
     #: bound of the pass probability, and as one that passed at the upper bound
@@ -76,7 +76,7 @@ class PassRecord(NamedTuple):
         more = 0.0 if verdict != "undecided" else self._more_surveys(passed, clusters, unknown)
         return Answer(verdict, label, low, high, len(passed), probability, more, int(unknown.sum()))
 
-    def _more_surveys(self, passed: Mask, clusters: Array, unknown: Mask) -> float:
+    def _more_surveys(self, passed: Mask, clusters: NDArray[Any], unknown: Mask) -> float:
         """Returns `Answer.more_surveys` of surveys (n,) that do not decide the verdict."""
         if passed.mean() >= self.required:  # even if no unknown result is a pass
             return surveys_to_decide(passed, clusters, self.required)

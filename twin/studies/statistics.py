@@ -168,7 +168,7 @@ def bootstrap_interval(
 
 
 def bootstrap_with_unknown(
-    values: Array, statistic: Callable[[Array], Array], clusters: Array, unknown_clusters: Array
+    values: Array, statistic: Callable[[Array], Array], clusters: NDArray[Any], unknown_clusters: NDArray[Any]
 ) -> Interval:
     """Returns `bootstrap_interval` if further values, given by their clusters (m,), may be anything.
 

@@ -19,10 +19,10 @@ from twin.judge.verdict import meets_limit, more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies.analysis import count_similar
-from twin.studies.flight import Row, has_passed, refused_row
+from twin.studies.flight import Row, failure_reason, has_passed, refused_row
 from twin.studies.results_log import key_of
-from twin.studies.statistics import Interval, wilson_interval
-from twin.studies.study_file import Study, TuningConfig
+from twin.studies.statistics import Proportion, trials_to_show, wilson_interval
+from twin.studies.study_file import MAX_VERIFY, Study, TuningConfig
 from twin.studies.surveys import (
     Sample,
     Survey,
@@ -39,6 +39,8 @@ _DEFAULT_PROBABILITY = 0.5  # required pass probability if the study does not se
 _POWER_OF_2 = ("sobol", "saltelli")  # designs that need a power of 2 as number of samples
 _CONFIRM_SEEDS = 1_000_000  # added to the sampling seed of the study for the confirmation of finalists
 _RENDER_SEEDS = 2_000_000  # added to it for the rendered surveys
+_FORGIVEN = 2  # rendered surveys of a plan that may fail before it is given up
+_ALWAYS = ("timing.simulated_s", "map.le90_area_m")  # compared with the starting plan in any case
 _PENALTY = 1e9  # objective of a candidate without a finite median; Optuna does not accept infinity
 
 Values = dict[str, Any]  #: a plan: the value of each searched key
@@ -52,7 +54,7 @@ class SurveyScore(NamedTuple):
     metrics: dict[str, float | None]  #: objectives and metrics with a limit, with their completeness metrics
     warning: str
     scenario_hash: str
-    reason: str  #: why the survey was refused; empty for other surveys
+    reason: str  #: why the survey did not pass; empty if it did
     unmodelled: bool  #: whether only the surrogate refuses it
 
 
@@ -60,10 +62,15 @@ class Candidate(NamedTuple):
     number: int  #: of the trial
     values: Values
     objectives: tuple[float, ...]
-    pass_probability: Interval
+    pass_probability: Proportion
     shortfall: float  #: required minus achieved pass probability; 0 or negative if the plan is feasible
     #: (name, median) of each completeness metric that is reported in addition to the objectives; NaN without a value
     completeness: tuple[tuple[str, float], ...] = ()
+
+    @property
+    def least_shortfall(self) -> float:
+        """Returns the shortfall if every survey passes whose result is unknown, because the surrogate refuses it."""
+        return self.shortfall - (self.pass_probability.most - self.pass_probability.value)
 
     @property
     def has_metrics(self) -> bool:
@@ -100,16 +107,25 @@ def confirmation_of(study: Study) -> Study:
     return study.model_copy(update={"sampling": sampling.model_copy(update=update)})
 
 
-def rendered_of(study: Study) -> Study:
-    """Returns the study of the rendered surveys of a plan: `tune.verify` new design points, each with its own seed.
+def most_rendered(study: Study) -> int:
+    """Returns the largest number of rendered surveys of a plan; see `tune.verify`."""
+    verify = tuning_config(study).verify
+    if verify is not None:
+        return verify
+    return int(min(trials_to_show(required_probability(study), _FORGIVEN), MAX_VERIFY))
 
-    Without a number of samples in the study, each cell of the grids has `tune.verify` seeds instead.
+
+def rendered_of(study: Study) -> Study:
+    """Returns the study of the rendered surveys of a plan: random samples of `most_rendered`, each with its own seed.
+
+    The first ones stay the same if there are more. Without a number of samples in the study, each cell of the grids has
+    as many seeds instead.
     """
     sampling, config = study.sampling, tuning_config(study)
     update: dict[str, Any] = {"seed": sampling.seed + _RENDER_SEEDS, "paired": False, "seeds": 1}
-    update["seeds" if sampling.samples is None else "samples"] = max(config.verify, 1)  # with 0, none is flown
-    if sampling.method in _POWER_OF_2:
-        update["method"] = "lhs"
+    update["seeds" if sampling.samples is None else "samples"] = max(most_rendered(study), 1)  # with 0, none is flown
+    if sampling.samples is not None:
+        update["method"] = "random"
     changes = {
         "sampling": sampling.model_copy(update=update),
         "set": study.set | {"imaging.fidelity": "rendered"},
@@ -117,6 +133,14 @@ def rendered_of(study: Study) -> Study:
         "timeout_s": config.timeout_s,
     }
     return study.model_copy(update=changes)
+
+
+def value_at(scenario: Scenario, key: str) -> Any:
+    """Returns the value of a dotted key of a scenario; None if its section is absent."""
+    value: Any = scenario
+    for part in key.split("."):
+        value = value[int(part)] if isinstance(value, list | tuple) else getattr(value, part, None)
+    return value
 
 
 class CandidateSurveys:
@@ -130,10 +154,11 @@ class CandidateSurveys:
         self.study, self.config, self.folder = study, tuning_config(study), folder
         self.base, refused = read_tree(study.scenario_file), refusals(study)
         self.conditions = [sample for sample in samples(study) if sample.number not in refused]
-        self._n_samples = len(self.conditions) + len(refused)
+        #: numbers of samples of a plan; constant for rendered surveys, whose number may change on --resume
+        self._n_samples = max(len(self.conditions) + len(refused), MAX_VERIFY)
         self.n_surveys = sum(len(seeds_of_sample(study, condition)) for condition in self.conditions)
         self.limits: dict[str, float] = study.limits or self.base.get("require", {})
-        names = with_completeness([*self.config.objectives, *self.limits])
+        names = with_completeness([*self.config.objectives, *self.limits, *_ALWAYS])
         self.metrics = [name for name in names if name != "risk"]
         self._scores: dict[tuple[int, int], SurveyScore] = {}
         for row in rows:
@@ -165,7 +190,7 @@ class CandidateSurveys:
             {name: row.get(name) for name in self.metrics},
             row.get("warning") or "",
             row["scenario_hash"],
-            row["reason"] if row["status"] == "refused" else "",
+            failure_reason(row),
             bool(row.get("unmodelled")),
         )
 
@@ -173,23 +198,29 @@ class CandidateSurveys:
         for condition in self.conditions:
             yield Sample(number * self._n_samples + condition.number, condition.point, values | condition.values)
 
-    def keys(self, number: int, values: Values) -> list[tuple[int, int]]:
-        return [(s.number, seed) for s in self._samples(number, values) for seed in seeds_of_sample(self.study, s)]
+    def keys(self, number: int, values: Values, first: int | None = None) -> list[tuple[int, int]]:
+        """Returns (sample, seed) of the first surveys of a plan (None: of all); the cells of grids take turns."""
+        pairs = [(s, seed) for s in self._samples(number, values) for seed in seeds_of_sample(self.study, s)]
+        pairs.sort(key=lambda pair: (pair[0].point, pair[1]))
+        return [(sample.number, seed) for sample, seed in pairs[:first]]
 
-    def surveys(self, number: int, values: Values) -> Iterator[Survey | Row]:
-        """Yields the surveys of a candidate; a refused row for a survey whose scenario is not valid."""
+    def surveys(self, number: int, values: Values, first: int | None = None) -> Iterator[Survey | Row]:
+        """Yields the `first` surveys of a candidate; a refused row for a survey whose scenario is not valid."""
+        wanted = set(self.keys(number, values, first))
         for sample in self._samples(number, values):
+            seeds = [seed for seed in seeds_of_sample(self.study, sample) if (sample.number, seed) in wanted]
             try:
-                scenario = scenario_of_sample(self.study, self.base, sample)
+                scenario = scenario_of_sample(self.study, self.base, sample) if seeds else None
             except ScenarioError as error:
-                for seed in seeds_of_sample(self.study, sample):
-                    yield refused_row(sample, seed, "; ".join(error.lines))
+                yield from (refused_row(sample, seed, "; ".join(error.lines)) for seed in seeds)
                 continue
-            yield from surveys_of_sample(self.study, self.folder, sample, scenario)
+            if scenario is not None:
+                found = surveys_of_sample(self.study, self.folder, sample, scenario)
+                yield from (survey for survey in found if survey.key in wanted)
 
-    def missing(self, candidates: Mapping[int, Values]) -> Iterator[Survey]:
+    def missing(self, candidates: Mapping[int, Values], first: int | None = None) -> Iterator[Survey]:
         """Yields the surveys of candidates that have no result with the present scenario; records the refused ones."""
-        for survey in (survey for plan in candidates.items() for survey in self.surveys(*plan)):
+        for survey in (survey for plan in candidates.items() for survey in self.surveys(*plan, first)):
             if not isinstance(survey, Survey):
                 self.add(survey)
             elif (score := self._result(survey.key)) is None or score.scenario_hash != survey.scenario_hash:
@@ -200,13 +231,15 @@ class CandidateSurveys:
         score = self._scores.get(key)
         return None if score is None or score.status == "failed" else score
 
-    def scores(self, number: int, values: Values) -> list[SurveyScore]:
+    def scores(self, number: int, values: Values, first: int | None = None) -> list[SurveyScore]:
         """Returns the results of a candidate's surveys; those of the same scenario with the same seed count once."""
-        known = [(key, score) for key in self.keys(number, values) if (score := self._result(key)) is not None]
+        known = [(key, score) for key in self.keys(number, values, first) if (score := self._result(key)) is not None]
         return list({(score.scenario_hash or key, key[1]): score for key, score in known}.values())
 
-    def n_failed(self, number: int, values: Values) -> int:
-        return sum(self._result(key) is None for key in self.keys(number, values))
+    def n_failed(self, number: int, values: Values, first: int | None = None) -> int:
+        """Returns the number of a candidate's surveys that failed because of the computer or the program."""
+        scores = (self._scores.get(key) for key in self.keys(number, values, first))
+        return sum(score is not None and score.status == "failed" for score in scores)
 
     def warnings(self, plans: Iterable[Candidate]) -> dict[str, int]:
         """Returns {warning: number of surveys of the candidates that have it}; see `count_similar`."""
@@ -222,14 +255,14 @@ class CandidateSurveys:
     def evaluate(self, number: int, values: Values, correction: PlanCorrection = NO_CORRECTION) -> Candidate:
         """Returns a candidate with its objectives and pass probability, corrected to those of rendered surveys.
 
-        A refused survey counts as one that does not pass; if only the surrogate refuses it, as one that passes at the
-        upper bound of the pass probability.
+        A refused survey counts as one that does not pass. If only the surrogate refuses it, its result is unknown: it
+        may pass at the upper bound of the pass probability, and counts as the worst value of an objective.
         """
         scores = self.scores(number, values)
         n_passed = sum(self._passes(score, correction) for score in scores)
         passed, n_unknown = correction.pass_factor * n_passed, sum(score.unmodelled for score in scores)
         best = wilson_interval(min(passed + n_unknown, len(scores)), len(scores))
-        passing = wilson_interval(passed, len(scores))._replace(high=best.high)
+        passing = wilson_interval(passed, len(scores))._replace(high=best.high, most=best.value)
         shortfall = required_probability(self.study) - passing.value if scores else 1.0
         risk = 1.0 - passing.value if scores else 1.0
         corrected = {name: correction.apply(name, median_of(scores, name)) for name in self.metrics}
@@ -255,18 +288,26 @@ def _finite(objective: str, value: float | None) -> float:
 def median_of(scores: list[SurveyScore], name: str) -> float | None:
     """Returns the median of a metric over the complete surveys; None if none has a value.
 
-    A missing value counts as infinite for a metric of `INFINITE_WITH_HOLES`.
+    A missing value counts as infinite for a metric of `INFINITE_WITH_HOLES`, and an unknown one as the worst, except
+    for a duration.
     """
     complete = [score.metrics[name] for score in scores if score.status == "complete"]
     known = [np.inf if value is None and name in INFINITE_WITH_HOLES else value for value in complete]
     known = [value for value in known if value is not None]
-    return float(np.median(known)) if known else None
+    if not known:
+        return None
+    n_unknown = 0 if name.startswith("timing.") else sum(score.unmodelled for score in scores)
+    return float(np.median([*known, *n_unknown * [-np.inf if more_is_better(name) else np.inf]]))
 
 
 def cost_index(config: TuningConfig) -> int:
     """Returns the index of the objective that is the cost of a plan: the first duration, or else the first one."""
     costs = [k for k, name in enumerate(config.objectives) if name.startswith("timing.") and name.endswith("_s")]
     return costs[0] if costs else 0
+
+
+def plan_cost(plan: Candidate, config: TuningConfig) -> float:
+    return float(costs_of([plan], config)[0, cost_index(config)])
 
 
 def costs_of(candidates: list[Candidate], config: TuningConfig) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""Report of a search: tuning.html, pareto.png and recommended.toml."""
+"""Report of a search: tuning.html, pareto.png, and the plan: recommended.toml, or candidate.toml if it is not shown."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from importlib.metadata import version
 from itertools import combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -20,25 +20,24 @@ from twin.report.plotting import log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.scenario.file import dump_toml
 from twin.studies import sentences
+from twin.studies.report import json_tree
 from twin.studies.sentences import metric_name, metric_value
 from twin.studies.study_figures import axis_label, make_panels, metric_axis, value_axis
 from twin.tuning.candidates import Candidate, pareto_front, required_probability, tuning_config
 from twin.tuning.rounds import TuningResult
 from twin.tuning.verification import Verification
 
-NOT_VERIFIED = (
-    "Not verified: the plan has no rendered surveys (verify = 0), and the surrogate's prediction may not hold."
-)
+RECOMMENDED, UNPROVEN = "recommended.toml", "candidate.toml"  #: files of the plan
 _LARGE_RATIO = 1.5  # a median ratio rendered / surrogate above this value, or below its inverse, gives a warning
 _DOT = {"linestyle": "", "marker": "o", "markersize": 4}
 Groups = list[tuple[list[Candidate], dict[str, Any]]]
 
 
 def write_tuning_report(result: TuningResult, folder: Path) -> None:
-    """Writes tuning.html, pareto.png and, if a plan is recommended, recommended.toml to a folder."""
+    """Writes tuning.html, pareto.png and the scenario of the recommended or unproven plan to a folder."""
     shown = [candidate for candidate in result.candidates if candidate.has_metrics]
     front = pareto_front(result.candidates, tuning_config(result.study))
-    groups, figures = _groups(shown, front, result), {}
+    groups, figures, compared = _groups(shown, front, result), {}, compared_plans(result)
     with matplotlib.rc_context(FIGURE_STYLE):
         trade_off = _trade_off_figure(groups, result)
         if shown:
@@ -54,13 +53,19 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
         "headline": headline(result),
         "warnings": warnings(result),
         "figures": figures,
-        "recommended": recommended_toml(result),
+        "compared": compared,
+        "metrics": [n for n in (compared[0].verification.medians if compared else ()) if _is_known(n, compared)],
+        "required": required_probability(result.study),
+        "plan": plan_toml(result),
+        "plan_file": plan_file(result),
         "text": read_text(result.study.source.path),
         "version": version("seabed-twin"),
     }
     (folder / "tuning.html").write_text(render_page("twin.tuning", "tuning.html.j2", page), encoding="utf-8")
-    if page["recommended"]:
-        (folder / "recommended.toml").write_text(page["recommended"], encoding="utf-8")
+    for name in (RECOMMENDED, UNPROVEN):
+        (folder / name).unlink(missing_ok=True)  # of an earlier call
+    if name := page["plan_file"]:
+        (folder / name).write_text(page["plan"], encoding="utf-8")
 
 
 def headline(result: TuningResult) -> str:
@@ -68,45 +73,89 @@ def headline(result: TuningResult) -> str:
     count = f"{len(result.candidates)} plans were evaluated"
     if n_rendered := len(result.verifications):
         count += f", {n_rendered} of them also in rendered surveys"
-    if (chosen := result.recommended) is None:
+    chosen = result.recommended
+    if (verification := result.verification(chosen)) is None or chosen is None:
         return f"No plan is recommended: {_missing_plan(result, count)}"
-    plan = "Recommended plan: " + ", ".join(f"{key} = {plain(value)}" for key, value in chosen.values.items())
-    passing = f"pass probability with new seeds {sentences.confidence(chosen.pass_probability)}"
-    if (verification := result.recommended_verification) is None:
-        named = (*zip(tuning_config(result.study).objectives, chosen.objectives, strict=True), *chosen.completeness)
-        objectives = ", ".join(f"{metric_name(n)} {metric_value(n, v)}" for n, v in named if n != "risk")
-        unverified = f" {NOT_VERIFIED}" if result.needs_rendering else ""
-        return f"{plan}. Medians: {objectives}; {passing}. {count}.{unverified}"
     medians = ", ".join(
         f"{metric_name(name)} {metric_value(name, rendered)} ({metric_value(name, surrogate)})"
         for name, (surrogate, rendered) in verification.medians.items()
+        if rendered is not None
     )
-    return (
-        f"{plan}. {verification.n_passed} of {verification.surveys} rendered surveys were completed and met every "
-        f"requirement ({sentences.confidence(verification.rendered.pass_probability)}). Medians "
-        f"rendered (surrogate): {medians}; by the surrogate, {passing}. {count}."
+    return " ".join(
+        [
+            f"Recommended plan: {_values(chosen)}. {verification.counts()}: {verification.state()}. Medians rendered "
+            f"(surrogate): {medians}; by the surrogate, pass probability with new seeds "
+            f"{sentences.confidence(chosen.pass_probability)}. {count}.",
+            *_cheaper(result),
+            *(["The budget was used up before cheaper plans were tried."] if result.out_of_time else []),
+        ]
     )
+
+
+def _values(plan: Candidate) -> str:
+    return ", ".join(f"{key} = {plain(value)}" for key, value in plan.values.items())
+
+
+def _cheaper(result: TuningResult) -> list[str]:
+    """Returns a sentence on the next cheaper plan that was flown rendered and not shown, if there is one."""
+    found = result.failed_cheaper
+    return [f"The next cheaper plan, {_values(found.surrogate)}, is not shown: {found.why_not()}."] if found else []
 
 
 def _missing_plan(result: TuningResult, count: str) -> str:
+    budget = " The budget was used up; --resume continues." if result.out_of_time else ""
+    required = percent(required_probability(result.study))
     if result.interrupted:
-        return f"{count}, and the search was interrupted before a plan was confirmed."
+        return f"{count}, and the search was interrupted before a plan was shown."
+    if (plan := result.unproven) is not None:
+        verification = result.verification(plan)
+        flown = "it has no rendered surveys"
+        if verification is not None:
+            flown = f"{verification.counts()}; {verification.state()}"
+        predicted = sentences.confidence(plan.pass_probability)
+        return (
+            f"none is shown to reach {required} in rendered surveys. The closest one: {_values(plan)}; {flown}. By the "
+            f"surrogate, pass probability with new seeds {predicted}. {count}.{budget}"
+        )
     if not result.verifications:
-        required = f"the required pass probability of {percent(required_probability(result.study))}"
-        return f"{count}, and none reached {required} when flown again with new seeds."
+        return f"{count}, and none reached the required pass probability of {required} with new seeds.{budget}"
     numbers = np.array([(v.surveys, v.n_passed, v.n_failed) for v in result.verifications])
     surveys, passed, n_failed = numbers.sum(axis=0).tolist()
     failed = f"; {n_failed} more failed because of the computer or the program, --resume flies them" if n_failed else ""
     return (
-        f"no plan of the search passed in rendered surveys. {count}; {passed} of {surveys - n_failed} rendered surveys "
-        f"passed{failed}."
+        f"none is shown to reach {required} in rendered surveys. {count}; {passed} of {surveys - n_failed} rendered "
+        f"surveys passed{failed}.{budget}"
     )
 
 
+class ComparedPlan(NamedTuple):
+    """Row of the comparison of the recommended plan with the starting plan and the next cheaper one that failed."""
+
+    name: str
+    verification: Verification
+    note: str  #: what the rendered surveys show, or why the plan is not recommended
+
+
+def _is_known(metric: str, rows: list[ComparedPlan]) -> bool:
+    return any(row.verification.medians[metric][1] is not None for row in rows)
+
+
+def compared_plans(result: TuningResult) -> list[ComparedPlan]:
+    recommended, rows = result.verification(result.recommended), []
+    if result.start:
+        rows.append(ComparedPlan("starting plan", result.start, "; ".join(result.start.reasons) or "for comparison"))
+    if recommended:
+        rows.append(ComparedPlan("recommended", recommended, recommended.state()))
+    elif unproven := result.verification(result.unproven):
+        rows.append(ComparedPlan("closest, not shown", unproven, unproven.state()))
+    if cheaper := result.failed_cheaper:
+        rows.append(ComparedPlan("next cheaper, not shown", cheaper, cheaper.why_not()))
+    return rows
+
+
 def warnings(result: TuningResult) -> list[str]:
-    """Returns warnings on a plan that was not verified, errors of the surrogate, refused plans, and of surveys."""
-    chosen = result.recommended_verification
-    texts = [NOT_VERIFIED] if result.recommended and result.needs_rendering and chosen is None else []
+    """Returns warnings on errors of the surrogate, refused plans, and of surveys."""
+    chosen, texts = result.verification(result.recommended), []
     for verification in [chosen] if chosen else result.verifications:
         texts += _surrogate_errors(verification)
         texts += [f"{text} (in {n} rendered surveys)" for text, n in verification.warnings.items()]
@@ -129,30 +178,38 @@ def _surrogate_errors(verification: Verification) -> Iterator[str]:
 
 
 def summary(result: TuningResult) -> dict[str, Any]:
-    chosen, verification, names = result.recommended, result.recommended_verification, tuning_config(result.study)
-    recommended = chosen and {
+    chosen, names = result.recommended or result.unproven, tuning_config(result.study)
+    verification = result.verification(chosen)
+    plan = chosen and {
         "values": chosen.values,
         "objectives": dict(zip(names.objectives, chosen.objectives, strict=True)),
         "probability": chosen.pass_probability._asdict(),
-        "verified": not result.needs_rendering or verification is not None,
+        "shown": result.recommended is not None,
         "rendered": verification and _rendered(verification),
     }
-    return {
+    found = {
         "name": result.study.name,
         "candidates": len(result.candidates),
         "interrupted": result.interrupted,
-        "recommended": recommended,
+        "out_of_time": result.out_of_time,
+        "recommended": plan if result.recommended else None,
+        "unproven": plan if result.unproven else None,
+        "start": result.start and _rendered(result.start),
         "verifications": [_rendered(one) for one in result.verifications],
         "warnings": warnings(result),
         "headline": headline(result),
     }
+    return json_tree(found)
 
 
 def _rendered(verification: Verification) -> dict[str, Any]:
     return {
         "plan": verification.surrogate.number,
         "round": verification.search_round,
-        "passed": verification.passed,
+        "shown": verification.shown,
+        "probability": verification.probability._asdict(),
+        "needed": verification.needed,
+        "reasons": verification.reasons,
         **{name: getattr(verification, name) for name in ("surveys", "n_passed", "n_failed")},
         "values": verification.surrogate.values,
         "medians": {
@@ -162,8 +219,13 @@ def _rendered(verification: Verification) -> dict[str, Any]:
     }
 
 
-def recommended_toml(result: TuningResult) -> str:
-    """Returns the recommended plan, if any, as a scenario file with headline and warnings in comments at the start."""
+def plan_file(result: TuningResult) -> str:
+    """Returns the name of the file of the plan; "" if there is none."""
+    return RECOMMENDED if result.recommended else UNPROVEN if result.unproven else ""
+
+
+def plan_toml(result: TuningResult) -> str:
+    """Returns the plan, if any, as a scenario file with headline and warnings in comments at the start."""
     if result.scenario is None:
         return ""
     imaging = result.scenario.imaging.model_copy(update={"fidelity": "rendered"})
@@ -174,8 +236,9 @@ def recommended_toml(result: TuningResult) -> str:
 
 
 def _groups(shown: list[Candidate], front: list[Candidate], result: TuningResult) -> Groups:
-    chosen = result.recommended
-    star = {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": "recommended"}
+    chosen = result.recommended or result.unproven
+    label = "recommended" if result.recommended else "closest, not shown"
+    star = {"marker": "*", "markersize": 13, "color": COLOURS["limit"], "label": label}
     return [
         (
             [c for c in shown if c.shortfall > 0],

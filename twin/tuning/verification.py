@@ -1,24 +1,23 @@
-"""Verification of a plan: results of its rendered surveys compared with the surrogate, and their expected run time."""
+"""Verification of a plan: the results of its rendered surveys, what they show, and how many more are needed."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
-from twin.studies.flight import Row
-from twin.studies.results_log import key_of
-from twin.tuning.candidates import Candidate, CandidateSurveys, median_of
+from twin.report.number_formats import percent
+from twin.studies.analysis import count_similar
+from twin.studies.statistics import Proportion, exact_interval, trials_to_show
+from twin.tuning.candidates import Candidate, CandidateSurveys, median_of, required_probability
 from twin.tuning.correction import PlanRatio, metric_ratio
 
-# Run time of a rendered frame on one CPU core of 2025: 0.023 s for 320 x 240 pixels, 0.07 s for 640 x 480 pixels.
-_FRAME_S = 0.008  # part that does not depend on the image size [s]
-_MEGAPIXEL_S = 0.2  # part per megapixel of one camera's image [s]
+_FIRST_SURVEYS = 3  # flown before it is looked at how many failed; then as many again
 
 
 class Verification(NamedTuple):
     surrogate: Candidate  #: the plan, evaluated by surrogate surveys with new seeds
-    rendered: Candidate  #: the plan, evaluated by its rendered surveys
-    surveys: int  #: number of rendered surveys required
+    required: float  #: pass probability that is to be shown
+    most: int  #: largest number of rendered surveys of a plan
+    surveys: int  #: number of rendered surveys flown
     n_passed: int  #: number of rendered surveys that were completed and met every requirement
     n_failed: int  #: number of rendered surveys without a result, because the computer or the program failed
     #: for each metric, the median (surrogate, rendered); None if no survey has a value
@@ -27,27 +26,79 @@ class Verification(NamedTuple):
     ratio: PlanRatio
     search_round: int  #: round of the search, from 0
     warnings: dict[str, int]  #: for each warning, the number of rendered surveys that have it
+    reasons: dict[str, int]  #: for each reason, the number of rendered surveys that did not pass
 
     @property
-    def passed(self) -> bool:
-        return self.n_passed == self.surveys
+    def probability(self) -> Proportion:
+        return exact_interval(self.n_passed, self.surveys - self.n_failed)
+
+    @property
+    def shown(self) -> bool:
+        """Returns whether the lower bound of the pass probability reaches the required one."""
+        return self.surveys > self.n_failed and self.probability.low >= self.required
+
+    @property
+    def needed(self) -> float:
+        """Returns the number of rendered surveys that show the required pass probability, if no more of them fail."""
+        n_missed = self.surveys - self.n_failed - self.n_passed
+        return trials_to_show(self.required, n_missed) + self.n_failed
+
+    @property
+    def rejected(self) -> bool:
+        """Returns whether so many surveys failed that `most` of them cannot show the required pass probability."""
+        n_missed = self.surveys - self.n_failed - self.n_passed
+        return not self.shown and n_missed > 0 and self.needed > self.most
+
+    def next_surveys(self) -> int:
+        """Returns the number of rendered surveys to fly before this is looked at again; 0 if that is the end.
+
+        The number doubles, so that a bad plan costs little, up to the needed one.
+        """
+        if self.shown or self.rejected:
+            return 0
+        return int(min(max(_FIRST_SURVEYS, 2 * self.surveys), self.needed, self.most))
 
     def notice(self) -> str:
+        return f"Plan {self.surrogate.number}: {self.counts()}; {self.state()}"
+
+    def counts(self) -> str:
         failed = f", {self.n_failed} failed because of the computer or the program" if self.n_failed else ""
-        return f"Plan {self.surrogate.number}: {self.n_passed} of {self.surveys} rendered surveys passed{failed}"
+        return f"{self.n_passed} of {self.surveys} rendered surveys passed{failed}"
+
+    def state(self) -> str:
+        """Returns what the rendered surveys show, and how many would show the required pass probability."""
+        required, low = percent(self.required), percent(self.probability.low)
+        if self.shown:
+            return f"with 95 % confidence at least {low} pass, {required} required"
+        failures = "no more fails" if self.reasons else "none fails"
+        enough = f"{self.needed:.0f} are needed if {failures}, at most {self.most} are flown"
+        return f"{required} is not shown: lower bound {low} with 95 % confidence; {enough}"
+
+    def why_not(self) -> str:
+        """Returns why the plan is not recommended: the reasons of surveys that did not pass, or that too few flew."""
+        reasons = "; ".join(f"{reason} ({n} of {self.surveys})" for reason, n in self.reasons.items())
+        return reasons or self.state()
 
 
 def verification_of(
-    rendered: CandidateSurveys, confirmation: CandidateSurveys, surrogate: Candidate, search_round: int
+    rendered: CandidateSurveys,
+    confirmation: CandidateSurveys,
+    surrogate: Candidate,
+    search_round: int,
+    surveys: int,
+    most: int,
 ) -> Verification:
+    """Returns the verification of a plan by its first rendered surveys."""
     number, values = surrogate.number, surrogate.values
-    scores, predicted = rendered.scores(number, values), confirmation.scores(number, values)
+    scores, predicted = rendered.scores(number, values, surveys), confirmation.scores(number, values)
     medians = {name: (median_of(predicted, name), median_of(scores, name)) for name in rendered.metrics}
     ratios = {name: metric_ratio(name, flown, expected) for name, (expected, flown) in medians.items()}
-    n_complete, n_failed = sum(score.status == "complete" for score in scores), rendered.n_failed(number, values)
+    n_complete = sum(score.status == "complete" for score in scores)
+    n_failed = rendered.n_failed(number, values, surveys)
     return Verification(
         surrogate,
-        rendered.evaluate(number, values),
+        required_probability(rendered.study),
+        most,
         len(scores) + n_failed,
         sum(score.passed for score in scores),
         n_failed,
@@ -55,33 +106,5 @@ def verification_of(
         PlanRatio(values, ratios, n_complete / len(scores) if scores else 1.0),
         search_round,
         rendered.warnings([surrogate]),
+        count_similar(score.reason for score in scores if not score.passed),
     )
-
-
-def expected_time(
-    trials: CandidateSurveys, rendered: CandidateSurveys, plan: Candidate, rows: Iterable[Row]
-) -> tuple[float, str]:
-    """Returns the expected run time of a rendered survey of a plan on one CPU core [s], and how it was found.
-
-    It is the longest simulated duration of the plan's surrogate surveys, times the run time per simulated second in
-    the rendered surveys flown so far, or before the first one as estimated from frame rate and image size.
-    """
-    run_s = simulated_s = longest_s = 0.0
-    own = set(trials.keys(plan.number, plan.values))
-    for row in rows:
-        duration_s = row.get("timing.simulated_s") or 0.0
-        if row.get("fidelity") == "rendered" and duration_s:
-            run_s, simulated_s = run_s + (row.get("timing.survey_s") or 0.0), simulated_s + duration_s
-        if key_of(row) in own:
-            longest_s = max(longest_s, duration_s)
-    if run_s and simulated_s:
-        return longest_s * run_s / simulated_s, "as measured"
-    rig = rendered.scenario(plan.values).rig
-    frame_s = _FRAME_S + _MEGAPIXEL_S * 1e-6 * rig.image_width_px * rig.image_height_px
-    return longest_s * rig.frame_rate_hz * frame_s, "a rough estimate"
-
-
-def duration(time_s: float) -> str:
-    if time_s < 90:
-        return f"{time_s:.0f} s"
-    return f"{time_s / 60:.0f} min" if time_s < 5400 else f"{time_s / 3600:.1f} h"
