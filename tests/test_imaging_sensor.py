@@ -83,6 +83,17 @@ def test_exposure_is_metered_on_the_brightest_channel():
     assert AutoExposure(0.45, 30.0).gain(green) == pytest.approx(0.045)
 
 
+def test_exposure_lets_few_highlights_saturate():
+    rng = np.random.default_rng(6)
+    light = rng.uniform(0.5, 1.5, (240, 320, 3)).astype(np.float32)
+    light[100:140, 100:160] *= 6  # a bright spot on 3 % of the image
+    gain = AutoExposure(0.45, 30.0).gain(light)
+    assert np.mean(gain * light > 1) < 0.004
+    assert gain > 0.9 / np.quantile(light, 0.998)
+    light[100:140, 100:160] /= 6
+    assert AutoExposure(0.45, 30.0).gain(light) == pytest.approx(0.45, rel=0.01)  # no highlights: the mean level
+
+
 class FlatFloor:
     """Renderer of a random texture at a depth of 2 m."""
 

@@ -22,7 +22,7 @@ from twin.imaging.light.spectra import (
     spectrum_of,
     water_spectrum,
 )
-from twin.imaging.light.water import Medium, downwelling_per_m, medium
+from twin.imaging.light.water import Medium, clarity, downwelling_per_m, medium
 from twin.scenario.file import load_scenario
 from twin.scenario.model import WaterConfig
 from twin.scenario.water_sources import WATER_SOURCES
@@ -171,6 +171,36 @@ def test_the_source_is_named():
     )
     assert provenance_of(WaterConfig(jerlov="9C")) == "Jerlov 9C (Solonenko & Mobley 2015), turbidity 1"
     assert provenance_of(WaterConfig(jerlov="clear")) == "clear, turbidity 1"
+
+
+@pytest.mark.parametrize("jerlov", ["I", "IB", "3C"])
+def test_a_water_has_the_visibility_that_is_asked_of_it(jerlov):
+    water = WaterConfig(jerlov=jerlov, visibility_m=6.0)
+    c = medium(water, light="daylight").attenuation_per_m[1]
+    assert 4.8 / c == pytest.approx(6.0) and clarity(water).visibility_m == pytest.approx(6.0)
+    # the absorption is that of the Jerlov type
+    np.testing.assert_array_equal(medium(water).absorption_per_m, medium(WaterConfig(jerlov=jerlov)).absorption_per_m)
+    assert clarity(WaterConfig(jerlov=jerlov, visibility_m=3.0)).secchi_m < clarity(water).secchi_m < 12
+
+
+def test_the_clarity_of_oceanic_waters_is_that_of_the_field():
+    """Secchi depths of the clearest and of coastal water: 40 to 60 m (Jerlov 1976), 1 to 5 m in 5C to 9C."""
+    assert 35 < clarity(WaterConfig(jerlov="I")).secchi_m < 80
+    assert 1 < clarity(WaterConfig(jerlov="9C")).secchi_m < 6
+    assert clarity(WaterConfig(jerlov="clear")) == (np.inf, np.inf)
+
+
+@pytest.mark.parametrize(
+    ("keys", "problem"),
+    [
+        ({"jerlov": "9C", "visibility_m": 150}, r"150 m, but absorption alone leaves less .allowed: at most [\d.]+ m"),
+        ({"visibility_m": 6, "turbidity": 2}, "given twice .allowed: one of them"),
+        ({"jerlov": "clear", "visibility_m": 6}, "a water that does not scatter"),
+    ],
+)
+def test_a_visibility_that_is_impossible_is_refused(keys, problem):
+    with pytest.raises(TwinError, match="water.visibility_m: .*" + problem):
+        medium(WaterConfig(**keys))
 
 
 @pytest.mark.parametrize(

@@ -138,13 +138,6 @@ def test_the_bound_between_three_depths_is_that_of_images_at_this_depth():
     np.testing.assert_allclose(matchability.bound_at(between), expected, rtol=0.2)
 
 
-@pytest.mark.parametrize("key", ["rotation_sigma_deg=0.03", "baseline_sigma_mm=0.1"])
-def test_a_survey_whose_cameras_calibrate_themselves_is_refused(key):
-    m = mission(f"calibration_error.{key}")
-    with pytest.raises(ScenarioError, match="imaging.fidelity: .*self-calibration .*baseline_sigma_mm = 0, or imaging"):
-        SurrogateVision(m, MODEL, lambda: m.start, Stopwatch())
-
-
 @pytest.mark.long
 def test_a_survey_in_snow_that_prevents_all_matches_is_refused_even_with_extrapolate():
     """All bounds are infinite, so no binning is better than another and the matches have no error to sample."""

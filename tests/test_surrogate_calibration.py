@@ -20,6 +20,7 @@ from twin.surrogate import error_model_file
 from twin.surrogate.coverage import QUANTITIES, quantities_outside_fit
 from twin.surrogate.matchability import FloorImages, floor_albedos, in_snow
 from twin.surrogate.measured_view import IDEAL_VIEW, MeasuredRows, measured_view
+from twin.surrogate.sampling import sample_link
 from twin.surrogate.snow_noise import snow_effect
 from twin.surrogate.surrogate_world import SurrogateWorld
 from twin.world.mission import prepare
@@ -157,6 +158,42 @@ def test_a_survey_with_a_longer_baseline_maps_the_floor_two_percent_too_near(flo
     path = {name: metrics["trajectory"]["final"]["ate_rmse_m"] for name, metrics in flown.items()}
     assert path["baseline"] > 5 * path["ideal"] and path["focal"] < 3 * path["ideal"]
     assert flown["baseline"]["status"] == "complete"  # no image shows an error of the baseline
+
+
+def test_a_link_shows_the_yaw_and_is_right_after_its_correction():
+    view, _, rig = view_of("calibration_error.right_yaw_deg=0.1")
+    step = geometry.exp(np.array([0.01, -0.02, 0.05, 0.25, -0.1, 0.03]))
+    points, cov = floor_points(rig, 48), np.diag([1e-8, 1e-8, 2e-8])
+
+    def link(view):
+        camera = (
+            rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), 5.0, rig.baseline_m,
+            view.table,
+        )  # fmt: skip
+        zeros = np.zeros((48, 3)), np.zeros((1, 1, 3)), np.zeros((1, 1, 2)), np.zeros((49, 3))
+        return sample_link(points, *zeros, np.eye(4), step, camera, cov, np.zeros((3, 3)), 0.0, 0.0, 0.0, 0.0, 1.0)
+
+    true = np.deg2rad(0.1)
+    n, turned, _, yaw = link(view)
+    assert n > 20 and yaw[0] == pytest.approx(true, rel=0.02)
+    _, corrected, _, remaining = link(view.without_yaw(true))
+    assert remaining[0] == pytest.approx(0, abs=0.02 * true)
+    error, left = (geometry.log(geometry.inverse(motion) @ step) for motion in (turned, corrected))
+    assert np.linalg.norm(left) < 0.03 * np.linalg.norm(error)
+    np.testing.assert_allclose(yaw[2:] * true, error - left, atol=0.1 * np.abs(error).max())
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_survey_calibrates_itself(seed, tmp_path):
+    """It finds the yaw that its seed draws, to its standard deviation, and the sigmas of the map contain the rest."""
+    given = scenario(
+        f"seed={seed}", "calibration_error.rotation_sigma_deg=0.1", "calibration_error.baseline_sigma_mm=0.1"
+    )
+    metrics = survey.run(given, tmp_path / "run", outputs=()).metrics
+    found, true_deg = metrics["self_check"]["calibration"], given.true_calibration_error().right_yaw_deg
+    assert found["yaw_deg"] == pytest.approx(true_deg, abs=4 * found["yaw_sigma_deg"])
+    assert 0.0005 < found["yaw_sigma_deg"] < 0.02
+    assert metrics["map"]["sigma_ratio"] < 2
 
 
 TEXTURE = np.random.default_rng(1).normal(120, 20, (120, 160)).astype(np.float32)

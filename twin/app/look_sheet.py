@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from twin.app.look import ViewLayers
 from twin.imaging.light.optics import range_of
+from twin.imaging.light.water import clarity
 from twin.report.number_formats import DASH
 from twin.report.style import FIGURE_STYLE
 from twin.scenario.model import Scenario
@@ -64,7 +65,7 @@ def _headline(scenario: Scenario, view: ViewLayers) -> str:
     if scenario.sensor is not None:
         exposure = view.decomposed.setting
         light += f"; {1000 * exposure.exposure_s:.3g} ms at gain {exposure.analogue_gain:.3g}"
-    return f"{scenario.name}: {at}; water {water.label}; {light}"
+    return f"{scenario.name}: {at}; water {water.label}, {clarity(water)}; {light}"
 
 
 def _panels(scenario: Scenario, view: ViewLayers) -> list[Panel]:

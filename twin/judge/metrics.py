@@ -53,6 +53,7 @@ class EvaluationInput:
     require: Mapping[str, float] = field(default_factory=dict)  #: limits of metrics, e.g. {"map.le90_m": 0.05}
     warnings: Sequence[str] = ()  #: sentences on limits of the simulation or the data set
     idealisations: Sequence[str] = ()  #: sentences on effects of a real survey that the scenario leaves out
+    water: Mapping[str, float] = field(default_factory=dict)  #: visibility_m and secchi_m of a survey
     actions: ActionTimes = ActionTimes()  #: durations for which the mission slowed and stopped the vehicle
     orthomosaic: Mapping[str, float | None] | None = None  #: `OrthomosaicJudge.metrics`; None if none was made
     #: description of the data set of a replay (reader, number of skipped frames by reason, etc.); None for a survey.
@@ -94,6 +95,7 @@ def _contents(survey: EvaluationInput, sections: dict[str, Any], warnings: Seque
         "warnings": found,
         "warning": " ".join(found),
         "idealisations": list(survey.idealisations),
+        "water": metrics["water"] | finite_tree(dict(survey.water)),
         "require": judge_requirements(survey.require, metrics),
     }
 
@@ -170,7 +172,7 @@ def empty_metrics() -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         **dict.fromkeys(_IDENTITY),
-        **{"warnings": [], "warning": "", "idealisations": []},
+        **{"warnings": [], "warning": "", "idealisations": [], "water": {"visibility_m": None, "secchi_m": None}},
         **finite_tree(_sections(survey, truth)),
         "timing": _timing({"stages": Stopwatch().summary()}, 0, 0),
         "require": {},

@@ -92,7 +92,8 @@ def headline(metrics: Mapping[str, Any] | None, scenario: Mapping[str, Any]) -> 
     verb = "was" if metrics["status"] == "aborted" else "is"
     if metrics.get("replay"):
         return f"The replay {verb} {metrics['status']}. {results(metrics)}"
-    return f"The survey {verb} {metrics['status']}. It was flown {conditions(scenario)}. {results(metrics)}"
+    flown = conditions(scenario, metrics.get("water", {}).get("visibility_m"))
+    return f"The survey {verb} {metrics['status']}. It was flown {flown}. {results(metrics)}"
 
 
 def results(metrics: Mapping[str, Any]) -> str:
@@ -110,8 +111,8 @@ def key_figures(metrics: Mapping[str, Any]) -> list[KeyFigure]:
     return [figure for figure in figures if figure.value != DASH] if metrics.get("replay") else figures
 
 
-def conditions(scenario: Mapping[str, Any]) -> str:
-    """Returns the conditions of a survey as text: altitude, water type with the source of its table, and turbidity."""
+def conditions(scenario: Mapping[str, Any], visibility_m: float | None = None) -> str:
+    """Returns the conditions of a survey as text: altitude, rig, water type with source of its table, clarity."""
     water, plan = scenario.get("water", {}), scenario.get("plan", {})
     jerlov, turbidity = water.get("jerlov", "clear"), water.get("turbidity", 1.0)
     custom = water.get("absorption_per_m") or water.get("spectrum_file")
@@ -120,8 +121,11 @@ def conditions(scenario: Mapping[str, Any]) -> str:
     if jerlov == "clear" and not custom:
         kind, turbidity = "clear water", 1.0
     scattering = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
+    seen = f" (visibility {visibility_m:.2g} m)" if visibility_m else ""
+    rig = scenario.get("rig", {}).get("title")
+    cameras = f' with the rig "{rig}"' if rig else ""
     below = "smoothed floor" if plan.get("height") == "floor" else "reference plane"
-    return f"{plan.get('altitude_m', 0):g} m above the {below} in {kind}{scattering}"
+    return f"{plan.get('altitude_m', 0):g} m above the {below}{cameras} in {kind}{scattering}{seen}"
 
 
 def closed_form_comparison(links: Mapping[str, Any]) -> str:

@@ -383,6 +383,10 @@ class WaterConfig(Section):
     """Jerlov water type of the source, or clear (no attenuation, no scattering)"""
     turbidity: float = Field(default=1.0, ge=0, le=100)
     """multiplies the scattering coefficient"""
+    visibility_m: float | None = Field(default=None, gt=0, le=200)
+    """horizontal visibility of a black object in daylight; sets the scattering, instead of turbidity [m]"""
+    visibility_constant: float = Field(default=4.8, ge=2, le=8)
+    """visibility times the beam attenuation coefficient c in green (Zaneveld & Pegau 2003, Opt. Express 11, 2997)"""
     absorption_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = None
     """absorption coefficient for R, G, B; replaces the Jerlov type; needs scattering_per_m [1/m]"""
     scattering_per_m: tuple[PerMetre, PerMetre, PerMetre] | None = None
@@ -403,6 +407,8 @@ class WaterConfig(Section):
     def label(self) -> str:
         own = "own values" if self.absorption_per_m else Path(self.spectrum_file).name if self.spectrum_file else ""
         name = f"Jerlov {self.jerlov} ({WATER_SOURCES[self.source].citation})" if self.is_jerlov_type else self.jerlov
+        if self.visibility_m is not None:
+            return f"{own or name}, visibility {self.visibility_m:g} m"
         return f"{own or name}, turbidity {self.turbidity:g}"
 
     @property

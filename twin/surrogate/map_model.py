@@ -17,6 +17,7 @@ from scipy.ndimage import map_coordinates, maximum_filter, uniform_filter
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.height_field import HeightField, cast_pixels
+from twin.core.quality import CalibrationEstimate
 from twin.core.records import MapGrid, StereoRig
 from twin.estimate.mapping import surface
 from twin.estimate.mapping.surface import HeightPatch
@@ -81,6 +82,7 @@ class MapModel:
         self.relief = floor_relief(height_m, grid.cell_m, rig, matchability.medium_depth_m)
         self._may_be_hidden = _may_be_hidden(height_m, grid.cell_m).ravel()
         self._information = 1 / np.square(matchability.dependence.bounds)
+        self._baseline_m = rig.baseline_m  # that of self-calibration
         self._lowest_m = float(np.nanmin(height_m))
         self.conditions = CellConditions(*np.zeros((len(CellConditions._fields), height_m.size)))
         self.n_heights = np.zeros(height_m.size, np.int64)
@@ -100,6 +102,11 @@ class MapModel:
         relief, scatter, edge = (window_noise(shape, cells, rng) for _ in range(3))
         level = float(np.exp(model.survey_scatter * rng.standard_normal()))
         return MapNoise(lateral, relief, heavy_tailed(edge), scatter, dropout, level)
+
+    def calibrate(self, found: CalibrationEstimate) -> None:
+        """Corrects the heights of the next map for errors of the calibration that were found."""
+        self._view = self._view.without_yaw(found.yaw_rad)
+        self._baseline_m = self._rig.baseline_m * (1 + found.baseline_error)
 
     def mark_seen(self, world_from_camera: Array) -> None:
         """Marks the cells that both cameras see from the true pose (4, 4) of a keyframe."""
@@ -230,7 +237,7 @@ class MapModel:
     def _mapped(self, true: Array, estimated: Array, points: Array) -> Array:
         """Returns the estimated positions (n, 3) of world points (n, 3) seen from a true pose."""
         measured = self._view.measure(self._normalised(true, points))
-        depth_m = self._rig.baseline_m / measured[:, 2:]
+        depth_m = self._baseline_m / measured[:, 2:]
         return geometry.transform(estimated, np.column_stack([measured[:, :2], np.ones(len(points))]) * depth_m)
 
     def _normalised(self, true: Array, points: Array) -> Array:

@@ -42,17 +42,23 @@ class ViewTable(NamedTuple):
     values: Array
     first: Array  #: (3,) true disparity, y and x of the first grid point
     step: Array  #: (3,) spacing of the grid
+    yaw_rad: float = 0.0  #: yaw of the right camera for which the measured positions are corrected (`self_calibration`)
 
 
 class MeasuredView(NamedTuple):
     """Measured positions and row differences of true points after the estimators have removed rectification errors."""
 
     table: ViewTable
-    removed: Array  #: (4,) pitch, yaw (always 0), roll [rad] and row offset (normalised) that the estimators remove
+    #: (4,) pitch, yaw (0; see `ViewTable.yaw_rad`), roll [rad] and row offset (normalised) that the estimators remove
+    removed: Array
 
     @property
     def is_ideal(self) -> bool:
-        return not self.table.values.size
+        return not self.table.values.size and not self.table.yaw_rad
+
+    def without_yaw(self, yaw_rad: float) -> MeasuredView:
+        """Returns the view after a correction for a yaw of the right camera [rad]."""
+        return self._replace(table=self.table._replace(yaw_rad=yaw_rad))
 
     def measure(self, points: Array) -> Array:
         """Returns the measured positions (n, 3) of true points (n, 3); NaN for points that are not imaged."""
@@ -171,9 +177,17 @@ def _flow(points: Array, baseline_m: float, image_of) -> Array:
 @kernel
 def measure_point(table, x, y, disparity):
     """Returns the measured x, y, disparity and row difference of a true point; the table is extrapolated linearly."""
+    m0, m1, m2, m3 = x, y, disparity, 0.0
+    if table.values.size:
+        m0, m1, m2, m3 = _interpolated(table, x, y, disparity)
+    right = m0 - m2  # column in the right image; see `observation_equations.change_by_yaw`
+    turned = table.yaw_rad * right * m1
+    return m0, m1 + turned / 2, m2 - table.yaw_rad * (1 + right * right), m3 + turned
+
+
+@kernel(inline="always")
+def _interpolated(table, x, y, disparity):
     values = table.values
-    if values.size == 0:
-        return x, y, disparity, 0.0
     n, rows, cols, _ = values.shape
     c, a = _interval((disparity - table.first[0]) / table.step[0], n)
     r, b = _interval((y - table.first[1]) / table.step[1], rows)
@@ -219,6 +233,12 @@ class MeasuredRows:
         self._view, self._rig, self._patch_px, self._rng = view, rig, patch_px, rng
         self._calibration = EpipolarCalibration()
         self._calibration.removed = view.removed
+
+    def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> MeasuredView:
+        """Corrects for a yaw of the right camera as `EpipolarCalibration`; returns the view from now on."""
+        self._calibration.correct_yaw(yaw_rad, sigma_rad, self._rig)
+        self._view = self._view.without_yaw(float(self._calibration.removed[1]))
+        return self._view
 
     def are_matched(self, points: Array) -> NDArray[np.bool_]:
         """Returns the mask (n,) of the true points (n, 3) whose measured positions satisfy the epipolar constraint."""

@@ -7,6 +7,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.estimate.vision import observation_equations
+from twin.estimate.vision.observation_equations import change_by_yaw
 from twin.estimate.vision.two_view_motion import CUTOFF, HUBER
 from twin.kernels import kernel
 from twin.surrogate.measured_view import measure_point
@@ -54,8 +55,8 @@ def sample_link(
             independent matches that a point represents, divided by that of a single match.
 
     Returns:
-        Number of points that both keyframes see; motion earlier_from_later (4, 4) and its reported covariance (6, 6),
-        valid only if at least `MIN_POINTS` points are seen.
+        Number of points that both keyframes see; motion earlier_from_later (4, 4), its reported covariance (6, 6), and
+        the yaw of the right camera as `_yaw` gives it. The latter are valid only if at least `MIN_POINTS` are seen.
     """
     focal, cx, cy, width, height, margin, baseline, table = camera
     earlier_from_later, bias = geometry.inverse(earlier_pose) @ later_pose, normals[-1] * common_sigma
@@ -92,10 +93,10 @@ def sample_link(
     observations = observation_equations.linearise(measured, b, earlier_from_later, baseline)
     normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, weight)
     if n < MIN_POINTS:
-        return n, earlier_from_later, normal
+        return n, earlier_from_later, normal, np.zeros(8)
     inverse = np.linalg.inv(normal)
     motion = earlier_from_later @ geometry.exp(inverse @ right)
-    for _ in range(_MORE_ITERATIONS if table.values.size else 0):
+    for _ in range(_MORE_ITERATIONS if table.values.size or table.yaw_rad else 0):
         observations = observation_equations.linearise(measured, b, motion, baseline)
         weight = _robust_weights(observations.normalised_residual, noise_share)
         normal, right, bias_jacobian = observation_equations.motion_normal_equations(observations, weight)
@@ -104,7 +105,29 @@ def sample_link(
         inverse = np.linalg.inv(normal)
         motion = motion @ geometry.exp(inverse @ right)
     common = inverse @ bias_jacobian * common_sigma
-    return n, motion, inverse + common @ common.T
+    yaw = _yaw(observations, weight, inverse, right, change_by_yaw(a), change_by_yaw(b))
+    return n, motion, inverse + common @ common.T, yaw
+
+
+@kernel
+def _yaw(observations, weight, inverse, right, change_a, change_b):
+    """Returns the yaw of the right camera, its standard deviation and its effect (6,) on the motion, as one (8,).
+
+    See `two_view_motion.YawEffect`; the standard deviation is infinite if the yaw is not observable.
+    """
+    coupling, information, score = np.zeros(6), 0.0, 0.0
+    for k in range(len(weight)):
+        derivative = change_a[k] - observations.jacobian_point[k] @ change_b[k]
+        weighted = weight[k] * (observations.information[k] @ derivative)
+        coupling += observations.jacobian_motion[k].T @ weighted
+        information += np.sum(weighted * derivative)
+        score += np.sum(weighted * observations.residual[k])
+    by_motion, found = inverse @ coupling, np.zeros(8)
+    remaining = information - np.sum(coupling * by_motion)
+    found[1], found[2:] = np.inf, -by_motion
+    if remaining > 1e-9 * information:
+        found[0], found[1] = (score - np.sum(by_motion * right)) / remaining, remaining**-0.5
+    return found
 
 
 @kernel
@@ -143,7 +166,7 @@ def measured_motion(points, earlier_pose, later_pose, camera, cov):
 
     It is the true motion if all points are measured at their true positions, or if too few of them are in both views.
     """
-    if not camera[-1].values.size:
+    if not camera[-1].values.size and camera[-1].yaw_rad == 0:
         return geometry.inverse(earlier_pose) @ later_pose
     noise, cells, normals = np.zeros(points.shape), np.zeros((1, 1, 3)), np.zeros((len(points) + 1, 3))
     return sample_link(

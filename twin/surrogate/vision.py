@@ -20,11 +20,12 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.height_field import cast_pixels, height_field
-from twin.core.quality import EpipolarError
+from twin.core.quality import EpipolarError, YawEffect
 from twin.core.records import ElevationMap, Frame, Image, MapGrid, StereoObservation, StereoRig, SurveyResult
 from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE, EstimatorSettings, braking_factor
 from twin.core.timing import StageTimer
 from twin.estimate.mapping import elevation
+from twin.estimate.mapping.map_builder import with_calibration_sigma
 from twin.estimate.vision import stereo
 from twin.estimate.vision.f2f import MAX_POINTS as F2F_POINTS
 from twin.estimate.vision.f2f import MIN_MATCHED, NOT_MATCHED, constant_velocity_motion
@@ -107,20 +108,13 @@ class SurrogateVision:
         frame_errors: error distribution of the current frame-to-frame motions; None if there are no points to track.
         n_corners: `corner_count`.
 
-    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`, or if the calibration
-    error is drawn by the seed, as the estimators then calibrate themselves.
+    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
 
     def __init__(self, mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer):
         scenario, terrain = mission.scenario, mission.terrain
-        if mission.rig.yaw_sigma_rad or mission.rig.baseline_sigma:
-            problem = (
-                "the surrogate does not simulate the self-calibration of cameras with an unknown calibration error"
-            )
-            allowed = f"calibration_error.rotation_sigma_deg = 0 and baseline_sigma_mm = 0, or {RENDERED}"
-            raise unmodelled(mission, [(problem, allowed)])
         rng, settings = streams(scenario.seed)["surrogate"], scenario.estimator_settings()
         self.matchability = matchability = _matchability(mission)
         self.view = view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
@@ -133,14 +127,14 @@ class SurrogateVision:
         margin_px = float(stereo.margin_px(settings.patch_px))
         self._camera = (
             rig.focal_px, rig.cx_px, rig.cy_px, float(rig.width_px), float(rig.height_px), margin_px, rig.baseline_m,
-            view.table,
         )  # fmt: skip
         self.n_corners = corner_count(rig, settings)
         self._pixels = _raster(rig, margin_px)
         middle = rig.baseline_m / float(np.median(matchability.depths_m))
         self._rays = view.true_directions(rig.normalised(self._pixels), middle)  # of the true points
         self._true_pixels = self._rays * rig.focal_px + [rig.cx_px, rig.cy_px]
-        self._rows = None if view.is_ideal else MeasuredRows(view, rig, settings.patch_px, rng)
+        exact = view.is_ideal and not rig.yaw_sigma_rad
+        self._rows = None if exact else MeasuredRows(view, rig, settings.patch_px, rng)
         self.last_pose: Array | None = None
         self.last_normals = np.zeros(6)
         self._tracking_cov: Array | None = None
@@ -269,10 +263,10 @@ class SurrogateVision:
         view = self._mosaic.view(self.latest.cells)
         if view is None:
             return None
-        points, pose = self.latest.points, self.latest.pose
+        points, pose, camera = self.latest.points, self.latest.pose, (*self._camera, self.view.table)
         cov = self._unit_cov * self.model.match_sigma_px(self.latest.bound_px, 0.0) ** 2
         measured = np.array([
-            sampling.measured_motion(points, self._poses[number], pose, self._camera, cov)
+            sampling.measured_motion(points, self._poses[number], pose, camera, cov)
             for number in view.numbers
         ])  # fmt: skip
         mean = sampling.mosaic_correction(view.estimated, measured, view.fractions, world_from_camera)
@@ -298,7 +292,8 @@ class SurrogateVision:
         return None if self._rows is None else self._rows.report()
 
     def correct_yaw(self, yaw_rad: float, sigma_rad: float) -> None:
-        """Does nothing: surveys with an unknown yaw are refused."""
+        if self._rows is not None:
+            self.view = self._rows.correct_yaw(yaw_rad, sigma_rad)
 
     def discard(self, numbers: range) -> None:
         for number in numbers:
@@ -307,12 +302,19 @@ class SurrogateVision:
     def sample_links(self, node: Keyframe, others: Sequence[Keyframe], model: ErrorModel) -> list[Motion | None]:
         with self.stopwatch("network"):
             later = self._keyframes.get(node.number, self.latest)
-            return [self._sample_link(later, self._keyframes[k.number], node.number, k.number, model) for k in others]
+            return [
+                self._sample_link(later, self._keyframes[k.number], node.number, k.number, model, node.yaw_rad)
+                for k in others
+            ]
 
     def _sample_link(
-        self, later: KeyframeTruth, earlier: KeyframeTruth, number: int, other: int, model: ErrorModel
-    ) -> Motion | None:
-        """Samples the motion between two keyframes; None if too few points or too small a fraction are matched."""
+        self, later: KeyframeTruth, earlier: KeyframeTruth, number: int, other: int, model: ErrorModel,
+        yaw_rad: float = 0.0,
+    ) -> Motion | None:  # fmt: skip
+        """Samples the motion between two keyframes; None if too few points or too small a fraction are matched.
+
+        The images are corrected for a yaw of the right camera by `yaw_rad`.
+        """
         n, parallax_px = len(later.points), later.parallax_px(earlier.pose)
         bound_px = max(later.bound_px, earlier.bound_px)
         stereo_sigma_px = model.match_sigma_px(bound_px, max(later.stereo_parallax_px, earlier.stereo_parallax_px))
@@ -321,9 +323,10 @@ class SurrogateVision:
         inflation = overlap_inflation(n_matches, self.rig, self.settings.patch_px)
         noise_scale, single = np.sqrt(n / n_matches * inflation), n / n_matches
         sigma_px, lamp_factor = stereo_sigma_px * noise_scale, model.lamp_factor(self.matchability.lamp_share)
-        in_view, motion, cov = sampling.sample_link(
+        in_view, motion, cov, yaw = sampling.sample_link(
             later.points, later.noise.reshape(-1, 3)[later.raster_indices], earlier.noise, self._relief_noise,
-            self._link_normals(number, other, n + 1), earlier.pose, later.pose, self._camera,
+            self._link_normals(number, other, n + 1), earlier.pose, later.pose,
+            (*self._camera, self.view.without_yaw(yaw_rad).table),
             self._unit_cov * (sigma_px * later.noise_ratio) ** 2, self._unit_root * (sigma_px * lamp_factor),
             model.match_bias_fraction,
             model.relief_gain * lamp_factor * later.unevenness_px / self.rig.focal_px * noise_scale,
@@ -335,7 +338,10 @@ class SurrogateVision:
         # relief increases the variance of the difference of a match's two image positions, 2 sigma^2 without it
         growth = 1 + (model.relief_gain * parallax_px) ** 2 / (2 * stereo_sigma_px**2)
         residual = np.sqrt(1 + _RESIDUAL_GROWTH * (growth - 1) / (growth + 1))
-        return Motion(motion, cov * growth, n_matched, float(residual))
+        found = Motion(motion, cov * growth, n_matched, float(residual))
+        if not np.isfinite(yaw[1]):
+            return found
+        return found._replace(yaw=YawEffect(yaw_rad + yaw[0], yaw[1] * growth**0.5, yaw[2:], yaw_rad))
 
     def _link_normals(self, number: int, other: int, n: int) -> Array:
         """Returns standard normal numbers (n, 3) of a link, which depend on seed and keyframe numbers only."""
@@ -351,6 +357,8 @@ class SurrogateVision:
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
         mapper, map_model, rng = elevation.ElevationMapper(grid), self.map_model, self._rng
+        calibration = result.quality.calibration
+        map_model.calibrate(calibration)
         noise = map_model.new_noise(self.model, rng)
         estimated = result.final.world_from_camera[result.keyframe_rows]
         true = [self._pose_at[row] for row in result.keyframe_rows.tolist()]
@@ -362,7 +370,7 @@ class SurrogateVision:
             if patch is not None:
                 mapper.fuse(patch)
             progress(k + 1)
-        return mapper.result()
+        return with_calibration_sigma(mapper.result(), estimated, self.rig, calibration)
 
     def draw_normals(self, n: int) -> Array:
         """Returns the next standard normal numbers (n, 6), which are generated in blocks."""

@@ -82,10 +82,10 @@ def build_map(
         progress(k + 1)
     if old is not None and old.patch is not None:
         mapper.fuse(old.patch)
-    return _with_calibration_sigma(mapper.result(), poses, rig, calibration)
+    return with_calibration_sigma(mapper.result(), poses, rig, calibration)
 
 
-def _with_calibration_sigma(
+def with_calibration_sigma(
     found: ElevationMap, poses: Array, rig: StereoRig, calibration: CalibrationEstimate
 ) -> ElevationMap:
     """Returns the map with the uncertainty of the calibration in its standard deviations.

@@ -41,14 +41,18 @@ class LinearisedObservations(NamedTuple):
     normalised_residual: Array  #: (n,) Mahalanobis distance of the residual, divided by sqrt(3)
 
 
+@kernel
 def change_by_yaw(points: Array) -> Array:
     """Returns the change (n, 3) of normalised (x, y, disparity) of a stereo pair per yaw of the right camera [rad].
 
     At the normalised column x of the right image, the column changes by -(1 + x^2) and the row by -x y (Hartley &
     Zisserman 2004, section 6.1); the constraint of equal rows takes the mean of both rows.
     """
-    x = points[:, 0] - points[:, 2]
-    return np.column_stack([np.zeros(len(points)), -x * points[:, 1] / 2, 1 + x**2])
+    change = np.zeros((len(points), 3))
+    for i in range(len(points)):
+        x = points[i, 0] - points[i, 2]
+        change[i, 1], change[i, 2] = -x * points[i, 1] / 2, 1 + x * x
+    return change
 
 
 @kernel

@@ -12,7 +12,7 @@ from twin.core.records import Array, Exposure, Image, Radiance, StereoRig
 from twin.core.threads import in_row_bands
 from twin.imaging.camera.photons import electrons_per_cd, vignetting
 from twin.imaging.camera.pixels import Raw, read_out
-from twin.imaging.camera.sensor import AutoExposure, ExposureSetting, PlainSensor
+from twin.imaging.camera.sensor import METERED, AutoExposure, ExposureSetting, PlainSensor, highlight
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.camera.tone import linear_of, tone
 from twin.imaging.camera.white_balance import WhiteBalance
@@ -53,8 +53,9 @@ class PhotoSensor:
         """Returns this frame's exposure, and meters `light` (H, W, 3); the first frame is metered on itself."""
         mean = _weighted_mean(light, self._vignetting)
         white = self._white.factors(mean, self._exposure.share)
-        brightest = float((mean * (white / self._white.of_white_light)).max())
-        return self._setting(self._exposure.gain_for(brightest), white)
+        relative = white / self._white.of_white_light
+        highlights = highlight(light[METERED] * self._vignetting[METERED][..., None] * relative)
+        return self._setting(self._exposure.gain_for(float((mean * relative).max()), highlights), white)
 
     def _setting(self, gain: float, white: Array) -> ExposureSetting:
         product_s = gain / self._signal_per_s

@@ -17,13 +17,16 @@ from twin.scenario.model import ImagingConfig, Scenario
 EXPOSURE_LAG_S = 0.5  # time constant of the auto-exposure
 
 DARK_CD_M2 = 1e-6  # lower limit of the metered radiance
+_HIGHLIGHTS = 0.002  # fraction of the pixel values that may saturate in a metered image
+METERED = np.s_[::4, ::4]  # pixels on which highlights are metered
 
 
 class AutoExposure:
     """Auto-exposure: adjusts the gain, with a lag, so that the mean of the brightest band reaches `gray_level`.
 
-    The mean of all bands would let the least absorbed one saturate. `lag_s` is a time constant, 0 = no lag; `limits`
-    are those of the gain [1 / (cd/m2)]; `share` is the fraction by which log gain approaches its target per frame.
+    The mean of all bands would let the least absorbed one saturate. The gain is lower if more than 0.2 % of the pixel
+    values would saturate. `lag_s` is a time constant, 0 = no lag; `limits` are those of the gain [1 / (cd/m2)];
+    `share` is the fraction by which log gain approaches its target per frame.
     """
 
     def __init__(
@@ -40,16 +43,22 @@ class AutoExposure:
 
     def gain(self, radiance: Radiance) -> float:
         """Returns the gain of this frame [1 / (cd/m2)], and meters `radiance` (H, W, 3) as in `gain_for`."""
-        return self.gain_for(float(_mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1)).max()))
+        mean = _mean(np.ascontiguousarray(radiance).reshape(len(radiance), -1))
+        return self.gain_for(float(mean.max()), highlight(radiance[METERED]))
 
-    def gain_for(self, brightest: float) -> float:
-        """Returns the gain of this frame, given the mean radiance of its brightest band, which affects later frames."""
+    def gain_for(self, brightest: float, highlight: float) -> float:
+        """Returns the gain of this frame and meters its mean radiance, of the brightest band, and its `highlight`."""
         least, most = self._limits
-        wanted = min(max(self._gray_level / max(brightest, DARK_CD_M2), least), most)
-        metered = float(np.log(wanted))
+        wanted = min(self._gray_level / max(brightest, DARK_CD_M2), 1 / max(highlight, DARK_CD_M2))
+        metered = float(np.log(min(max(wanted, least), most)))
         log_gain = metered if self._log_gain is None else self._log_gain
         self._log_gain = log_gain + self.share * (metered - log_gain)
         return float(np.exp(log_gain))
+
+
+def highlight(values: Array | Radiance) -> float:
+    """Returns the level that 0.2 % of the values of metered pixels exceed."""
+    return float(np.quantile(values, 1 - _HIGHLIGHTS))
 
 
 class ExposureSetting(NamedTuple):

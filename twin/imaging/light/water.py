@@ -16,6 +16,8 @@ from twin.imaging.light.spectra import CENTRE_NM, NM, Light, band_weights, effec
 from twin.scenario.model import ScatteringModel, WaterConfig
 
 MAX_SPECTRUM_BYTES = 10_000_000
+_GREEN = 1  # band in which visibility and Secchi depth are given
+_SECCHI = 8.0  # Preisendorfer (1986, Limnol. Oceanogr. 31, 909)
 
 
 class Medium(NamedTuple):
@@ -50,13 +52,14 @@ class Medium(NamedTuple):
 def medium(
     water: WaterConfig, scattering: ScatteringModel = "full", *, path_m: float = 0.0, light: Light = "led"
 ) -> Medium:
-    """Returns the optical properties of a scenario's water, with the scattering multiplied by `turbidity`.
+    """Returns the optical properties of a scenario's water, scattering as its turbidity or visibility states.
 
     `path_m` is the path of the light for the effective absorption; 0: mean absorption of the band. Raises TwinError
-    where absorption or scattering is missing or given twice, or there is no valid spectrum of water or light.
+    where absorption or scattering is missing or given twice, there is no valid spectrum of water or light, or the water
+    cannot have the visibility.
     """
     absorption, per_m = _coefficients(water, path_m, light)
-    per_m = per_m * (water.turbidity if scattering != "none" else 0.0)
+    per_m = per_m * (_turbidity(water) if scattering != "none" else 0.0)
     return Medium(absorption, per_m, scatterers(water, per_m), scattering == "full")
 
 
@@ -72,6 +75,42 @@ def scatterers(water: WaterConfig, scattering_per_m: Array) -> tuple[Scatterer, 
         "henyey_greenstein": (water.mean_cosine,),
     }[water.phase_function]
     return (Scatterer(water.phase_function, 0.0, parameters),) * 3
+
+
+def _turbidity(water: WaterConfig) -> float:
+    """Returns the factor on the scattering of a water with which it has its `visibility_m`, if that is given."""
+    if water.visibility_m is None:
+        return water.turbidity
+    if water.turbidity != 1:
+        problem = f"{water.visibility_m:g}, and water.turbidity is {water.turbidity:g}: the scattering is given twice"
+        raise TwinError("water.visibility_m", problem, "one of them")
+    absorption, scattering = (float(per_m[_GREEN]) for per_m in _coefficients(water, 0.0, "daylight"))
+    per_m = water.visibility_constant / water.visibility_m - absorption
+    if scattering == 0:
+        raise TwinError("water.visibility_m", f"{water.visibility_m:g} m of a water that does not scatter", "no value")
+    if per_m < 0:
+        problem = f"{water.visibility_m:g} m, but absorption alone leaves less"
+        raise TwinError("water.visibility_m", problem, f"at most {water.visibility_constant / absorption:.3g} m")
+    return per_m / scattering
+
+
+class Clarity(NamedTuple):
+    """What a diver sees in daylight, by the coefficients in green."""
+
+    visibility_m: float  #: horizontal visibility of a black object [m], `visibility_constant` / c
+    secchi_m: float  #: depth at which a white disk disappears [m], 8 / (c + Kd) (Preisendorfer 1986)
+
+    def __str__(self) -> str:
+        return f"visibility {self.visibility_m:.2g} m, Secchi depth {self.secchi_m:.2g} m"
+
+
+def clarity(water: WaterConfig) -> Clarity:
+    """Returns the visibility and the Secchi depth of a water, infinite without attenuation; TwinError as `medium`."""
+    found = medium(water, light="daylight")
+    c, kd = float(found.attenuation_per_m[_GREEN]), float(downwelling_per_m(found)[_GREEN])
+    if c == 0:
+        return Clarity(np.inf, np.inf)
+    return Clarity(water.visibility_constant / c, _SECCHI / (c + kd))
 
 
 def _coefficients(water: WaterConfig, path_m: float, light: Light) -> tuple[Array, Array]:
