@@ -140,7 +140,7 @@ MUTANTS = [
         ("twin/planning/expected_error.py", "float(np.mean(2 * ndtr(x / sigma) - 1)) - share", "float(np.mean(ndtr(x / sigma))) - share", "app_plan"),
         ("twin/reproduce/tank_sizes.py", "share = np.sqrt(3) / 2 if item.shape == \"dome\"", "share = 0.5 if item.shape == \"dome\"", "reproduce_tank"),
         # self-calibration, rigs, interrupts
-        ("twin/estimate/vision/observation_equations.py", "-x * points[:, 1] / 2, 1 + x**2", "x * points[:, 1] / 2, 1 + x**2", "estimate_self_calibration"),
+        ("twin/estimate/vision/observation_equations.py", "-x * points[i, 1] / 2, 1 + x * x", "x * points[i, 1] / 2, 1 + x * x", "estimate_self_calibration"),
         ("twin/estimate/vision/two_view_motion.py", "variance**0.5, -by_unknowns[:6]", "variance**0.5, by_unknowns[:6]", "estimate_self_calibration"),
         ("twin/estimate/self_calibration.py", 'np.einsum("nji,nj->ni", rotation, moved)', 'np.einsum("nij,nj->ni", rotation, moved)', "estimate_self_calibration"),
         ("twin/estimate/adjustment/pose_graph.py", "derivatives, shared - at)", "derivatives, shared + 0 * at)", "estimate_self_calibration"),

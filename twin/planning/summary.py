@@ -10,7 +10,6 @@ from typing import Any
 from twin.controllers.forecast import Forecast, forecast
 from twin.core.geometry import Array
 from twin.imaging.light.spectra import provenance_of
-from twin.imaging.light.water import clarity
 from twin.judge.summary_statistics import finite_tree
 from twin.judge.verdict import judge_requirements
 from twin.planning.cost import ComputingCost, computing_cost
@@ -177,7 +176,7 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ("on the reference plane: footprint", f"{length(width_m)} across, {length(height_m)} along"),
         ("on the reference plane: overlap", f"{percent(f.overlap_along)} along, {percent(f.overlap_across)} across"),
         ("on the reference plane: disparity", f"{f.disparity_px:.1f} px"),
-        ("water", f"{provenance_of(mission.scenario.water)}; {clarity(mission.scenario.water)}"),
+        ("water", f"{provenance_of(mission.scenario.water)}; {mission.clarity}"),
         *([("objects", objects)] if mission.objects else []),
         ("coverage of the area by both cameras", percent(summary.floor.coverage)),
         (
@@ -232,7 +231,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "name": mission.scenario.name,
             "objects": len(mission.objects),
             "water": provenance_of(mission.scenario.water),
-            "clarity": clarity(mission.scenario.water)._asdict(),
+            "clarity": mission.clarity._asdict(),
             "plan": plane | {"duration_s": plane["duration_s"] + summary.hold_s, "n_frames": mission.n_frames},
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,

@@ -11,7 +11,6 @@ import numpy as np
 from twin.core.ortho_tiles import mean_colours, window
 from twin.core.quality import ActionTimes, Finding
 from twin.core.records import ElevationMap, SurveyResult, Truth
-from twin.imaging.light.water import clarity
 from twin.judge.metrics import EvaluationInput
 from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.plugin.navigator import NOTE
@@ -75,7 +74,7 @@ class FlownSurvey:
             require=scenario.require,
             warnings=warnings,
             idealisations=idealisations(scenario),
-            water=clarity(scenario.water)._asdict(),
+            water=mission.clarity._asdict(),
             actions=actions,
         )
 

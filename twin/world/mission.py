@@ -19,6 +19,7 @@ from twin.errors import ScenarioError, TwinError
 from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
 from twin.imaging.light.illumination import Illumination, illumination_of
 from twin.imaging.light.lamps import light_sources_in_camera
+from twin.imaging.light.water import Clarity, clarity
 from twin.imaging.scene.object_view import Objects
 from twin.judge.metrics import check_require
 from twin.plugin.guard import check_loadable
@@ -88,6 +89,10 @@ class Mission:
     illumination: Illumination
     objects: tuple[PlacedObject, ...] = ()
     mesh_floor: MeshFloor | None = None  #: the sea floor if it is a mesh, else None
+
+    @property
+    def clarity(self) -> Clarity:
+        return clarity(self.scenario.water)
 
     @property
     def rendered_terrain(self) -> terrains.Terrain:
