@@ -20,6 +20,7 @@ from twin.planning.summary import run_time_s
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies import agreement, rendered_check, report, sentences
+from twin.studies.conditions import in_sea_trial
 from twin.studies.progress import study_progress
 from twin.studies.rendered_check import RenderedCheck
 from twin.studies.run_time import duration, parsed_duration
@@ -142,6 +143,7 @@ def tune(file: str, options: StudyOptions, as_json: bool = False) -> int:
 
 def load(file: str, options: StudyOptions) -> Study:
     study = load_study(file, options.allow_plugins)
+    study = in_sea_trial(study) if study.sea_trial else study
     changes = {"imaging.extrapolate": True} if options.extrapolate else {}
     return study.model_copy(update={"set": study.set | changes})
 

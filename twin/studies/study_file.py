@@ -108,6 +108,9 @@ class Study(Section):
     compare: tuple[str, ...] = ()
     """metrics, never negative, whose values in rendered and surrogate surveys are compared; needs
     vary.imaging.fidelity = { grid = ["rendered", "surrogate"] }"""
+    sea_trial: bool | None = None
+    """also in the conditions of scenes/sea_trial.toml (calibration errors, current, marine snow, shadows of the lamps)
+    that neither the study nor its scenario sets; default: in the rendered surveys of `twin tune` only"""
     set: dict[str, Any] = {}
     """keys of the scenario that have a fixed value in this study"""
     vary: dict[str, Distribution] = {}
@@ -169,7 +172,7 @@ def load_study(path: str | Path, allow_plugins: bool = False) -> Study:
     source = Source(path=file, lines=lines, allow_plugins=allow_plugins)
     for node, section in ((tree, "vary"), (tree, "set"), (tree.get("tune"), "search")):
         if isinstance(node, dict) and isinstance(node.get(section), dict):
-            node[section] = dict(_flat_keys(node[section]))
+            node[section] = dict(flat_keys(node[section]))
     study = validated(tree, Study, source)
     study._source = source
     if study.name is None:
@@ -194,11 +197,11 @@ def _find_study(path: str | Path) -> Path:
     raise ScenarioError([f"{shown(str(path))}: no such study (allowed: a file, or one of {names})"])
 
 
-def _flat_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def flat_keys(tree: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     """Yields (dotted key, value) for the entries of nested tables; a table that defines a distribution is one value."""
     for key, value in tree.items():
         if isinstance(value, dict) and value and not value.keys() & set(KINDS):
-            yield from _flat_keys(value, f"{prefix}{key}.")
+            yield from flat_keys(value, f"{prefix}{key}.")
         else:
             yield prefix + key, value
 
@@ -236,7 +239,7 @@ def _sampling_rules(study: Study) -> Iterator[Rule]:
     for key, law in study.vary.items():
         problem = f"{law.kind} has no list of values"
         yield is_grid and law.kind not in ("grid", "choice"), f"vary.{key}", problem, "grid or choice"
-    useless = not is_grid and not is_sampled and n not in (None, 1)
+    useless = not is_grid and not is_sampled and not study.sea_trial and n not in (None, 1)
     yield useless, field, "no key is sampled, so all samples are equal", "sampling.seeds"
     yield is_sampled and n is None, field, "missing", "a number of samples"
     m = n or 1

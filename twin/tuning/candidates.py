@@ -19,6 +19,7 @@ from twin.judge.verdict import meets_limit, more_is_better
 from twin.scenario.file import read_tree
 from twin.scenario.model import Scenario
 from twin.studies.analysis import count_similar
+from twin.studies.conditions import in_sea_trial
 from twin.studies.flight import Row, failure_reason, has_passed, refused_row
 from twin.studies.results_log import key_of
 from twin.studies.statistics import Proportion, trials_to_show, wilson_interval
@@ -118,9 +119,11 @@ def most_rendered(study: Study) -> int:
 def rendered_of(study: Study) -> Study:
     """Returns the study of the rendered surveys of a plan: random samples of `most_rendered`, each with its own seed.
 
-    The first ones stay the same if there are more. Without a number of samples in the study, each cell of the grids has
-    as many seeds instead.
+    They are flown in the conditions of the sea trial, unless `sea_trial` is set. The first ones stay the same if there
+    are more. Without a number of samples in the study, each cell of the grids has as many seeds instead.
     """
+    if study.sea_trial is None:
+        study = in_sea_trial(study)
     sampling, config = study.sampling, tuning_config(study)
     update: dict[str, Any] = {"seed": sampling.seed + _RENDER_SEEDS, "paired": False, "seeds": 1}
     update["seeds" if sampling.samples is None else "samples"] = max(most_rendered(study), 1)  # with 0, none is flown

@@ -20,6 +20,7 @@ from twin.report.plotting import log_axis, to_data_uri
 from twin.report.style import COLOURS, FIGURE_STYLE
 from twin.scenario.file import dump_toml
 from twin.studies import sentences
+from twin.studies.conditions import condition_lines
 from twin.studies.report import json_tree
 from twin.studies.sentences import metric_name, metric_value
 from twin.studies.study_figures import axis_label, make_panels, metric_axis, value_axis
@@ -51,6 +52,7 @@ def write_tuning_report(result: TuningResult, folder: Path) -> None:
         "front": front,
         "sentences": sentences,
         "headline": headline(result),
+        "conditions": condition_lines(result.study),
         "warnings": warnings(result),
         "figures": figures,
         "compared": compared,
