@@ -84,6 +84,9 @@ def test_a_path_far_over_floor_without_a_height_is_refused(tmp_path, height):
     file = write(tmp_path / "half.npy", lambda x, y: x > 0.01)
     with pytest.raises(ScenarioError, match=r"plan.area_m: the path leads over floor without a height, up to 1.\d+ m"):
         mission(file, "plan.centre_m=[1.0, 0.0]", f"plan.height={height}")
+    with pytest.raises(ScenarioError) as caught:  # no overlap in images without floor
+        mission(file, "plan.centre_m=[1.3, 0.0]", "plan.area_m=[2.4, 2.4]", f"plan.height={height}", "plan.tracks=0")
+    assert len(caught.value.lines) == 1 and "the path leads over floor without a height" in caught.value.lines[0]
     mission(file, "plan.centre_m=[-1.0, 0.0]", f"plan.height={height}")
 
 
@@ -144,8 +147,10 @@ def test_the_share_of_nodata_is_that_of_rasterio_in_plan_truth_picture_and_notes
     drawn = []
     monkeypatch.setattr("matplotlib.axes.Axes.imshow", lambda self, shown, **style: drawn.append((shown, style)))
     draw(summary, tmp_path / "plan.png")
-    shown = {style["cmap"].colors[0]: np.isfinite(mask).mean() for mask, style in drawn if style["cmap"] != "gray"}
-    assert shown[COLOURS["hole"]] == pytest.approx(floor.unknown_share, abs=0.01) and shown[COLOURS["filled"]] > 0
+    shown = {style["cmap"].colors[0]: np.isfinite(mask) for mask, style in drawn if style["cmap"] != "gray"}
+    hole = shown[COLOURS["hole"]]
+    assert hole.mean() == pytest.approx(floor.unknown_share, abs=0.01) and shown[COLOURS["filled"]].any()
+    assert (hole[0, 0], hole[-1, -1]) == (False, share > 0.1)  # north-west and south-east
 
 
 def test_an_area_without_any_cell_of_floor_is_refused(tmp_path):

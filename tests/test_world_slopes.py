@@ -4,14 +4,15 @@ import numpy as np
 import pytest
 
 from twin.core.height_field import image_overlap
-from twin.core.records import StereoRig
+from twin.core.records import StereoRig, Trajectory
 from twin.errors import ScenarioError
 from twin.judge.swaths import image_pairs
 from twin.scenario.file import load_scenario
+from twin.survey import run
 from twin.terrains import Terrain
 from twin.world.floor_forecast import forecast_over_floor
 from twin.world.mission import Mission, prepare
-from twin.world.path_checks import climb_slope
+from twin.world.path_checks import climb_slope, highest_near
 from twin.world.planning import floor_of, planned_keyframes
 
 FOLLOW = ["plan.height=floor", "plan.altitude_m=1.8"]
@@ -120,6 +121,20 @@ def test_over_a_level_floor_the_legs_are_equally_spaced(monkeypatch):
     assert plan.request.leg_spacing == () and plan.least_spacing_m == plan.swath_spacing_m
 
 
+def test_the_highest_floor_near_a_point_is_that_in_a_circle():
+    rng = np.random.default_rng(0)
+    terrain = floor(lambda x, y: rng.random(x.shape))
+    nodes = np.stack(np.meshgrid(*[np.arange(-120, 121) * 0.05] * 2), axis=-1)
+    for point in rng.uniform(-5, 5, (200, 2)):
+        distance = np.linalg.norm(nodes - point, axis=-1)
+        found = highest_near(terrain, *point[:, None], 0.4)[0]
+        assert terrain.height_m[distance < 0.8 * 0.4 - 0.05].max() <= found
+        assert found <= terrain.height_m[distance < 0.4 + 0.1].max()
+    coarse = Terrain(0.5 * np.arange(9, dtype=np.float32) * np.ones((9, 1), np.float32), 2.0, -8.0, -8.0,
+                     np.zeros((2, 2, 3), np.uint8), 8.0)  # fmt: skip
+    assert highest_near(coarse, np.zeros(1), np.zeros(1), 0.7)[0] == pytest.approx(2.0 + 0.25 * 0.7)
+
+
 @pytest.mark.parametrize("direction_deg", [20.0, 130.0])
 def test_contours_are_perpendicular_to_the_slope_of_the_floor_that_has_heights(direction_deg, monkeypatch):
     east, north = np.cos(np.deg2rad(direction_deg)), np.sin(np.deg2rad(direction_deg))
@@ -149,3 +164,28 @@ def test_a_level_path_below_a_slope_is_refused_with_the_key_that_helps(monkeypat
     message = r"plan.altitude_m: 1.8: the cameras lie below the floor at .*at least .* of clearance, or plan.height"
     with pytest.raises(ScenarioError, match=message):
         over(floor(lambda x, y: 0.25 * x), monkeypatch, "plan.altitude_m=1.8")
+
+
+FLOORS = {
+    "slope": lambda x, y: 0.25 * x,
+    "ridge": lambda x, y: -0.4 * np.abs(x),
+    "wall": lambda x, y: np.clip(WALL * y, -2.0, 2.0),
+}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", FLOORS)
+def test_slopes_ridges_and_walls_are_flown_as_planned(name, tmp_path):
+    x, y = np.meshgrid(np.arange(-80, 81) * 0.05, np.arange(80, -81, -1) * 0.05)
+    np.save(tmp_path / "floor.npy", FLOORS[name](x, y) + 0.02 * np.sin(9 * x) * np.sin(11 * y))
+    values = ["terrain.kind=file", f"terrain.height_file={tmp_path}/floor.npy", "terrain.height_spacing_m=0.05",
+              "imaging.fidelity=surrogate", "plan.along_contours=true", "plan.area_m=[1.4, 1.0]", "plan.tracks=1",
+              "plan.overlap_across=0.55", "plan.overlap_along=0.8"]  # fmt: skip
+    scenario = load_scenario("reef", [*values, *FOLLOW])
+    metrics = run(scenario, tmp_path / "run", outputs=()).metrics
+    assert metrics["status"] == "complete" and metrics["map"]["completeness_area"] > 0.95
+    path = Trajectory.load(tmp_path / "run" / "trajectory_truth.tum").positions
+    planned = altitudes(prepare(scenario))
+    flown = path[:, 2] - prepare(scenario).terrain.height_at(*path[:, :2].T)
+    assert planned.min() - 0.05 < flown.min() and flown.max() < planned.max() + 0.05
+    assert metrics["control"]["altitude_rmse_m"] < 0.02

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,20 +107,38 @@ def unknown_share(plan: SurveyPlan, terrain: Terrain) -> float:
     return float(terrain.in_hole(x, y)[asked].mean()) if asked.any() else 0.0
 
 
+class HolePart(NamedTuple):
+    """Part of a path over a hole of the floor that is farthest from a height."""
+
+    away_m: float
+    x_m: float
+    y_m: float
+    limit_m: float  # greatest distance at which an image still shows floor with heights
+
+    @property
+    def too_far(self) -> bool:
+        return self.away_m > self.limit_m
+
+
+def hole_part(plan: SurveyPlan, terrain: Terrain) -> HolePart:
+    """Returns the part of a path, inside the extent of the terrain, that is farthest from floor with a height."""
+    x, y, _ = plan.all_references().position.T
+    known = np.ones_like(terrain.height_m, np.bool_) if terrain.known is None else terrain.known
+    away_m = np.asarray(distance_transform_edt(~known))[_nodes(terrain, x, y)] * terrain.spacing_m
+    k = int(away_m.argmax())
+    return HolePart(float(away_m[k]), float(x[k]), float(y[k]), min(plan.request.footprint_m) / 2)
+
+
 def _check_over_heights(field: str, terrain: Terrain, plan: SurveyPlan) -> None:
     """Raises TwinError if the path is farther from the next height than an image shows, or the area has no floor."""
     if terrain.known is None:
         return
     allowed = "another plan.centre_m, plan.area_m or plan.polygon"
-    x, y, _ = plan.all_references().position.T
-    away_m = np.asarray(distance_transform_edt(~terrain.known)) * terrain.spacing_m
-    away_m = away_m[_nodes(terrain, x, y)]
-    k, limit_m = int(away_m.argmax()), min(plan.request.footprint_m) / 2
-    if away_m[k] > limit_m:
+    if (part := hole_part(plan, terrain)).too_far:
         raise TwinError(
-            field, f"the path leads over floor without a height, up to {away_m[k]:.2f} m from the next height"
-            f" (at x {x[k]:.1f}, y {y[k]:.1f})",
-            f"a path within {limit_m:.2f} m of heights: {allowed}",
+            field, f"the path leads over floor without a height, up to {part.away_m:.2f} m from the next height"
+            f" (at x {part.x_m:.1f}, y {part.y_m:.1f})",
+            f"a path within {part.limit_m:.2f} m of heights: {allowed}",
         )  # fmt: skip
     if unknown_share(plan, terrain) == 1:
         share = f"{100 * terrain.unknown_share:.3g} % of the floor has none"

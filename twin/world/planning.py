@@ -20,7 +20,7 @@ from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, is_turning
 from twin.scenario.model import Scenario
 from twin.terrains import Terrain
 from twin.world.asked_area import survey_area
-from twin.world.path_checks import climb_slope
+from twin.world.path_checks import climb_slope, hole_part
 
 #: Percentage of pairs with less overlap than required; with 0, a single step or boulder would set the spacing.
 SHORT_PERCENT = 5.0
@@ -46,8 +46,8 @@ _PATTERNS = {"lawnmower": lawnmower.plan, "loops": loops.plan}
 def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """Returns the plan of a survey, with height and spacing adapted to the floor if the scenario requests it.
 
-    They are not adapted without a terrain or if the path leaves it, nor the spacing if the path meets the floor. Raises
-    TwinError if no plan satisfies the scenario, or it exceeds the limits of `check_plan_size`.
+    They are not adapted without a terrain or if the path leaves it or leads over its holes, nor the spacing if the path
+    meets the floor. Raises TwinError if no plan satisfies the scenario, or it exceeds the limits of `check_plan_size`.
     """
     request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
     plan = _PATTERNS[pattern](request)
@@ -102,7 +102,8 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
 
 
 def _lies_over(plan: SurveyPlan, terrain: Terrain) -> bool:
-    return bool(np.isfinite(terrain.height_at(*plan.outline()[:, :2].T)).all())
+    inside = bool(np.isfinite(terrain.height_at(*plan.outline()[:, :2].T)).all())
+    return inside and (terrain.known is None or not hole_part(plan, terrain).too_far)
 
 
 def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
