@@ -11,8 +11,9 @@ from scipy import ndimage
 from twin.terrains.file_header import height_error
 
 _NODATA = (-9999.0, 9999.0, -99999.0, 99999.0, -32768.0, -32767.0, 32767.0, 65535.0)
-#: Holes are small if they are enclosed, and no node in them is farther from a height than this many grid spacings.
-_SMALL = 2.0
+#: Holes are small if they are enclosed, and no node in them is farther than this many grid spacings from a height. So
+#: are gaps between scattered heights: what a morphological closing fills, by a square that reaches so many spacings.
+_SMALL = 2
 #: A value marks holes if it is farther from all heights than this, and than their range times `_MOST_RANGES`.
 _LEAST_GAP, _MOST_RANGES = 100.0, 10.0
 
@@ -50,5 +51,5 @@ def known_nodes(given: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     holes, distance = np.asarray(labelled, np.int64), np.asarray(ndimage.distance_transform_edt(~given))
     small = np.append(False, np.asarray(ndimage.maximum(distance, holes, np.arange(1, n + 1))) <= _SMALL)
     small[np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])] = False  # open at the border
-    known = given | small[holes]
+    known = given | small[holes] | ndimage.binary_closing(given, np.ones((2 * _SMALL + 1,) * 2))
     return None if known.all() else known
