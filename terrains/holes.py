@@ -51,5 +51,6 @@ def known_nodes(given: NDArray[np.bool_]) -> NDArray[np.bool_] | None:
     holes, distance = np.asarray(labelled, np.int64), np.asarray(ndimage.distance_transform_edt(~given))
     small = np.append(False, np.asarray(ndimage.maximum(distance, holes, np.arange(1, n + 1))) <= _SMALL)
     small[np.concatenate([holes[0], holes[-1], holes[:, 0], holes[:, -1]])] = False  # open at the border
-    known = given | small[holes] | ndimage.binary_closing(given, np.ones((2 * _SMALL + 1,) * 2))
+    closed = np.asarray(ndimage.binary_closing(given, np.ones((2 * _SMALL + 1,) * 2)), np.bool_)
+    known = given | small[holes] | closed
     return None if known.all() else known

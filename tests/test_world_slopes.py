@@ -125,9 +125,9 @@ def test_the_highest_floor_near_a_point_is_that_in_a_circle():
     rng = np.random.default_rng(0)
     terrain = floor(lambda x, y: rng.random(x.shape))
     nodes = np.stack(np.meshgrid(*[np.arange(-120, 121) * 0.05] * 2), axis=-1)
-    for point in rng.uniform(-5, 5, (200, 2)):
-        distance = np.linalg.norm(nodes - point, axis=-1)
-        found = highest_near(terrain, *point[:, None], 0.4)[0]
+    x, y = rng.uniform(-5, 5, (2, 200))
+    for east, north, found in zip(x, y, highest_near(terrain, x, y, 0.4), strict=True):
+        distance = np.hypot(nodes[..., 0] - east, nodes[..., 1] - north)
         assert terrain.height_m[distance < 0.8 * 0.4 - 0.05].max() <= found
         assert found <= terrain.height_m[distance < 0.4 + 0.1].max()
     coarse = Terrain(0.5 * np.arange(9, dtype=np.float32) * np.ones((9, 1), np.float32), 2.0, -8.0, -8.0,
