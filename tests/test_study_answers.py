@@ -103,13 +103,12 @@ def test_a_range_of_unknown_results_is_neither_said_to_pass_nor_to_fail():
 
 
 def test_nothing_is_claimed_where_the_direction_depends_on_the_unknown_results():
-    """The pass fraction falls to 70 %; with the unknown results as passes it would seem to rise."""
+    """Passes, then 55 %, then unknown: with these as passes, the fraction seems to rise from a small value."""
     rng = np.random.default_rng(0)
-    x = np.linspace(0.0, 1.0, 240)
-    passed = rng.random(240) < np.where(x < 0.2, 0.95, 0.7)
-    found = with_unknown(passed & (x < 0.75), x >= 0.75, x=x, required=0.8)
-    assert {a.verdict for a in found if a.low < 0.2} <= {"passes", "undecided"}
-    assert not of_verdict(found, "passes") or found[0].high <= 0.2
+    x = np.arange(240.0)
+    passed = (x < 10) | (rng.random(240) < 0.55)
+    found = with_unknown(passed & (x < 180), x >= 180, x=x, required=0.8)
+    assert not [a for a in of_verdict(found, "fails") if a.low < 10]
 
 
 def test_one_survey_decides_nothing_and_states_how_many_would():

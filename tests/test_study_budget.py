@@ -32,6 +32,7 @@ def test_another_text_is_refused_with_what_is_allowed(text):
         parsed_duration(text, "--budget")
 
 
+@pytest.mark.long
 def test_a_budget_that_is_too_small_for_one_survey_is_refused_before_any_flight(tmp_path):
     study_of(tmp_path, STUDY)
     for command in (study_command.fly_study, study_command.fly_search):
@@ -48,8 +49,10 @@ def test_a_budget_that_is_too_small_for_one_survey_is_refused_before_any_flight(
 def test_the_surveys_of_a_budget_represent_all_samples_and_resume_flies_the_others(tmp_path, monkeypatch):
     """A grid in its own order would fly the clear water only."""
     changes = (
-        ("{ log_uniform = [1.0, 40.0] }", "{ grid = [1.0, 2.0, 4.0, 8.0, 16.0] }"), ("samples = 12", "samples = 20"),
-    )  # fmt: skip
+        ("{ log_uniform = [1.0, 40.0] }", "{ grid = [1.0, 2.0, 4.0, 8.0, 16.0] }"),
+        ("{ uniform = [1.6, 2.4] }", "{ grid = [1.6, 1.8, 2.0, 2.2] }"),
+        ('"lhs"\nsamples = 12', '"grid"'),
+    )
     study, clock = study_of(tmp_path, STUDY, *changes), [0.0]
     monkeypatch.setattr("time.time", lambda: clock[0])
 
@@ -58,14 +61,14 @@ def test_the_surveys_of_a_budget_represent_all_samples_and_resume_flies_the_othe
         return fly(survey)
 
     first = SerialEngine()
-    result = runner.run_study(study, tmp_path / "out", False, runner.Fleet(first, StudyProgress(), ticking, 40.0))
+    result = runner.run_study(study, tmp_path / "out", False, runner.Fleet(first, StudyProgress(), ticking, 20.0))
     values = result.analysis.numbers("vary.water.turbidity")
-    assert len(values) == len(first.flown) == 40 and not result.interrupted
-    assert min(np.unique(values, return_counts=True)[1]) >= 3  # of 20 each
-    assert "60 surveys not flown yet; --resume continues it" in sentences.headline(result.analysis)
+    assert len(values) == len(first.flown) == 20 and not result.interrupted
+    assert len(np.unique(values)) == 5  # of 8 surveys each
+    assert "20 surveys not flown yet; --resume continues it" in sentences.headline(result.analysis)
     rest = SerialEngine()
     runner.run_study(study, tmp_path / "out", True, runner.Fleet(rest, StudyProgress(), fly))
-    assert len(rest.flown) == 60 and not set(first.flown) & set(rest.flown)
+    assert len(rest.flown) == 20 and not set(first.flown) & set(rest.flown)
 
 
 def refusing(survey):
@@ -136,7 +139,7 @@ def test_progress_states_the_time_left_at_the_present_pace(monkeypatch):
     shown.add(row())
     assert shown.state().endswith("about 1.5 h left")
     shown.end_s = time.time() + 60
-    assert shown.state().endswith(" s left")
+    assert ", at most " in shown.state() and shown.state().endswith(" s left")
 
 
 def test_without_a_terminal_progress_is_printed_regularly(monkeypatch, capsys):

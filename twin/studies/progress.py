@@ -57,27 +57,24 @@ class StudyProgress:
             self.print_line(line if self.bar else f"{self.done}/{self.total} {line}; {self}")
         self._update_bar()
 
-    def time_left_s(self) -> float:
-        """Returns the expected time until the planned surveys are done or stopped [s]; infinite if not known."""
+    def time_left(self) -> str:
+        """Returns the expected time until the planned surveys are done, or the one after which they are stopped."""
         begin_s, done_before = self._begin
-        n_done = self.done - done_before
+        n_done, n_left = self.done - done_before, self.total - self.done
         pace_s = (time.monotonic() - begin_s) / n_done if n_done else math.inf
-        n_left = self.total - self.done
-        return max(0.0, min(pace_s * n_left if n_left else 0.0, self.end_s - time.time()))
+        expected_s, most_s = (pace_s * n_left if n_left else 0.0), max(0.0, self.end_s - time.time())
+        if math.isinf(expected_s) and math.isinf(most_s):
+            return "time left not known yet"
+        return f"{'about' if expected_s < most_s else 'at most'} {duration(min(expected_s, most_s))} left"
 
     def state(self) -> str:
         """Returns the number of surveys done, the results so far and the time left as one line."""
-        left_s = self.time_left_s()
-        left = f"about {duration(left_s)} left" if math.isfinite(left_s) else "time left not known yet"
-        return ", ".join(filter(None, (f"{self.done} of {self.total} surveys", str(self), left)))
+        return ", ".join(filter(None, (f"{self.done} of {self.total} surveys", str(self), self.time_left())))
 
     def _update_bar(self) -> None:
         if self.bar:
-            self.bar.update(self._task, total=self.total, completed=self.done, note=self._note())
-
-    def _note(self) -> str:
-        left_s = self.time_left_s()
-        return ", ".join(filter(None, (f"{duration(left_s)} left" if math.isfinite(left_s) else "", str(self))))
+            note = ", ".join(filter(None, (self.time_left(), str(self))))
+            self.bar.update(self._task, total=self.total, completed=self.done, note=note)
 
     def __str__(self) -> str:
         failures = ", ".join(f"{n} {status}" for status in ("failed", "refused") if (n := self.ended[status]))
