@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -87,6 +87,7 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         side_along_m=request.footprint_m[1],
         side_across_m=request.footprint_m[0],
         least_spacing_m=min(s.spacing_m for s in strips),
+        legs_after_gaps=tuple(2 * n for n in accumulate(counts[:-1])),
         covered_to_m=math.inf if n_tracks == sum(counts) else strips[2 * n_tracks - 1].high_m,
     )
 

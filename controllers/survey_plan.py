@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -71,6 +71,7 @@ class SurveyPlan:
     side_along_m: float
     side_across_m: float
     least_spacing_m: float  # least distance between neighbouring swaths
+    legs_after_gaps: tuple[int, ...] = ()  # numbers of legs, from 0, between which and the one before no area lies
     covered_to_m: float = math.inf  # greatest v of the part of the area that the planned legs have to cover
 
     def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
@@ -88,6 +89,11 @@ class SurveyPlan:
             return inside
         _, across = self.area.to_legs(x_m, y_m)
         return inside & (across <= self.covered_to_m + _EDGE_M)
+
+    @property
+    def swath_notes(self) -> dict[str, Any]:
+        """Returns what tells legs from other parts of the path, and neighbours from legs beside a gap of the area."""
+        return {"cross_track": self.cross_track, "legs_after_gaps": self.legs_after_gaps}
 
     @property
     def n_leg_tracks(self) -> int:

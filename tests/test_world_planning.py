@@ -1,8 +1,7 @@
 """Plans over the true floor: spacing, height, forecast, clearance and thrust."""
 
 import dataclasses
-from types import SimpleNamespace
-from typing import Any
+import json
 
 import numpy as np
 import pytest
@@ -10,9 +9,10 @@ import pytest
 from twin import terrains
 from twin.controllers.camera_surface import surface_above_floor
 from twin.controllers.survey_area import SurveyArea
+from twin.core.georeference import Georeference
 from twin.core.records import SurveyResult, Trajectory, Truth
 from twin.errors import ScenarioError, TwinError
-from twin.judge.swaths import overlap_metrics, swath_numbers
+from twin.judge.swaths import image_pairs, overlap_metrics, swath_numbers
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.terrains import Terrain, TextureSource
@@ -219,10 +219,23 @@ def test_cross_lines_belong_to_no_swath_and_change_no_overlap(monkeypatch):
     assert (swath[-n_cross:] == -1).all() and n_cross > 20
     position = plan.all_references().position
     track = np.repeat(np.arange(last) + 1, [len(plan.frames_of_track(k + 1)[0]) for k in range(last)])
-    truth: Any = SimpleNamespace(reference=position, track=track, reference_yaw=None)
-    assert swath_numbers(truth, "lawnmower", plan.cross_track).max() + 1 == 2 * without.plan.n_tracks
-    assert (swath_numbers(truth, "lawnmower", plan.cross_track)[track == last] == -1).all()
-    assert swath_numbers(truth, "lawnmower").max() + 1 > 2 * without.plan.n_tracks
+    numbers = swath_numbers(position, None, track, plan.swath_notes)
+    assert numbers.max() + 1 == 2 * without.plan.n_tracks and (numbers[track == last] == -1).all()
+    assert swath_numbers(position, None, track, {}).max() + 1 > 2 * without.plan.n_tracks
+
+
+def test_legs_beside_a_gap_of_the_area_are_no_neighbours(tmp_path, monkeypatch):
+    """The two parts have the spacing of one alone, and the sidelap of all pairs is the closed form."""
+    part = np.array([[-1.5, -2.6], [1.5, -2.6], [1.5, -1.0], [-1.5, -1.0], [-1.5, -2.6]])
+    rings = [[part.tolist()], [(part * [1, -1])[::-1].tolist()]]
+    (tmp_path / "area.geojson").write_text(json.dumps({"type": "MultiPolygon", "coordinates": rings}))
+    terrain = dataclasses.replace(raised(0.0), georeference=Georeference(0.0, 0.0))
+    two = over(terrain, monkeypatch, f"plan.polygon={tmp_path}/area.geojson").plan
+    one = over(terrain, monkeypatch, f"plan.polygon={part.tolist()}").plan
+    assert two.n_tracks == 2 * one.n_tracks and two.swath_spacing_m == pytest.approx(one.swath_spacing_m)
+    assert two.legs_after_gaps == (2 * one.n_tracks,)
+    pairs = [image_pairs(planned_keyframes(plan, "lawnmower"))[1] for plan in (one, two)]
+    assert len(pairs[1].first) == 2 * len(pairs[0].first) > 0
 
 
 def test_a_kinematic_vehicle_cannot_follow_the_floor():

@@ -43,14 +43,24 @@ def travel_direction(reference: Array) -> Array:
     return step[row] / length[row, None]
 
 
-def swath_numbers(truth: Truth, pattern: str, cross_track: int | None = None) -> NDArray[np.int64]:
-    """Returns the leg, or the track of loops, of each frame (n,), from 0; -1 between legs, on turns and cross lines."""
-    if pattern == "loops":
-        return truth.track - 1
-    off_leg = truth.track == cross_track
-    if truth.reference_yaw is not None:
-        off_leg |= is_turning(truth.reference_yaw)
-    return np.where(off_leg, -1, leg_numbers(truth.reference))
+def swath_numbers(
+    reference: Array, yaw: Array | None, track: NDArray[np.int64], planned: Mapping[str, Any]
+) -> NDArray[np.int64]:
+    """Returns the leg, or the track of loops, of each frame (n,), from 0; -1 between legs, on turns and cross lines.
+
+    Before a leg after a gap in the area, a number is left out: the swaths beside the gap are no neighbours.
+
+    Args:
+        reference, yaw, track: planned positions (n, 3), headings (n,) or None, and numbers (n,) of the tracks, from 1.
+        planned: `pattern`, `cross_track` and `legs_after_gaps` of the plan.
+    """
+    if planned.get("pattern") == "loops":
+        return track - 1
+    off_leg = track == planned.get("cross_track")
+    if yaw is not None:
+        off_leg |= is_turning(yaw)
+    legs = leg_numbers(reference)
+    return np.where(off_leg, -1, legs + np.searchsorted(planned.get("legs_after_gaps", ()), legs, side="right"))
 
 
 def is_turning(yaw: Array) -> NDArray[np.bool_]:
@@ -119,13 +129,13 @@ def overlap_metrics(
 
     Args:
         grid: cells of `truth.height_m`; None: the floor is taken to be level, at the mean height.
-        planned: `pattern` of the plan, number `cross_track` of the track of its cross lines, whether overlaps count
-            `both_ways` (`image_pairs`), requested `overlap_along` and `overlap_across`, and `along_median` and
-            `across_median`, forecast from the planned poses over the floor; 0 to 1.
+        planned: `pattern`, `cross_track` and `legs_after_gaps` of the plan, whether overlaps count `both_ways`
+            (`image_pairs`), requested `overlap_along` and `overlap_across`, and `along_median` and `across_median`,
+            forecast from the planned poses over the floor; 0 to 1.
     """
-    rows, pattern = result.keyframe_rows, planned.get("pattern", "lawnmower")
+    rows = result.keyframe_rows
     travel = travel_direction(truth.reference)[rows]
-    swath = swath_numbers(truth, pattern, planned.get("cross_track"))[rows]
+    swath = swath_numbers(truth.reference, truth.reference_yaw, truth.track, planned)[rows]
     poses = KeyframePoses(truth.trajectory.world_from_camera[rows], travel, swath)
     field, found = _true_floor(truth, grid), {}
     both = image_pairs(poses, planned.get("both_ways", False))

@@ -58,7 +58,7 @@ class FlownSurvey:
         mission, scenario, actions = self.mission, self.mission.scenario, self.actions
         along, across = planned_overlap(mission)
         plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
-        plan |= {"cross_track": mission.plan.cross_track, "both_ways": mission.plan.follows_floor}
+        plan |= {"both_ways": mission.plan.follows_floor} | mission.plan.swath_notes
         warnings = [
             *plugin_notes(scenario), *mission.hole_notes, *self.world_warnings,
             *calibration_notes(result, mission.rig), *result.quality.repeat_notes, *filter(None, [actions.sentence]),

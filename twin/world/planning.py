@@ -16,7 +16,7 @@ from twin.core.geometry import Array
 from twin.core.height_field import HeightField, height_field, image_overlap
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
-from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, is_turning, leg_numbers, travel_direction
+from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, swath_numbers, travel_direction
 from twin.scenario.model import Scenario
 from twin.terrains import Terrain
 from twin.world.asked_area import survey_area
@@ -230,9 +230,8 @@ def planned_keyframes(plan: SurveyPlan, pattern: str) -> KeyframePoses:
     are_keyframes = [plan.frames_of_track(track)[1] for track in range(1, plan.n_tracks + 1)]
     position, _, yaw, _ = plan.all_references()
     keyframe, yaw = np.concatenate(are_keyframes), np.asarray(yaw)
-    track = np.repeat(np.arange(plan.n_tracks), [len(part) for part in are_keyframes])
-    off_leg = is_turning(yaw) | (track + 1 == plan.cross_track)
-    swath = track if pattern == "loops" else np.where(off_leg, -1, leg_numbers(position))
+    track = np.repeat(np.arange(1, plan.n_tracks + 1), [len(part) for part in are_keyframes])
+    swath = swath_numbers(position, yaw, track, {"pattern": pattern} | plan.swath_notes)
     poses = np.tile(np.eye(4), (int(keyframe.sum()), 1, 1))
     poses[:, :3, :3] = geometry.rotations_of_down_camera(yaw[keyframe])
     poses[:, :3, 3] = position[keyframe]
