@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
+from twin.core.height_field import height_field
 from twin.core.records import StereoRig
 from twin.errors import TwinError
 from twin.imaging.light.lamps import LED_BEAM, beam_share
 from twin.imaging.light.phase_function import BandWater, Scatterer, phase_of
+from twin.imaging.reference.floor_crossings import LEVEL
 from twin.imaging.reference.pixel_light import (
     Effort,
     PixelRay,
@@ -51,8 +53,8 @@ def central(pose, pixel=None):
     return PixelRay(pose, RIG, pixel or (RIG.cx_px, RIG.cy_px))
 
 
-def lit(water, albedo=0.5):
-    return ReferenceScene(water, LAMPS, (LED, LED), albedo)
+def lit(water, albedo=0.5, relief=LEVEL, lamps=LAMPS):
+    return ReferenceScene(water, lamps, (LED, LED), albedo, relief)
 
 
 def under_sun(water, mu0, albedo, surface_m):
@@ -192,6 +194,57 @@ def test_both_estimators_agree(phase):
     for one, other in zip(components(fine), components(plain), strict=True):
         limit = 4 * np.hypot(one.standard_error, other.standard_error)
         assert abs(one.value - other.value) < limit < 0.6 * one.value
+
+
+def grid_of(height_of, half_m=20.0, spacing_m=0.1):
+    """Returns the floor with the heights of a function of (x, y), as a grid."""
+    at = np.linspace(-half_m, half_m, round(2 * half_m / spacing_m) + 1)
+    return height_field(height_of(*np.meshgrid(at, at)), spacing_m, -half_m, -half_m)
+
+
+def test_a_level_grid_is_the_level_floor():
+    """The same random numbers, so the same walks, but for rounding."""
+    water, ray = BandWater(0.1, 0.3, henyey_greenstein(0.8)), central(looking_down(2.0), (250.0, 60.0))
+    level, grid = (
+        pixel_light(lit(water, relief=one), ray, Effort(640, 8))
+        for one in (LEVEL, grid_of(lambda x, y: 0 * x, 1000.0, 5.0))
+    )
+    np.testing.assert_allclose(grid.sums, level.sums, rtol=1e-6)
+
+
+def test_a_slope_is_a_level_floor_seen_by_a_turned_camera():
+    """Camera and lamps are turned about the y axis by the angle of the slope, through a point of the floor."""
+    tilt, water = np.deg2rad(35.0), BandWater(0.1, 0.4, henyey_greenstein(0.8))
+    turn = np.array([[np.cos(tilt), 0, -np.sin(tilt)], [0, 1, 0], [np.sin(tilt), 0, np.cos(tilt)]])  # raises the x axis
+    lamps = np.column_stack([LAMPS[:, :3] @ turn.T, LAMPS[:, 3:6] @ turn.T, LAMPS[:, 6]])
+    pose = looking_down(2.0)
+    turned = np.eye(4)
+    turned[:3, :3], turned[:3, 3] = turn @ pose[:3, :3], turn @ pose[:3, 3]
+    slope, effort = grid_of(lambda x, y: np.tan(tilt) * x), Effort(2000, 20)
+    level = pixel_light(lit(water), central(pose, (60.0, 60.0)), effort)
+    found = pixel_light(lit(water, relief=slope, lamps=lamps), central(turned, (60.0, 60.0)), effort)
+    assert found.direct.value == pytest.approx(level.direct.value, rel=1e-4)
+    for one, other in zip(components(found), components(level), strict=True):
+        limit = 4 * np.hypot(one.standard_error, other.standard_error)
+        assert abs(one.value - other.value) < limit < 0.5 * other.value
+
+
+def test_the_shadow_of_a_wall_ends_where_similar_triangles_say_and_scattering_fills_it():
+    """Lamp 2 m high and 1 m before a wall of 0.5 m: without scattering, 0.5 / 1.5 m behind the wall are dark."""
+    wall = grid_of(lambda x, y: np.where(np.abs(x) < 0.005, 0.5, 0.0), 3.0, 0.01)
+    lamp = np.array([[-1.0, 0, 2.0, 0, 0, -1.0, 1000.0]])
+    light = {}
+    for b, x in ((0.0, 0.32), (0.0, 0.345), (0.5, 0.32)):
+        scene = ReferenceScene(BandWater(0.05, b, henyey_greenstein(0.8)), lamp, (EVEN_BEAM,), 0.5, wall)
+        pose = looking_down(2.0)
+        pose[0, 3] = x
+        light[b, x] = pixel_light(scene, central(pose), Effort(2000, 10))
+    assert light[0.0, 0.32].total.value == 0 and light[0.5, 0.32].direct.value == 0
+    d = np.hypot(1.345, 2.0)
+    expected = 0.5 / np.pi * 1000 * 2.0 / d**3 * np.exp(-0.05 * (d + 2.0))
+    assert light[0.0, 0.345].total.value == pytest.approx(expected, rel=1e-5)
+    filling = batch_mean(light[0.5, 0.32].sums[:, LAMP_SCATTERED])
+    assert filling.value > 3 * filling.standard_error > 0
 
 
 def test_the_blur_of_a_pixel_keeps_the_light_and_falls_off_with_distance():

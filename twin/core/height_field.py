@@ -79,14 +79,13 @@ def cast_camera_ray(field, pose, a, b):
 def cast_ray(field, ox, oy, oz, dx, dy, dz):
     """Returns the smallest t >= 0 at which the ray o + t d meets the floor; 0 if o lies below the floor.
 
-    Cell by cell (Amanatides & Woo 1987) between the highest and the lowest node. inf if d does not point downwards, or
-    if the ray starts outside the grid, leaves it or enters a cell without floor first.
+    Cell by cell (Amanatides & Woo 1987) between the highest and the lowest node. inf if the ray starts outside the
+    grid, leaves it or enters a cell without floor first.
     """
-    if not dz < 0:
-        return np.inf
+    dz = dz if dz != 0 else 1e-12
     rows, cols = field.height_m.shape
-    t = max(0.0, (field.highest_m - oz) / dz)
-    t_lowest = (field.lowest_m - oz) / dz + 1e-9
+    t = max(0.0, (field.highest_m - oz) / dz) if dz < 0 else 0.0
+    t_last = ((field.lowest_m if dz < 0 else field.highest_m) - oz) / dz + 1e-9
     col, col_rate = (ox - field.west_m) / field.spacing_m, dx / field.spacing_m
     row, row_rate = (oy - field.south_m) / field.spacing_m, dy / field.spacing_m
     c, r = int(np.floor(col + t * col_rate)), int(np.floor(row + t * row_rate))
@@ -97,11 +96,11 @@ def cast_ray(field, ox, oy, oz, dx, dy, dz):
     while 0 <= c < cols - 1 and 0 <= r < rows - 1:
         t_col = (c + (col_rate > 0) - col) / col_rate if col_rate != 0 else np.inf
         t_row = (r + (row_rate > 0) - row) / row_rate if row_rate != 0 else np.inf
-        end = max(t, min(t_col, t_row, t_lowest))
+        end = max(t, min(t_col, t_row, t_last))
         met = _meet_cell(field.height_m, r, c, col - c, row - r, oz, col_rate, row_rate, dz, t, end)
         if not met > end:  # a hit, or NaN: a corner without height
             return np.inf if np.isnan(met) else met
-        if end >= t_lowest:
+        if end >= t_last:
             return np.inf
         t = end
         if t_col <= t_row:
@@ -121,7 +120,7 @@ def _meet_cell(height, r, c, u0, v0, z0, u_rate, v_rate, z_rate, start, end):
     top = max(max(h00, h01), max(h10, h11))
     if np.isnan(h00 + h01 + h10 + h11):
         return np.nan
-    if z0 + end * z_rate > top:
+    if z0 + (end if z_rate < 0 else start) * z_rate > top:
         return np.inf
     side_rate = u_rate - v_rate  # the diagonal is u = v
     middle = (v0 - u0) / side_rate if side_rate != 0 else end

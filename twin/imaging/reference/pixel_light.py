@@ -10,12 +10,14 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from twin.core.height_field import HeightField
 from twin.core.records import Array, StereoRig
 from twin.errors import TwinError
 from twin.imaging.light.lamp_light import LAMP_RADIUS_M
 from twin.imaging.light.lamps import LightSources, beam_share
 from twin.imaging.light.phase_function import BandWater, PhaseTable, table_of
 from twin.imaging.reference import walk
+from twin.imaging.reference.floor_crossings import LEVEL
 
 BEAM_STEPS = 3600  # steps of 0.025 deg
 BIN_EDGES_PX = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 40.0, 80.0, 160.0)
@@ -40,7 +42,8 @@ class ReferenceScene:
     water: BandWater  # optical properties of the water
     lamps: Array  # (n, 7) position [m], unit beam axis, both in world axes with z up, and intensity [cd]
     beams: Sequence[Array]  # for each lamp, (m, 2) angle from the axis [deg] and relative intensity
-    albedo: float = 0.5  # albedo of the Lambertian floor, the plane z = 0
+    albedo: float = 0.5  # albedo of the Lambertian floor
+    relief: HeightField = LEVEL  # the floor; beyond its grid there is none
     sun: Sunlight = field(default_factory=Sunlight)  # sunlight and light of the sky; by default none, and no surface
     # points within this distance of a lamp neither reflect nor scatter its unscattered light
     lamp_radius_m: float = LAMP_RADIUS_M
@@ -137,6 +140,7 @@ class KernelScene(NamedTuple):
     absorption: float
     scattering: float
     albedo: float
+    relief: HeightField
     phase: PhaseTable
     lamps: Array
     beams: Array
@@ -219,7 +223,7 @@ def _kernel_scene(scene: ReferenceScene, plain: bool) -> KernelScene:
     lit = lamps[:, 6] > 0
     sun = scene.sun
     return KernelScene(
-        float(scene.water.absorption_per_m), float(scene.water.scattering_per_m), float(scene.albedo),
+        float(scene.water.absorption_per_m), float(scene.water.scattering_per_m), float(scene.albedo), scene.relief,
         table_of(scene.water.scatterer),
         np.ascontiguousarray(lamps[lit]), np.ascontiguousarray(beams.reshape(-1, BEAM_STEPS + 1)[lit]),
         float(scene.lamp_radius_m), np.array(sun.to_sun, np.float64), float(sun.normal_lx), float(sun.surface_m),

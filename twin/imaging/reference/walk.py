@@ -13,12 +13,16 @@ Light of a lamp first scattered in the water is sampled by the second connection
 `share_of_walk`; a sun with a disc likewise. The sky is sampled by walks that leave the water. The next direction is
 sampled from a mixture: phase function or Lambert's cosine, lobes around lamps and sun, and the upper hemisphere.
 Absorption reduces the weight; Russian roulette ends weak walks; no contribution is clipped.
+
+The `axis` of a vertex is what its response depends on: the unit normal of the floor, or, in the water, the unit
+direction in which the backward path arrived.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from twin.core.height_field import cast_ray
 from twin.imaging.reference.directions import (
     density_at,
     guide_density,
@@ -28,6 +32,7 @@ from twin.imaging.reference.directions import (
     turn,
     turn_by_cosine,
 )
+from twin.imaging.reference.floor_crossings import LIFT_M, floor_normal, sees
 from twin.kernels import kernel
 
 #: Indices of the sums to which `walk` adds light; the bins of the blurred light start at FIRST_BIN.
@@ -36,8 +41,6 @@ GUIDED_AT_FLOOR, GUIDED_IN_WATER = 0.5, 0.05  # shares of the directions that ar
 UPWARDS = 0.1  # share of the directions that are sampled upwards, for downward walks in water with daylight
 #: Kinds of vertices, and of ends of a path. For `int` arguments, numba would compile a function once for each value.
 ON_FLOOR, IN_WATER, ABOVE, NOWHERE = np.int64(0), np.int64(1), np.int64(2), np.int64(3)
-LIFT_M = 1e-6  # distance by which a path vertex on the floor is moved off the floor
-UP = (0.0, 0.0, 1.0)  # normal of the floor, the plane z = 0
 WEAK, STEPS = 0.002, 10000  # share of the first weight below which Russian roulette starts; most vertices of a walk
 
 
@@ -52,14 +55,12 @@ def beam_at(beam, cosine):
 
 
 @kernel
-def response(scene, kind, direction, ox, oy, oz):
-    """Returns the share of the light from the direction o that a vertex sends back along the path [1/sr].
-
-    `direction` is the unit direction in which the backward path arrived.
-    """
+def response(scene, kind, axis, ox, oy, oz):
+    """Returns the share of the light from the direction o that a vertex sends back along the path [1/sr]."""
+    cosine = axis[0] * ox + axis[1] * oy + axis[2] * oz
     if kind == ON_FLOOR:
-        return scene.albedo / np.pi * max(oz, 0.0)
-    return density_at(scene.phase.density_per_sr, direction[0] * ox + direction[1] * oy + direction[2] * oz)
+        return scene.albedo / np.pi * max(cosine, 0.0)
+    return density_at(scene.phase.density_per_sr, cosine)
 
 
 @kernel(inline="always")
@@ -70,7 +71,7 @@ def towards(lamp, point):
 
 
 @kernel
-def straight(scene, kind, point, direction, before, density, step_m):
+def straight(scene, kind, point, axis, before, density, step_m):
     """Returns the unscattered light of all lamps at a vertex, times the `response` of the vertex [cd/m2].
 
     If the direction from `before` was sampled with a `density` [1/sr] above 0, it is weighted by `share_of_walk`.
@@ -82,19 +83,19 @@ def straight(scene, kind, point, direction, before, density, step_m):
         if d <= scene.lamp_radius_m:
             continue
         light = lamp[6] * beam_at(scene.beams[k], -(x * lamp[3] + y * lamp[4] + z * lamp[5]))
-        light *= response(scene, kind, direction, x, y, z)
-        if light > 0 and point[2] > 0 and lamp[2] > 0:  # the floor does not block the way
+        light *= response(scene, kind, axis, x, y, z)
+        if light > 0 and sees(scene.relief, point, (lamp[0], lamp[1], lamp[2])):
             light *= np.exp(-attenuation * d) / (d * d)
             if density > 0:
                 a, b, c = lamp[0] - before[0], lamp[1] - before[1], lamp[2] - before[2]
-                phase = density_at(scene.phase.density_per_sr, direction[0] * x + direction[1] * y + direction[2] * z)
+                phase = density_at(scene.phase.density_per_sr, axis[0] * x + axis[1] * y + axis[2] * z)
                 light *= share_of_walk(scene, np.sqrt(a * a + b * b + c * c), phase, d, density, step_m)
             total += light
     return total
 
 
 @kernel
-def by_one_scattering(scene, kind, point, direction, guided, rng):
+def by_one_scattering(scene, kind, point, axis, guided, rng):
     """Returns an estimate of lamp light after one scattering, times `response` and 1 - `share_of_walk` [cd/m2]."""
     total, attenuation = 0.0, scene.absorption + scene.scattering
     for k in range(scene.lamps.shape[0]):
@@ -111,7 +112,7 @@ def by_one_scattering(scene, kind, point, direction, guided, rng):
         if from_lamp <= scene.lamp_radius_m:
             continue
         ox, oy, oz = turn(x, y, z, np.cos(alpha), np.sin(alpha), 2 * np.pi * rng.random())
-        own = response(scene, kind, direction, ox, oy, oz)
+        own = response(scene, kind, axis, ox, oy, oz)
         if own <= 0:
             continue
         px, py, pz = point[0] + from_point * ox, point[1] + from_point * oy, point[2] + from_point * oz
@@ -119,17 +120,18 @@ def by_one_scattering(scene, kind, point, direction, guided, rng):
             continue
         bx, by, bz = (px - lamp[0]) / from_lamp, (py - lamp[1]) / from_lamp, (pz - lamp[2]) / from_lamp
         light = own * lamp[6] * beam_at(scene.beams[k], bx * lamp[3] + by * lamp[4] + bz * lamp[5])
-        if light > 0 and min(point[2], pz, lamp[2]) > 0:  # the floor does not block the way
+        between, source = (px, py, pz), (lamp[0], lamp[1], lamp[2])
+        if light > 0 and sees(scene.relief, point, between) and sees(scene.relief, between, source):
             scale = 2 * np.pi * scene.phase.angle_integral * scene.scattering / d
             scale *= np.exp(-attenuation * (from_point + from_lamp))
-            density = direction_density(scene, kind, point, direction, guided, own, ox, oy, oz)
+            density = direction_density(scene, kind, point, axis, guided, own, ox, oy, oz)
             phase = density_at(scene.phase.density_per_sr, np.cos(angle))
             total += scale * light * (1 - share_of_walk(scene, d, phase, from_lamp, density, from_point))
     return total
 
 
 @kernel
-def sunlight(scene, kind, point, direction, guided, rng):
+def sunlight(scene, kind, point, axis, guided, rng):
     """Returns the unscattered sunlight at a vertex, times the `response` of the vertex [cd/m2].
 
     For a vertex in water, a sun with a disc is sampled at a random point of the disc, and its light is weighted by
@@ -141,13 +143,13 @@ def sunlight(scene, kind, point, direction, guided, rng):
     has_disc = kind == IN_WATER and scene.sun_cosine < 1
     if has_disc:
         sx, sy, sz = turn_by_cosine(sx, sy, sz, 1 - rng.random() * (1 - scene.sun_cosine), rng)
-    if sz <= 0:
+    if sz <= 0 or cast_ray(scene.relief, point[0], point[1], point[2], sx, sy, sz) < np.inf:
         return 0.0
     path = (scene.surface_m - point[2]) / sz
-    own = response(scene, kind, direction, sx, sy, sz)
+    own = response(scene, kind, axis, sx, sy, sz)
     light = scene.sun_lx * np.exp(-(scene.absorption + scene.scattering) * path) * own
     if has_disc:
-        density = direction_density(scene, kind, point, direction, guided, own, sx, sy, sz)
+        density = direction_density(scene, kind, point, axis, guided, own, sx, sy, sz)
         light *= 1 - share_of_escape(scene, density, path)
     return light
 
@@ -186,38 +188,38 @@ def axis_of(scene, k, point):
 
 
 @kernel(inline="always")
-def upward_share(scene, kind, direction, guided):
+def upward_share(scene, kind, axis, guided):
     """Returns the share of directions sampled upwards, among those that are not sampled around a lamp or the sun."""
     sunny = scene.sun_lx > 0 or scene.sky.shape[0] > 1
-    return UPWARDS if sunny and kind == IN_WATER and guided > 0 and direction[2] < 0 else 0.0
+    return UPWARDS if sunny and kind == IN_WATER and guided > 0 and axis[2] < 0 else 0.0
 
 
 @kernel
-def next_direction(scene, kind, point, normal, direction, guided, rng):
+def next_direction(scene, kind, point, axis, guided, rng):
     """Returns the next direction of a walk, sampled from the mixture of `direction_density`."""
     n = scene.lamps.shape[0] + (1 if scene.sun_lx > 0 else 0)
     if n > 0 and rng.random() < guided:
         x, y, z = axis_of(scene, min(int(n * rng.random()), n - 1), point)
         x, y, z = turn_by_cosine(x, y, z, sample_guide(scene.phase.cumulative_angle, rng), rng)
     elif kind == ON_FLOOR:
-        x, y, z = turn_by_cosine(normal[0], normal[1], normal[2], np.sqrt(rng.random()), rng)
-    elif rng.random() < upward_share(scene, kind, direction, guided):
+        x, y, z = turn_by_cosine(axis[0], axis[1], axis[2], np.sqrt(rng.random()), rng)
+    elif rng.random() < upward_share(scene, kind, axis, guided):
         x, y, z = turn_by_cosine(0.0, 0.0, 1.0, np.sqrt(rng.random()), rng)
     else:
         cosine = sample_cosine(scene.phase.cumulative, rng)
-        x, y, z = turn_by_cosine(direction[0], direction[1], direction[2], cosine, rng)
+        x, y, z = turn_by_cosine(axis[0], axis[1], axis[2], cosine, rng)
     length = np.sqrt(x * x + y * y + z * z)
     return x / length, y / length, z / length
 
 
 @kernel
-def direction_density(scene, kind, point, direction, guided, own, x, y, z):
+def direction_density(scene, kind, point, axis, guided, own, x, y, z):
     """Returns the density [1/sr] of `next_direction` at the direction (x, y, z), whose response at the vertex is `own`.
 
     `own` is the density of the phase function; divided by the albedo, that of Lambert's cosine.
     """
     own = own / scene.albedo if kind == ON_FLOOR else own
-    upwards = upward_share(scene, kind, direction, guided)
+    upwards = upward_share(scene, kind, axis, guided)
     if upwards > 0:
         own = (1 - upwards) * own + upwards * max(z, 0.0) / np.pi
     n = scene.lamps.shape[0] + (1 if scene.sun_lx > 0 else 0)
@@ -265,9 +267,9 @@ def bin_of(view, bin_edges_px, x, y, z):
 
 
 @kernel
-def flight(scene, point, z, rng):
+def flight(scene, point, x, y, z, rng):
     """Returns kind and distance [m] of the next vertex; ABOVE: the path leaves the water, NOWHERE: it meets nothing."""
-    floor_m = -point[2] / z if z < 0 else np.inf
+    floor_m = cast_ray(scene.relief, point[0], point[1], point[2], x, y, z)
     surface_m = (scene.surface_m - point[2]) / z if z > 0 else np.inf
     step_m = -np.log(1 - rng.random()) / scene.scattering if scene.scattering > 0 else np.inf
     if step_m >= surface_m and surface_m <= floor_m:
@@ -278,15 +280,18 @@ def flight(scene, point, z, rng):
 
 
 @kernel
-def vertex(kind, point, step_m, x, y, z):
-    """Returns the point at a distance in a unit direction, lifted off the floor."""
-    lift_m = LIFT_M if kind == ON_FLOOR else 0.0
-    return point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z + lift_m
+def vertex(scene, kind, point, step_m, x, y, z):
+    """Returns the point at a distance in a unit direction, lifted off the floor, and its `axis`."""
+    px, py, pz = point[0] + step_m * x, point[1] + step_m * y, point[2] + step_m * z
+    if kind != ON_FLOOR:
+        return (px, py, pz), (x, y, z)
+    nx, ny, nz = floor_normal(scene.relief, px, py)
+    return (px + LIFT_M * nx, py + LIFT_M * ny, pz + LIFT_M * nz), (nx, ny, nz)
 
 
 @kernel
-def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
-    """Adds the light of one random walk from `point` to `sums`, arriving in the unit `direction`.
+def walk(scene, view, bin_edges_px, kind, point, axis, weight, rng, sums):
+    """Adds the light of one random walk from `point`, whose response has the `axis`, to `sums`.
 
     `sums` (FIRST_BIN + 2 n,) [cd/m2]: DIRECT, LAMP_SCATTERED, VEIL_ONCE, VEIL_MORE; then n bins of blurred light that
     had reached the floor straight, and n bins of all other.
@@ -298,11 +303,11 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
         first = order == 0
         shared = 0.0 if scene.plain or kind == ON_FLOOR else density  # density is 0 at the first vertex
         guided = 0.0 if scene.plain else (GUIDED_AT_FLOOR if kind == ON_FLOOR else GUIDED_IN_WATER)
-        once = weight * sunlight(scene, kind, point, direction, guided, rng)
-        once += weight * straight(scene, kind, point, direction, before, shared, step_m)
+        once = weight * sunlight(scene, kind, point, axis, guided, rng)
+        once += weight * straight(scene, kind, point, axis, before, shared, step_m)
         more = 0.0
         if not scene.plain and scene.scattering > 0:
-            more = weight * by_one_scattering(scene, kind, point, direction, guided, rng)
+            more = weight * by_one_scattering(scene, kind, point, axis, guided, rng)
         if before_floor:
             to, to_more = VEIL_ONCE if first else VEIL_MORE, VEIL_MORE
         elif unscattered:
@@ -315,20 +320,19 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
         sums[to_more] += more
         if scene.scattering <= 0 and scene.sky.shape[0] < 2:
             return
-        x, y, z = next_direction(scene, kind, point, UP, direction, guided, rng)
-        own = response(scene, kind, direction, x, y, z)
+        x, y, z = next_direction(scene, kind, point, axis, guided, rng)
+        own = response(scene, kind, axis, x, y, z)
         if own <= 0:
             return
-        density = direction_density(scene, kind, point, direction, guided, own, x, y, z)
+        density = direction_density(scene, kind, point, axis, guided, own, x, y, z)
         weight *= own / density
         if weight < WEAK * start:
             survival = weight / (WEAK * start)
             if rng.random() >= survival:
                 return
             weight = WEAK * start
-        direction = (x, y, z)
         from_water = kind == IN_WATER
-        kind, step_m = flight(scene, point, z, rng)
+        kind, step_m = flight(scene, point, x, y, z, rng)
         if kind == ABOVE:
             above = light_above(scene, from_water, density, step_m, x, y, z)
             sums[to] += weight * np.exp(-scene.absorption * step_m) * above
@@ -336,7 +340,7 @@ def walk(scene, view, bin_edges_px, kind, point, direction, weight, rng, sums):
             return
         weight *= np.exp(-scene.absorption * step_m)
         before = point
-        point = vertex(kind, point, step_m, x, y, z)
+        point, axis = vertex(scene, kind, point, step_m, x, y, z)
         if kind == ON_FLOOR:
             if scene.albedo <= 0:
                 return
@@ -359,20 +363,20 @@ def trace_pixel(scene, view, bin_edges_px, n_walks, rng):
     y = (a * view[0, 1] + b * view[1, 1] + f * view[2, 1]) / length
     z = (a * view[0, 2] + b * view[1, 2] + f * view[2, 2]) / length
     ray = (x, y, z)
-    floor_m = -centre[2] / z if z < 0 else np.inf
+    floor_m = cast_ray(scene.relief, centre[0], centre[1], centre[2], x, y, z)
     end_m = min(floor_m, (scene.surface_m - centre[2]) / z if z > 0 else np.inf)
     seen = floor_m < np.inf and floor_m <= end_m and scene.albedo > 0
     share = 1 - np.exp(-scene.scattering * end_m) if scene.scattering > 0 else 0.0
-    arrives, shown = 0.0, centre
+    arrives, shown, normal = 0.0, centre, ray
     if seen:
         arrives = np.exp(-(scene.absorption + scene.scattering) * floor_m)
-        shown = vertex(ON_FLOOR, centre, floor_m, x, y, z)
-        direct = straight(scene, ON_FLOOR, shown, ray, shown, 0.0, 0.0)
-        direct += sunlight(scene, ON_FLOOR, shown, ray, 0.0, rng)
+        shown, normal = vertex(scene, ON_FLOOR, centre, floor_m, x, y, z)
+        direct = straight(scene, ON_FLOOR, shown, normal, shown, 0.0, 0.0)
+        direct += sunlight(scene, ON_FLOOR, shown, normal, 0.0, rng)
         sums[DIRECT] = n_walks * arrives * direct
     for k in range(n_walks):
         if seen and (scene.scattering > 0 or scene.sky.shape[0] > 1):
-            walk(scene, view, bin_edges_px, ON_FLOOR, shown, ray, arrives, rng, sums)
+            walk(scene, view, bin_edges_px, ON_FLOOR, shown, normal, arrives, rng, sums)
         if share > 0:
             at_m = -np.log(1 - share * (k + rng.random()) / n_walks) / scene.scattering
             weight = share * np.exp(-scene.absorption * at_m)
@@ -388,28 +392,28 @@ def trace_plane(scene, point, normal, n_walks, rng):
     sx, sy, sz = scene.to_sun[0], scene.to_sun[1], scene.to_sun[2]
     guided = 0.0 if scene.plain else GUIDED_AT_FLOOR
     facing = normal[0] * sx + normal[1] * sy + normal[2] * sz
-    if scene.sun_lx > 0 and facing > 0 and sz > 0:
+    if scene.sun_lx > 0 and facing > 0 and cast_ray(scene.relief, point[0], point[1], point[2], sx, sy, sz) == np.inf:
         attenuation = scene.absorption + scene.scattering
         out[0] = n_walks * facing * scene.sun_lx * np.exp(-attenuation * (scene.surface_m - point[2]) / sz)
     for _ in range(n_walks):
-        x, y, z = next_direction(scene, ON_FLOOR, point, normal, normal, guided, rng)
+        x, y, z = next_direction(scene, ON_FLOOR, point, normal, guided, rng)
         cosine = normal[0] * x + normal[1] * y + normal[2] * z
         if cosine <= 0:
             continue
         own = cosine / np.pi
         weight = cosine / direction_density(scene, IN_WATER, point, (0.0, 0.0, 1.0), guided, own, x, y, z)
-        kind, step_m = flight(scene, point, z, rng)
+        kind, step_m = flight(scene, point, x, y, z, rng)
         if kind == ABOVE:
             light = light_above(scene, False, 0.0, step_m, x, y, z)
             out[1] += weight * np.exp(-scene.absorption * step_m) * light
         if kind > IN_WATER or (kind == ON_FLOOR and scene.albedo <= 0):
             continue
         weight *= np.exp(-scene.absorption * step_m)
-        next_point = vertex(kind, point, step_m, x, y, z)
+        next_point, axis = vertex(scene, kind, point, step_m, x, y, z)
         if kind == ON_FLOOR:
-            first = straight(scene, ON_FLOOR, next_point, (x, y, z), next_point, 0.0, 0.0)
-            first += sunlight(scene, ON_FLOOR, next_point, (x, y, z), 0.0, rng)
+            first = straight(scene, ON_FLOOR, next_point, axis, next_point, 0.0, 0.0)
+            first += sunlight(scene, ON_FLOOR, next_point, axis, 0.0, rng)
             sums[LAMP_SCATTERED] += weight * first
-        walk(scene, no_view, edges, kind, next_point, (x, y, z), weight, rng, sums)
+        walk(scene, no_view, edges, kind, next_point, axis, weight, rng, sums)
     out[2] = sums.sum()
     return out / n_walks
