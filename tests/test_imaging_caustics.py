@@ -10,10 +10,10 @@ from twin.core import geometry
 from twin.errors import TwinError
 from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light import caustics as caustics_module
-from twin.imaging.light.caustics import CELLS, TILE_DEPTHS, Caustics, scattering_blur
+from twin.imaging.light.caustics import CELLS, TILE_DEPTHS, Caustics, displacement, scattering_blur
 from twin.imaging.light.illumination import Daylight, Illumination, daylight_at, illumination_of
 from twin.imaging.light.phase_function import BandWater, Scatterer, table_of
-from twin.imaging.light.sun_sky import SunSky
+from twin.imaging.light.sun_sky import SunSky, direction_to_sun
 from twin.imaging.light.water import Medium, medium
 from twin.imaging.light.waves import GRAVITY_MPS2, curvature_spectrum, directionality, slope_variance
 from twin.scenario.model import SEA_WATER_INDEX, Scenario, SunConfig, WaterConfig
@@ -55,7 +55,7 @@ def image_formation(here):
     return ImageFormation(here, illumination_of(here), FLAT, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize(("depth_m", "jerlov"), [(1.0, "clear"), (4.0, "IB"), (20.0, "II")])
+@pytest.mark.parametrize(("depth_m", "jerlov"), [(0.3, "clear"), (1.0, "clear"), (4.0, "IB"), (20.0, "II")])
 def test_waves_conserve_light(depth_m, jerlov):
     caustics = caustics_at(depth_m, 1.0, medium(WaterConfig(jerlov=jerlov)), 3)
     for time_s in (0.0, 1.7):
@@ -279,3 +279,33 @@ def test_without_caustics_daylight_is_uniform():
 def test_daylight_without_enough_water_above_is_rejected(sun, message):
     with pytest.raises(TwinError, match=message):
         daylight_at(SunConfig(illuminance_lx=10.0, **sun), CLEAR, 2.2)
+
+
+def landing(to_sun, slope):
+    """Returns where a ray of the sun meets the depth 1 m, east and north of where it meets a surface of this slope."""
+    sun = np.array(to_sun)
+    in_air = np.array([*(SEA_WATER_INDEX * -sun[:2]), 0.0])
+    in_air[2] = -np.sqrt(1 - in_air @ in_air)
+    down = np.array([*slope, -1.0]) / np.sqrt(1 + np.dot(slope, slope))  # normal of the surface into the water
+    along = in_air @ down
+    cosine = np.sqrt(1 - (1 - along**2) / SEA_WATER_INDEX**2)
+    ray = in_air / SEA_WATER_INDEX + (cosine - along / SEA_WATER_INDEX) * down
+    return ray[:2] / -ray[2]
+
+
+@pytest.mark.parametrize(("elevation_deg", "azimuth_deg"), [(90.0, 0.0), (50.0, 30.0), (15.0, 200.0)])
+def test_a_ray_of_a_slanted_sun_is_displaced_as_by_snells_law(elevation_deg, azimuth_deg):
+    to_sun, step = direction_to_sun(elevation_deg, azimuth_deg), 1e-5
+    found = [(landing(to_sun, step * axis) - landing(to_sun, -step * axis)) / (2 * step) for axis in np.eye(2)]
+    np.testing.assert_allclose(displacement(to_sun), np.transpose(found), atol=1e-6)
+
+
+def test_a_low_sun_stretches_its_caustics_along_its_azimuth():
+    """The pattern of the same waves: its variance of slopes towards the sun falls more than across."""
+    steep = {}
+    for elevation_deg in (90.0, 20.0):
+        sun = SunConfig(illuminance_lx=1.0, depth_m=3.0, caustics=1.0, elevation_deg=elevation_deg, azimuth_deg=90.0)
+        light = pattern(Caustics(Illumination(CLEAR, daylight_at(sun, CLEAR, 0.0)), WIND_MPS, 1), 0.0)
+        to_north, to_east = np.gradient(light)
+        steep[elevation_deg] = to_north.std() / to_east.std()
+    assert steep[20.0] < 0.9 * steep[90.0]

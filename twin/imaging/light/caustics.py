@@ -1,9 +1,11 @@
 """Caustics: bright moving lines on the floor where waves on the water surface focus the sunlight.
 
-The surface is a sum of waves with the spectrum of `waves`, periodic in a square tile. A vertical ray that meets the
-surface at a small slope s is deflected by (1 - 1/n) s, n being the refractive index, and displaced by (1 - 1/n) s D at
-the depth D. The pattern is blurred by waves that the cells do not resolve (normally distributed deflections), by the
-disc of the sun, and by scattering (Wells 1973). Waves longer than the tile focus far below the floor and are left out.
+The surface is a sum of waves with the spectrum of `waves`, periodic in a square tile. A ray of the sun that meets the
+surface at a small slope s is displaced at the depth D by q D (s + h (h . s) / w^2), where (h, -w) is its unit direction
+under the level surface and q = 1 - c / (n w), with c the cosine of its zenith angle in air and n the refractive index
+(derivative of Snell's law). For a sun in the zenith it is (1 - 1/n) s D. The pattern is blurred by waves that the cells
+do not resolve (normally distributed deflections), by the disc of the sun, and by scattering (Wells 1973). Waves longer
+than the tile focus far below the floor and are left out.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from twin.scenario.model import SEA_WATER_INDEX
 CELLS = 256  # number of cells per side of the tile, a power of two
 TILE_DEPTHS = 1.5  # side of the tile in units of the depth
 RESOLVED = 0.95  # wave number of the shortest resolved waves, in units of the Nyquist wave number of the cells
+LEAST_CELLS = 0.6  # least standard deviation of the blur in cells, so that light between narrow lines is not negative
 #: Standard deviation of directions within the solar disc along one axis, in water.
 SUN_RAD = 0.00465 / 2 / SEA_WATER_INDEX
 STREAM = 1 << 16  # key of the random stream for the waves
@@ -52,8 +55,9 @@ class Caustics:
         waves *= np.where(kx > 0, 0.5, 1.0) / np.where(k > 0, k, 1.0)
         self._slope = [(along * waves).astype(np.complex64) for along in (kx, ky)]
         self._turns_per_s = angular_frequency(k) / (2 * np.pi)
-        self._cells_per_slope = np.float32((1 - 1 / SEA_WATER_INDEX) * depth_m * self.cells_per_m)
-        blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest))
+        sun = daylight.source.to_sun
+        self._cells_per_slope = (displacement(sun) * depth_m * self.cells_per_m).astype(np.float32)
+        blur = self._blur_of(depth_m, water, slope_variance(wind_mps, shortest), sun)
         self._blur = (_packed(blur) * daylight.focused_share / CELLS**2).astype(np.float32)
         self._diffuse_share = np.float32(1 - daylight.focused_share)
         self._cached: tuple[float, NDArray[np.float32]] | None = None
@@ -93,12 +97,29 @@ class Caustics:
         closed[:, -1] = closed[:, 0]
         return closed
 
-    def _blur_of(self, depth_m: float, water: Medium, unresolved: tuple[float, float]) -> Array:
+    def _blur_of(
+        self, depth_m: float, water: Medium, unresolved: tuple[float, float], to_sun: tuple[float, float, float]
+    ) -> Array:
         """Returns the modulation transfer function (CELLS, CELLS / 2 + 1) of the blur by sun, water and short waves."""
         kx, ky = _wave_numbers(self.tile_m)
-        along, across = (SUN_RAD**2 + (1 - 1 / SEA_WATER_INDEX) ** 2 * variance for variance in unresolved)
-        rough = np.exp(-0.5 * depth_m**2 * (along * kx**2 + across * ky**2))
-        return rough * scattering_blur(np.hypot(kx, ky), depth_m, water.bands[1])
+        by_slope, slant = displacement(to_sun), _slant(to_sun)
+        cov = by_slope @ np.diag(unresolved) @ by_slope.T + SUN_RAD**2 / to_sun[2] ** 2 * slant
+        cov += np.eye(2) * max((LEAST_CELLS * TILE_DEPTHS / CELLS) ** 2 - min(cov[0, 0], cov[1, 1]), 0.0)
+        rough = np.exp(-0.5 * depth_m**2 * (cov[0, 0] * kx**2 + 2 * cov[0, 1] * kx * ky + cov[1, 1] * ky**2))
+        return rough * scattering_blur(np.hypot(kx, ky), depth_m / to_sun[2], water.bands[1])
+
+
+def displacement(to_sun: tuple[float, float, float]) -> Array:
+    """Returns the displacement (2, 2) of a ray east and north, per depth and slope of the surface east and north."""
+    cosine = to_sun[2]
+    in_air = np.sqrt(max(1 - SEA_WATER_INDEX**2 * (1 - cosine**2), 0.0))
+    return (1 - in_air / (SEA_WATER_INDEX * cosine)) * _slant(to_sun)
+
+
+def _slant(to_sun: tuple[float, float, float]) -> Array:
+    """Returns the factors (2, 2) by which a slanted ray crosses a horizontal plane farther than a vertical one."""
+    aside = np.array(to_sun[:2]) / to_sun[2]
+    return np.eye(2) + np.outer(aside, aside)
 
 
 def scattering_blur(k: Array, depth_m: float, water: BandWater) -> Array:
@@ -164,11 +185,13 @@ def _add_waves(east, north, cosine, sine, spectrum):
 
 @kernel(error_model="numpy")
 def _trace_rays(east, north, cells_per_slope, light):
-    """Traces one vertical ray per cell through the surface; adds it to four cells of `light`, bilinearly."""
+    """Traces one ray per cell through the surface; adds it to four cells of `light`, bilinearly."""
     n, one = light.shape[0], np.float32(1.0)
     for i in range(n):
         for j in range(n):
-            col, row = np.float32(j) - cells_per_slope * east[i, j], np.float32(i) - cells_per_slope * north[i, j]
+            a, b = east[i, j], north[i, j]
+            col = np.float32(j) - (cells_per_slope[0, 0] * a + cells_per_slope[0, 1] * b)
+            row = np.float32(i) - (cells_per_slope[1, 0] * a + cells_per_slope[1, 1] * b)
             left, low = np.floor(col), np.floor(row)
             w, h = col - left, row - low
             k, m = int(left) & (n - 1), int(low) & (n - 1)
