@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.special import ndtr
 
 from twin.imaging.light.forward_scatter import ForwardScatter, _add_upsampled, level_sigma_px, place_of
 from twin.imaging.light.illumination import Illumination, daylight_at
@@ -150,6 +151,25 @@ def test_a_ray_that_ends_near_collects_less_scattered_light_than_one_that_ends_f
     # the widest levels take the weights of the mean range within their width, so the near part is up to 30 % too bright
     assert near < light[10] < 1.3 * near and light[150] == pytest.approx(far, rel=0.1)
     assert (np.diff(light[20:140]) > -2e-3).all()
+
+
+def test_light_of_a_near_edge_is_blurred_by_its_own_range():
+    """A white floor at 1 m beside a black one at 4 m: 30 px beyond the edge, the kernel of 1 m cut by a half plane."""
+    water, edge, away = sea(0.0, 0.4), 80, 30
+    blur = ForwardScatter(RIG, water)
+    range_m, floor = np.full(SHAPE, 4.0), np.zeros((*SHAPE, 3), np.float32)
+    range_m[:, :edge], floor[:, :edge] = 1.0, 1.0
+    grid = blur.surroundings
+    left = np.arange(grid.shape[1]) < grid.pad + edge / 2**grid.level
+    place = np.where(left, place_of(np.float64(1.0)), place_of(np.float64(4.0))) * np.ones((grid.shape[0], 1))
+    around = np.repeat(np.where(left, 1.0, 0.0)[None, :, None], grid.shape[0], 0).repeat(3, 2)
+    inner = place.copy()
+    inner[grid.pad : -grid.pad, grid.pad : -grid.pad] = place_of(np.float64(2.0))  # of the plane that fits the image
+    light = blur.spread(floor, range_m, (around.astype(np.float32), inner.astype(np.float32)))[60, edge + away, 1]
+    sigmas = [level_sigma_px(k) for k in range(8)]
+    weights = camera_mixture(water.bands[1], (1.0,), tuple(s / RIG.focal_px for s in sigmas))[0]
+    beyond = [w * ndtr(-away / s) for w, s in zip(weights[1:], sigmas[1:], strict=True)]
+    assert light == pytest.approx(sum(beyond), rel=0.15)
 
 
 def optics(water):

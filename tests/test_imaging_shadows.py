@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,10 +14,15 @@ from twin.core import geometry
 from twin.core.height_field import cast_pixels, height_field
 from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
 from twin.imaging.light import shadows
-from twin.imaging.light.illumination import illumination_of
+from twin.imaging.light.illumination import daylight_at, illumination_of
+from twin.imaging.light.lamp_halos import LampHalos, hidden_share
+from twin.imaging.light.lamps import light_sources_in_camera
+from twin.imaging.light.shading import HIDDEN_STEPS
 from twin.imaging.light.shadows import BLOCK_CELLS, Shadows
+from twin.imaging.light.spread import NODES_M
+from twin.imaging.light.water import medium
 from twin.imaging.scene.renderer import Renderer
-from twin.scenario.model import LampConfig, Scenario
+from twin.scenario.model import LampConfig, Scenario, SunConfig, WaterConfig
 from twin.scenes.builder import FLOOR_GROUP, SceneModel, build
 from twin.scenes.gl import mujoco
 from twin.terrains import TextureSource
@@ -99,7 +105,7 @@ def test_shadows_agree_with_mujoco_rays() -> None:
     assert np.mean(dark) > 0.03, "the test floor has too few shadows"
 
 
-def wall(height_m: float, spacing_m: float = 0.05) -> types.SimpleNamespace:
+def wall(height_m: float, spacing_m: float = 0.05) -> Any:
     """Returns a flat floor, 10 m by 10 m, with a wall along y at x = 0 that falls to the floor within one cell."""
     n = round(10 / spacing_m) + 1
     height = np.zeros((n, n), np.float32)
@@ -127,7 +133,7 @@ def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> Non
         rng.normal(scale=0.2, size=(3 * BLOCK_CELLS + 2, 2 * BLOCK_CELLS + 1)).astype(np.float32), 0.1, -0.8, -1.2,
         np.zeros((2, 2, 3), np.uint8), 1.0,
     )  # fmt: skip
-    tops = shadows._tops(floor.height_m)
+    tops = shadows.tops_of(floor.height_m)
     share = (np.arange(20000) + 0.5) / 20000
     wrong = total = 0
     for _ in range(250):
@@ -141,7 +147,7 @@ def test_a_rough_floor_agrees_with_its_heights_sampled_densely(seed: int) -> Non
             continue
         col, row = (x + 0.8) / 0.1, (y + 1.2) / 0.1
         to = (lamp[0] - x) / 0.1, (lamp[1] - y) / 0.1, lamp[2] - start[2]
-        wrong += shadows._occluded(floor.height_m, *tops, col, row, start[2], *to) != (margin > 0)
+        wrong += shadows.occluded(floor.height_m, *tops, col, row, start[2], *to) != (margin > 0)
         total += 1
     assert total > 60 and wrong == 0
 
@@ -169,7 +175,7 @@ def test_a_shadow_removes_the_light_of_its_lamp_only() -> None:
     pose = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
     depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
     white, stamped_pose = np.full((*depth.shape, 3), 255, np.uint8), StampedPose(pose, 0.0)
-    high = types.SimpleNamespace(height_m=wall(1.0).height_m.T.copy(), spacing_m=0.05, west_m=-5.0, south_m=-5.0)
+    high: Any = types.SimpleNamespace(height_m=wall(1.0).height_m.T.copy(), spacing_m=0.05, west_m=-5.0, south_m=-5.0)
 
     def light_of(lamps: list[dict], casts: bool) -> np.ndarray:
         changes = {
@@ -186,3 +192,61 @@ def test_a_shadow_removes_the_light_of_its_lamp_only() -> None:
     dark = port[..., 1] == 0
     assert 0.2 < dark.mean() < 0.8
     np.testing.assert_allclose(port[~dark], free[~dark], rtol=1e-5)
+
+
+def halos(floor: Any, lamp_m: tuple[float, float, float]) -> LampHalos:
+    """Returns the halo of an even lamp [m, world axes] for a camera 2 m above the origin, in water of type II."""
+    even = {"position_m": (0.0, 0.0, 0.0), "beam": [(0.0, 1.0), (90.0, 1.0)]}
+    water = medium(WaterConfig(jerlov="II"))
+    daylight = daylight_at(SunConfig(illuminance_lx=0.0), water, 0.0)
+    sources = light_sources_in_camera(RIG, (LampConfig.model_validate(even),), daylight, 0)
+    position = geometry.transform(geometry.inverse(DOWN), np.array([lamp_m]))
+    return LampHalos(floor, [sources._replace(position_m=position)] * 2, water)
+
+
+DOWN = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 2.0]))
+
+
+def test_a_high_wall_beside_a_point_hides_half_of_the_halo_of_a_lamp_above_it() -> None:
+    """But for light turned by less than `CORE_RAD`, which counts as straight, and paths before or above the wall."""
+    floor = wall(1.9, 0.01)
+    floor.height_m[:, floor.height_m.shape[1] // 2 :] = 1.9
+    for x, expected in ((-0.0101, 0.4), (-4.0, 0.0)):
+        halo = halos(floor, (x, 0.0, 2.0))
+        lamp = np.array([x, 0.0, 2.0]), np.array([0.0, 0.0, -1.0]), halo._beams[0]
+        assert halo._halo is not None
+        core, dark, _ = halo._halo
+        node = int(np.argmin(np.abs(np.array(NODES_M) - 2.0)))
+        share = hidden_share(halo._solid, (x, 0.0, 0.0), lamp, halo._halo, False)
+        assert share / dark[node] == pytest.approx(expected * (1 - core[node]), abs=0.06)
+
+
+def test_scattered_light_is_hidden_around_shadows_only() -> None:
+    """Behind a wall of 0.5 m nearly all is hidden, less far from it, none at some distance; the masks stay the same."""
+    lamp = geometry.transform(geometry.inverse(DOWN), np.array([[-1.0, 0.0, 2.0]]))
+    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)  # depth without the wall
+    lit = Shadows(wall(0.5), RIG, [lamp, lamp]).lit(depth, DOWN, 0)
+    masks = lit.copy()
+    halos(wall(0.5), (-1.0, 0.0, 2.0)).hide(lit, depth, RIG.focal_px, DOWN, 0)
+    np.testing.assert_array_equal(lit & 1, masks)
+    hidden, x = (lit[0, :, 160] >> 1) / HIDDEN_STEPS, points_of(depth, DOWN)[:, 160, 0]
+    near, end, lit_side = (hidden[np.argmin(np.abs(x - at))] for at in (0.08, 0.31, 0.36))
+    assert near > 0.85 and near > end > 0.5 > lit_side > 0.1
+    assert not hidden[(x < -0.4) | (x > 0.7)].any()
+
+
+def test_light_is_hidden_by_objects_as_by_relief() -> None:
+    """A grid of the heights of floor and object in place of a floor of these heights."""
+    depth = np.full((RIG.height_px, RIG.width_px), 2.0, np.float32)
+    of_relief, of_object = (np.ones((1, *depth.shape), np.uint8) for _ in range(2))
+    for lit in (of_relief, of_object):
+        lit[0, 75:115] = 0
+    halo = halos(wall(0.5), (-1.0, 0.0, 2.0))
+    halo.hide(of_relief, depth, RIG.focal_px, DOWN, 0)
+    level = wall(0.0)
+    beside = LampHalos(level, halo._sources, medium(WaterConfig(jerlov="II")), wall(0.5).height_m)
+    beside.hide(of_object, depth, RIG.focal_px, DOWN, 0)
+    far = points_of(depth, DOWN)[:, 160, 0] > 0.15  # beyond what the nodes do not resolve
+    hidden, expected = (one[0, far, 160] >> 1 for one in (of_object, of_relief))
+    np.testing.assert_allclose(hidden.astype(float), expected.astype(float), atol=0.1 * HIDDEN_STEPS)
+    assert expected.max() > 0.5 * HIDDEN_STEPS

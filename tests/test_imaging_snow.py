@@ -8,7 +8,8 @@ from twin.core import geometry
 from twin.imaging.camera.lens_psf import Defocus
 from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
 from twin.imaging.camera.shutter import ExposureMotion
-from twin.imaging.light.illumination import daylight_at
+from twin.imaging.image_formation import ImageFormation, RenderedView, StampedPose
+from twin.imaging.light.illumination import daylight_at, illumination_of
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.lamps import light_sources_in_camera
 from twin.imaging.light.water import medium
@@ -33,7 +34,7 @@ def marine_snow(density=40.0, diameter_m=0.002, current=(0.0, 0.0, 0.0), water="
     properties = medium(WaterConfig(jerlov=water), "single")
     sources = [LampLight(light_sources(camera), properties) for camera in (0, 1)]
     keys = SnowConfig(density_per_m3=density, diameter_m=diameter_m)
-    return MarineSnow(keys, np.array(current), RIG, properties, sources, np.random.default_rng(seed))
+    return MarineSnow(keys, np.array(current), RIG, sources, np.random.default_rng(seed))
 
 
 def draw(snow, camera=0, pose=POSE, time_s=0.0, depth_m=np.inf):
@@ -71,7 +72,7 @@ def centroid(image):
 def positions(snow, centre_m, time_s):
     """Returns the particle positions (n, 3) in the world [m], in the box around a centre (3,)."""
     low, points = centre_m - BOX_M / 2, np.empty((3, len(snow._start_m)))
-    _into_camera(snow._start_m, snow._current_mps * time_s - low, low, np.eye(4), points)
+    _into_camera(snow._start_m, snow._current_mps * time_s - low, low, snow._box_m, np.eye(4), points)
     return points.T
 
 
@@ -188,14 +189,14 @@ def test_large_particles_of_a_distribution_give_more_light():
     properties = medium(WaterConfig(jerlov="clear"))
     sources = [LampLight(light_sources(camera), properties) for camera in (0, 1)]
     keys = SnowConfig(density_per_m3=40, junge_exponent=3, diameter_min_m=0.0005, diameter_max_m=0.01)
-    snow = MarineSnow(keys, np.zeros(3), RIG, properties, sources, np.random.default_rng(1))
+    snow = MarineSnow(keys, np.zeros(3), RIG, sources, np.random.default_rng(1))
     seen = snow.visible_particles(POSE, 0, 0.0)
     inside = np.all((seen.pixel > 30) & (seen.pixel < np.array(SHAPE[::-1]) - 30), axis=1)
     cover_px2 = np.pi / 4 * (RIG.focal_px * seen.diameter_m / seen.depth_m) ** 2
     assert np.ptp(seen.diameter_m) > 0.002 and inside.sum() > 20
     for k in np.flatnonzero(inside)[:10]:
         index = np.argmin(np.linalg.norm(snow.visible_particles(POSE, 0, 0.0).points_m - seen.points_m[k], axis=1))
-        alone = MarineSnow(keys, np.zeros(3), RIG, properties, sources, np.random.default_rng(1))
+        alone = MarineSnow(keys, np.zeros(3), RIG, sources, np.random.default_rng(1))
         starts, sizes = alone._start_m, alone._diameter_m
         which = np.argmin(np.abs(sizes - seen.diameter_m[index]))
         alone._start_m, alone._diameter_m = starts[which : which + 1], sizes[which : which + 1]
@@ -300,7 +301,42 @@ def test_particles_get_the_daylight_of_the_actual_depth_of_the_camera():
     keys, lit = SnowConfig(density_per_m3=20.0), []
     for planned_m in (2.0, 4.0):
         sources = light_sources_in_camera(RIG, (), daylight_at(sun, water, planned_m), 0)
-        snow = MarineSnow(keys, np.zeros(3), RIG, water, [LampLight(sources, water)] * 2, np.random.default_rng(0))
+        snow = MarineSnow(keys, np.zeros(3), RIG, [LampLight(sources, water)] * 2, np.random.default_rng(0))
         lit.append(snow.visible_particles(POSE, 0, 0.0).radiance)
     assert len(lit[0]) > 10 and lit[0].max() > 0
     np.testing.assert_allclose(lit[1], lit[0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(("albedo", "scattering"), [(0.9, "full"), (0.9, "single"), (0.1, "full")])
+def test_a_particle_on_the_floor_shows_the_difference_of_their_albedos(albedo, scattering):
+    """The change is (albedo / that of the floor - 1) times its direct light, within 30 % of it."""
+    scenario = Scenario.model_validate({
+        "rig": {"image_width_px": 320, "image_height_px": 240}, "water": {"jerlov": "III"},
+        "lamps": [{"position_m": (0.0, 0.05, 0.0), "intensity_cd": 1000.0}], "imaging": {"scattering": scattering},
+        "snow": {"density_per_m3": 20.0, "albedo": albedo},
+    })  # fmt: skip
+    formation = ImageFormation(scenario, illumination_of(scenario), None, np.random.default_rng(0))
+    down = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, 1.5]))
+    assert formation._snow is not None
+    formation._snow._start_m = geometry.transform(down, np.array([[0.0, 0.0, 1.499]]))
+    formation._snow._diameter_m = np.array([0.1])  # wider than its blur
+    grey, depth = np.full((*SHAPE, 3), 128, np.uint8), np.full(SHAPE, 1.5, np.float32)
+    found = formation.components(RenderedView(grey, depth, 0, StampedPose(down, 0.0)))
+    assert found.snow is not None
+    middle = np.s_[SHAPE[0] // 2, SHAPE[1] // 2]
+    expected = (albedo / (128 / 255) - 1) * found.direct[middle]
+    np.testing.assert_allclose(found.snow[middle], expected, atol=0.3 * found.direct[middle].max())
+
+
+def test_snow_reaches_the_floor_of_a_high_flight():
+    snow = MarineSnow(
+        SnowConfig(density_per_m3=20.0), np.zeros(3), RIG,
+        [LampLight(light_sources(camera), medium(WaterConfig(jerlov="clear"))) for camera in (0, 1)],
+        np.random.default_rng(0), None, 4.0,
+    )  # fmt: skip
+    level = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([3.0, 1.0, 4.0]))
+    z = snow.visible_particles(level, 0, 0.0).depth_m
+    volume_m3 = lambda a, b: (b**3 - a**3) / 3 * RIG.width_px * RIG.height_px / RIG.focal_px**2  # noqa: E731
+    for low, high in ((1.5, 2.5), (3.0, 4.0)):
+        expected = 20 * volume_m3(low, high)
+        assert ((z > low) & (z < high)).sum() == pytest.approx(expected, abs=5 * np.sqrt(expected))

@@ -64,8 +64,8 @@ def test_the_light_model_agrees_with_the_reference(water, height_m, fit):
 @pytest.mark.long
 def test_table_and_files_hold_all_cells(tmp_path):
     found = list(lamp_cells((*FEW[:3], PIXELS[:2]), 640, "petzold"))
-    summary = LightComparison(found, []).write(tmp_path / "light")
-    assert json.loads((tmp_path / "light" / "light.json").read_text()) | {"daylight": []} == summary
+    summary = LightComparison(found, [], []).write(tmp_path / "light")
+    assert json.loads((tmp_path / "light" / "light.json").read_text()) | {"relief": [], "daylight": []} == summary
     with (tmp_path / "light" / "light.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [float(row["total_truth_cd_m2"]) for row in rows] == [cell.light["total"].truth.value for cell in found]

@@ -196,10 +196,10 @@ def light(
     found = compare(quick, walks, phase)
     with sole_writer(out, used=True), outputs.writing(out):
         summary = found.write(out)
-    lamps, daylight = (list(table.rows) for table in found.tables)
+    titles = "Light model", "Relief, light model", "Daylight, light model"
     tables = [
-        ("Light model and reference, green band", lamps),
-        ("Daylight, light model and reference, green band", daylight),
+        (f"{title} and reference, green band", list(table.rows))
+        for title, table in zip(titles, found.tables, strict=True)
     ]
     _show(as_json, summary, tables, f"Sheet: {out / 'light.png'}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,12 +12,13 @@ from twin.imaging.camera.lens_psf import defocus_of
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.light.caustics import Caustics
 from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.lamp_halos import LampHalos
 from twin.imaging.light.optics import Optics, SceneView, WaterSurface, calm_surface
 from twin.imaging.light.shadows import Shadows, direction_to_casting_sun
 from twin.imaging.scene.facets import Facets, Heights
 from twin.imaging.scene.materials import material_of
 from twin.imaging.scene.mesh_raster import NO_OBJECTS, ObjectView
-from twin.imaging.scene.object_shadows import ObjectShadows
+from twin.imaging.scene.object_shadows import ObjectShadows, heights_with
 from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.imaging.snow import MarineSnow
 from twin.scenario.model import Scenario
@@ -75,12 +77,15 @@ class ImageFormation:
         to_sun = direction_to_casting_sun(daylight)
         positions_m = [source.position_m for source in sources]
         shaded = floor if imaging.shadows else None
-        self._shadows = None if shaded is None else Shadows(shaded, rig, positions_m, to_sun)
         casting = objects if imaging.shadows else None
+        tops_m = None if casting is None or shaded is None else heights_with(casting, shaded)
+        self._shadows = None if shaded is None else Shadows(shaded, rig, positions_m, to_sun)
+        self._halos = None if shaded is None else LampHalos(shaded, sources, water, tops_m)
         self._object_shadows = None if casting is None else ObjectShadows(casting, rig, positions_m, to_sun)
         snows = snow.density_per_m3 > 0
-        particles = snow, current_mps, rig, water, self._optics.lamp_light, snow_rng
-        self._snow = MarineSnow(*particles, defocus_of(scenario, rig)) if snows else None
+        particles = snow, current_mps, rig, self._optics.lamp_light, snow_rng
+        height_m = scenario.plan.altitude_m
+        self._snow = MarineSnow(*particles, defocus_of(scenario, rig), height_m) if snows else None
 
     def view_of(self, floor: tuple[Image, Depth], camera: int, pose: StampedPose) -> RenderedView:
         """Returns the view of a camera; draws the objects, if any, into albedo and depth of the floor in place."""
@@ -103,7 +108,9 @@ class ImageFormation:
         """Draws marine snow, if enabled, into `light` (H, W, 3) in place, as streaks along the camera's `motion`."""
         if self._snow is not None:
             _, depth, camera, pose, _ = view
-            self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion)
+            surface = self._surface(self._world_from_camera(camera, pose), pose.time_s) if self._daylight_on else None
+            veil = partial(self._optics.veil, camera, surface)
+            self._snow.draw(light, depth, pose.world_from_left, camera, pose.time_s, motion, veil)
 
     def components(self, view: RenderedView) -> RadianceComponents:
         """Returns the light of `radiance` by its components."""
@@ -127,6 +134,8 @@ class ImageFormation:
             lit = self._shadows.lit(depth, world_from_camera, camera, None if objects is None else objects.label)
             if objects is not None and self._object_shadows is not None:
                 self._object_shadows.darken(lit, depth, objects, world_from_camera, (camera, pose.time_s))
+            if self._halos is not None:
+                self._halos.hide(lit, depth, self._rig.focal_px, world_from_camera, camera)
             scene = scene._replace(lit=lit)
         return scene._replace(surface=self._surface(world_from_camera, pose.time_s)) if self._daylight_on else scene
 

@@ -23,6 +23,7 @@ from twin.errors import TwinError
 from twin.imaging.camera.photons import vignetting
 from twin.imaging.camera.tone import linear_of
 from twin.imaging.light.illumination import Illumination
+from twin.imaging.light.lamp_halos import LampHalos
 from twin.imaging.light.optics import Optics, SceneView, calm_surface
 from twin.imaging.light.shadows import Shadows, direction_to_casting_sun
 from twin.imaging.scene.facets import Facets
@@ -42,12 +43,14 @@ class Restoration:
         self._floor = floor = estimated_floor(elevation)
         self._facets = Facets(floor)
         sources = self._optics.light_sources
-        self._shadows = None
+        self._shadows = self._halos = None
         if scenario.imaging.shadows:
             to_sun = direction_to_casting_sun(illumination.daylight)
             if to_sun is not None:
                 to_sun = elevation.map_from_world[:3, :3] @ to_sun
-            self._shadows = Shadows(floor, rig, [source.position_m for source in sources], to_sun)
+            positions_m = [source.position_m for source in sources]
+            self._shadows = Shadows(floor, rig, positions_m, to_sun)
+            self._halos = LampHalos(floor, sources, illumination.water)
         self._signal = linear_signal(scenario)
         power = 0.0 if scenario.sensor is None else scenario.sensor.vignetting_power
         self._vignetting = vignetting(rig, power)[..., None]
@@ -66,8 +69,10 @@ class Restoration:
     def _albedo(self, radiance: Radiance, depth: Depth, map_from_camera: Array) -> Radiance:
         """Returns the albedo (H, W, 3), 1 = white, of a floor at this depth in an image of this radiance."""
         scene = SceneView(self._facets.seen_from(map_from_camera))
-        if self._shadows is not None:
-            scene = scene._replace(lit=self._shadows.lit(depth, map_from_camera, 0))
+        if self._shadows is not None and self._halos is not None:
+            lit = self._shadows.lit(depth, map_from_camera, 0)
+            self._halos.hide(lit, depth, self._rig.focal_px, map_from_camera, 0)
+            scene = scene._replace(lit=lit)
         if self._sunny:
             surface = calm_surface(self._world_from_map @ map_from_camera, self._reference_depth_m)
             scene = scene._replace(surface=surface)

@@ -1,16 +1,18 @@
 """Marine snow: small particles that drift with the current through the light of lamps and sun.
 
 The particles fill a periodic box around the left camera, so both cameras and consecutive frames show the same ones. A
-particle of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, blurred by one pixel and
-by the circle of confusion A f |1/z - 1/s|, and spread evenly along its path during the exposure. A rolling shutter
-images it where it is when its row is read; if the whole image is displaced later, it is drawn displaced by the
-difference from the floor behind it. Diameters follow a power law n(D) ~ D^-j between a and b (Junge 1963), with the
-cumulative distribution (a^(1-j) - D^(1-j)) / (a^(1-j) - b^(1-j)).
+particle of diameter D at depth z is a Lambertian disc with an image area of pi/4 (f D / z)^2, which hides the light
+from behind it that is not scattered in front of it. It is blurred by one pixel and by the circle of confusion A f |1/z
+- 1/s|, and spread evenly along its path during the exposure. A rolling shutter images it where it is when its row is
+read; if the whole image is displaced later, it is drawn displaced by the difference from the floor behind it. Diameters
+follow a power law n(D) ~ D^-j between a and b (Junge 1963), with the cumulative distribution (a^(1-j) - D^(1-j)) /
+(a^(1-j) - b^(1-j)).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -21,15 +23,20 @@ from twin.imaging.camera.lens_psf import Defocus
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.shading import FAR_M
-from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 from twin.scenario.model import SnowConfig
 
-BOX_M = 5.0  # side of the periodic box; along each world axis, snow is visible up to half a side from the left camera
+#: Least side of the periodic box. Along each world axis, snow is visible up to half a side from the left camera; half a
+#: side is at least MARGIN times the extent of the image of a level floor.
+BOX_M, MARGIN = 5.0, 1.1
 NEAREST_M = 0.1  # smallest depth of a particle: the port is in front of the camera
 APERTURE_M = 0.004  # diameter of the lens aperture where the scenario has no depth of field
 PIXEL_BLUR_PX = 1.0  # blur of the image of a particle by the lens
 FOOTPRINT_PX = 4096  # most pixels of a footprint whose weights are stored; those of a larger one are computed twice
+
+
+#: Light (n, 3) that is scattered into the camera before ranges (n,) [m] at pixels (n, 2) [cd/m2].
+Veil: TypeAlias = Callable[[Array, Array], Array]
 
 
 class VisibleParticles(NamedTuple):
@@ -44,15 +51,21 @@ class VisibleParticles(NamedTuple):
 
 
 class MarineSnow:
-    """Marine snow, which moves with the current (3,). Without `defocus`, the lens is focused at infinity."""
+    """Marine snow, which moves with the current (3,), for cameras at `height_m` above the reference plane.
+
+    Without `defocus`, the lens is focused at infinity.
+    """
 
     def __init__(
-        self, snow: SnowConfig, current_mps: Array, rig: StereoRig, water: Medium, lamp_light: list[LampLight],
-        rng: np.random.Generator, defocus: Defocus | None = None,
+        self, snow: SnowConfig, current_mps: Array, rig: StereoRig, lamp_light: list[LampLight],
+        rng: np.random.Generator, defocus: Defocus | None = None, height_m: float = 0.0,
     ):  # fmt: skip
-        self._start_m = rng.uniform(0, BOX_M, (round(snow.density_per_m3 * BOX_M**3), 3))
+        aside_m = height_m * np.hypot(rig.width_px, rig.height_px) / 2 / rig.focal_px
+        self._box_m = np.maximum(BOX_M, 2 * MARGIN * np.array([aside_m, aside_m, height_m]))
+        n = round(snow.density_per_m3 * float(np.prod(self._box_m)))
+        self._start_m = rng.uniform(0, self._box_m, (n, 3))
         self._diameter_m = diameters(snow, len(self._start_m), rng)
-        self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, water
+        self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, lamp_light[0].water
         self._lamp_light = lamp_light
         self._defocus = Defocus(APERTURE_M, 0.0) if defocus is None else defocus
         largest = float(self._diameter_m.max(initial=0.0))
@@ -64,11 +77,11 @@ class MarineSnow:
         """Returns the particles in view of a camera (0 left, 1 right)."""
         rig = self._rig
         world_from_camera = world_from_left @ (rig.left_from_right if camera else np.eye(4))
-        low, middle = world_from_left[:3, 3] - BOX_M / 2, (rig.cx_px, rig.cy_px)
+        low, middle = world_from_left[:3, 3] - self._box_m / 2, (rig.cx_px, rig.cy_px)
         view = rig.focal_px, *middle, rig.width_px, rig.height_px, self._margin_px, rig.focal_px * reach_m, farthest_m
         points, seen = np.empty((3, len(self._start_m))), np.empty(len(self._start_m), np.bool_)
         pose = geometry.inverse(world_from_camera)
-        _into_camera(self._start_m, self._current_mps * time_s - low, low, pose, points)
+        _into_camera(self._start_m, self._current_mps * time_s - low, low, self._box_m, pose, points)
         _test_view(points, view, seen)
         found = np.flatnonzero(seen)
         points = np.ascontiguousarray(points[:, found].T)
@@ -80,9 +93,12 @@ class MarineSnow:
 
     def draw(
         self, light: Radiance, depth: Depth, world_from_left: Array, camera: int, time_s: float,
-        motion: ExposureMotion | None = None,
+        motion: ExposureMotion | None = None, veil: Veil | None = None,
     ) -> None:  # fmt: skip
-        """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance (H, W, 3) `light`."""
+        """Draws the particles in front of the floor, of depth (H, W) [m], into the radiance (H, W, 3) `light`.
+
+        `veil` is the backscatter that `light` contains, see `optics.Optics.veil`; None: none.
+        """
         rig, defocus = self._rig, self._defocus
         reach_m = 0.0 if motion is None else self._reach_m(motion)
         seen = self.visible_particles(world_from_left, camera, time_s, reach_m, float(depth.max()))
@@ -93,13 +109,17 @@ class MarineSnow:
             centre_px, path_px = seen.pixel, np.zeros_like(seen.pixel)
         else:
             centre_px, path_px = self._paths(seen, depth, world_from_left, camera, motion)
-        scene = light, depth, centre_px, path_px, z, seen.radiance, width_px, cover_px2
+        range_m, water = np.linalg.norm(seen.points_m, axis=1), self._water
+        # share of the light from behind a particle that is not scattered in front of it
+        through = np.exp((water.camera_loss_per_m - water.attenuation_per_m) * range_m[:, None])
+        radiance = seen.radiance if veil is None else seen.radiance + through * veil(seen.pixel, range_m)
+        scene = light, depth, centre_px, path_px, z, radiance, through, width_px, cover_px2
         in_row_bands(lambda first, end: _draw(*scene, first, end), len(light))
 
     def _reach_m(self, motion: ExposureMotion) -> float:
         """Returns an upper limit of the distance that a particle moves relative to the camera [m]."""
         speed_mps = np.linalg.norm(motion.twist[3:]) + np.linalg.norm(self._current_mps)
-        speed_mps += np.linalg.norm(motion.twist[:3]) * BOX_M
+        speed_mps += np.linalg.norm(motion.twist[:3]) * self._box_m.max()
         return float(speed_mps * (motion.exposure_s + motion.readout_s) / 2)
 
     def _paths(
@@ -172,18 +192,19 @@ def _image_velocity(x, y, z, focal, drift, twist):
 
 
 @kernel
-def _into_camera(start, shift, low, pose, points):
-    """Computes the positions (3, n) of particles in camera axes; in the world: low + mod(start + shift, BOX_M)."""
-    per_box, flat, xs, ys, zs = 1 / BOX_M, start.reshape(-1), points[0], points[1], points[2]
+def _into_camera(start, shift, low, box, pose, points):
+    """Computes the positions (3, n) of particles in camera axes; in the world: low + mod(start + shift, box)."""
+    flat, xs, ys, zs = start.reshape(-1), points[0], points[1], points[2]
+    (bx, by, bz), (per_x, per_y, per_z) = (box[0], box[1], box[2]), (1 / box[0], 1 / box[1], 1 / box[2])
     (px, py, pz), (lx, ly, lz) = (shift[0], shift[1], shift[2]), (low[0], low[1], low[2])
     a, b, c, d = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     e, f, g, h = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     i, j, m, o = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
     for k in range(xs.size):
         x, y, z = flat[3 * k] + px, flat[3 * k + 1] + py, flat[3 * k + 2] + pz
-        x = lx + x - BOX_M * np.floor(x * per_box)
-        y = ly + y - BOX_M * np.floor(y * per_box)
-        z = lz + z - BOX_M * np.floor(z * per_box)
+        x = lx + x - bx * np.floor(x * per_x)
+        y = ly + y - by * np.floor(y * per_y)
+        z = lz + z - bz * np.floor(z * per_z)
         xs[k] = a * x + b * y + c * z + d
         ys[k] = e * x + f * y + g * z + h
         zs[k] = i * x + j * y + m * z + o
@@ -203,7 +224,7 @@ def _test_view(points, view, seen):
 
 
 @kernel
-def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
+def _draw(light, depth, centre, path, z, radiance, through, width, cover, first, end):
     cols, weights = depth.shape[1], np.empty(FOOTPRINT_PX)
     for k in range(z.size):
         radius = 0.5 * width[k] + 0.5
@@ -233,7 +254,7 @@ def _draw(light, depth, centre, path, z, radiance, width, cover, first, end):
                     weight = _swept(radius, u - centre[k, 0], v - centre[k, 1], step_u, step_v, steps)
                 share = min(cover[k] * weight / total, 1.0)
                 for c in range(3):
-                    light[v, u, c] += np.float32(share * (radiance[k, c] - light[v, u, c]))
+                    light[v, u, c] += np.float32(share * (radiance[k, c] - through[k, c] * light[v, u, c]))
 
 
 @kernel(inline="always")

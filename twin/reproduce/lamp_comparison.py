@@ -11,10 +11,12 @@ from itertools import product
 
 import numpy as np
 
+from twin.core.height_field import HeightField
 from twin.imaging.light.forward_scatter import ForwardScatter
 from twin.imaging.light.illumination import illumination_of
 from twin.imaging.light.lamps import light_sources_in_camera
 from twin.imaging.light.optics import Optics, range_of
+from twin.imaging.reference.floor_crossings import LEVEL
 from twin.imaging.reference.pixel_light import (
     BatchMean,
     Effort,
@@ -116,12 +118,14 @@ def _blur_shares(light: PixelLight) -> tuple[BatchMean, BatchMean]:
     return light.blurred_share(0.0, NEAR_PX), light.blurred_share(FAR_PX)
 
 
-def reference_light(scenario: Scenario, height_m: float, pixel: tuple[int, int], effort: Effort) -> PixelLight:
+def reference_light(
+    scenario: Scenario, height_m: float, pixel: tuple[int, int], effort: Effort, relief: HeightField = LEVEL
+) -> PixelLight:
     """Returns the Monte Carlo estimate of the green light of a pixel of the left camera, which points straight down."""
     rig, illumination, pose = scenario.believed_rig(), illumination_of(scenario), looking_down(height_m)
     sources = light_sources_in_camera(rig, scenario.lamps, illumination.daylight, 0)
     water, lamps = illumination.water.bands[GREEN], lamps_in_world(sources, pose, GREEN)
-    scene = ReferenceScene(water, lamps, sources.beam, ALBEDO / 255)
+    scene = ReferenceScene(water, lamps, sources.beam, ALBEDO / 255, relief)
     return pixel_light(scene, PixelRay(pose, rig, pixel), effort)
 
 

@@ -17,35 +17,42 @@ from twin.reproduce.daylight_comparison import ALL_DAYLIGHT, QUICK_DAYLIGHT, day
 from twin.reproduce.exhibit import Exhibit, Figure, Table, drawn, make_table, write_json
 from twin.reproduce.lamp_comparison import ALL_LAMPS, QUICK_LAMPS, lamp_cells, lamp_table
 from twin.reproduce.light_cell import ALBEDO, MOST_WALKS, LightCell, write_csv
+from twin.reproduce.relief_comparison import ALL_RELIEFS, QUICK_RELIEFS, relief_cells, relief_table
 
 MARKERS = {"leds": "o", "spots": "^"}
 OFFSET_M = 0.08  # horizontal distance between the markers of two pixels at the same height
 
 
 class LightComparison(NamedTuple):
-    """Cells of the comparisons of the light of lamps and of daylight."""
+    """Cells of the comparisons of the light of lamps over level floors and over relief, and of daylight."""
 
     lamps: list[LightCell]
+    relief: list[LightCell]
     daylight: list[LightCell]
 
     @property
-    def tables(self) -> tuple[Table, Table]:
-        lamps = make_table("light", "Lamps", lamp_table(self.lamps))
-        return lamps, make_table("daylight", "Daylight", daylight_table(self.daylight))
+    def tables(self) -> tuple[Table, ...]:
+        return (
+            make_table("light", "Lamps", lamp_table(self.lamps)),
+            make_table("relief", "Lamps over relief", relief_table(self.relief)),
+            make_table("daylight", "Daylight", daylight_table(self.daylight)),
+        )
 
     def write(self, folder: Path) -> dict[str, Any]:
-        """Writes light.csv, light.json, light.png and daylight.csv to a folder; returns the contents of all."""
+        """Writes light.csv, light.json, light.png, relief.csv and daylight.csv to a folder; returns the contents."""
         rows = write_csv(self.lamps, folder / "light.csv")
         summary = {"schema": "twin.light/1", "band": "green", "albedo": ALBEDO / 255, "cells": rows}
         write_json(folder / "light.json", summary)
         draw(self.lamps, folder / "light.png")
-        return summary | {"daylight": write_csv(self.daylight, folder / "daylight.csv")}
+        more = {"relief": self.relief, "daylight": self.daylight}
+        return summary | {name: write_csv(found, folder / f"{name}.csv") for name, found in more.items()}
 
 
 def compare(quick: bool, walks: int = MOST_WALKS, phase: str = "sea") -> LightComparison:
     """Returns the comparison; arguments as for `lamp_cells`."""
     lamps = list(lamp_cells(QUICK_LAMPS if quick else ALL_LAMPS, walks, phase))
-    return LightComparison(lamps, list(daylight_cells(QUICK_DAYLIGHT if quick else ALL_DAYLIGHT, walks)))
+    relief = list(relief_cells(QUICK_RELIEFS if quick else ALL_RELIEFS, walks))
+    return LightComparison(lamps, relief, list(daylight_cells(QUICK_DAYLIGHT if quick else ALL_DAYLIGHT, walks)))
 
 
 def run(folder: Path, quick: bool = False) -> Exhibit:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, Image, MapGrid
 from twin.imaging.scene.mesh_raster import DrawnMesh, Projection, Target, draw_meshes
+from twin.imaging.scene.object_shadows import FROM_ABOVE
 from twin.imaging.scene.triplanar import paint_walls_from_above, wall_surface
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
@@ -23,7 +24,6 @@ from twin.terrains.terrain import MAX_NODES
 
 Layer = NDArray[np.float32]
 
-FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes east, south, down
 FROM_BELOW: Array = np.diag([1.0, -1.0, 1.0, 1.0])  #: axes east, south, up, so that the lowest surface is the nearest
 OVERHANG_M = 0.01  #: least gap between the floor and an object that overhangs it
 FINE_M = 0.01  #: largest spacing of the nodes of `with_objects`, unless MAX_NODES requires a larger one

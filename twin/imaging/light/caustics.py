@@ -28,7 +28,7 @@ from twin.scenario.model import SEA_WATER_INDEX
 CELLS = 256  # number of cells per side of the tile, a power of two
 TILE_DEPTHS = 1.5  # side of the tile in units of the depth
 RESOLVED = 0.95  # wave number of the shortest resolved waves, in units of the Nyquist wave number of the cells
-LEAST_CELLS = 0.6  # least standard deviation of the blur in cells, so that light between narrow lines is not negative
+LEAST_CELLS = 0.9  # least standard deviation of the blur in cells, so that light between narrow lines is not negative
 #: Standard deviation of directions within the solar disc along one axis, in water.
 SUN_RAD = 0.00465 / 2 / SEA_WATER_INDEX
 STREAM = 1 << 16  # key of the random stream for the waves

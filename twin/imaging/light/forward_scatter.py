@@ -1,8 +1,9 @@
 """Forward scatter: light of the floor, scattered on its way to the camera, arrives blurred.
 
 The fraction exp(-b r) arrives unscattered; the rest is blurred by a kernel with a sharp core and a long tail
-(`spread.camera_mixture`), a mixture of the levels of an image pyramid with weights by band and range of the pixel. Off
-the axis a small angle covers k = 1 / cos(theta)^1.5 more pixels, so a fraction log2(k) of the light of each level moves
+(`spread.camera_mixture`), a mixture of the levels of an image pyramid with weights by band and range. Over relief, the
+range of a wide level is that of its light: of the bright near side of an edge, not of the far pixels beside it. Off the
+axis a small angle covers k = 1 / cos(theta)^1.5 more pixels, so a fraction log2(k) of the light of each level moves
 to the next, except for the widest (`WIDENED_TAN`). Outside the image, the floor is the plane that fits the depth, with
 the mean albedo of the image.
 """
@@ -35,6 +36,7 @@ SURROUNDINGS_STEP_TAN = 0.035  # side of a pixel of the surroundings, as a tange
 WIDENING = 1.5  # exponent of 1 / cos(theta) in the pixels that an angle covers
 WIDENED_TAN = 0.1  # largest standard deviation of a level that is widened, as a tangent; cos(theta) hardly varies in it
 WIDEST_TAN = 1.2  # upper limit of the standard deviation of a level, as a tangent
+LEVEL_STEPS = 8.0  # largest distance from the plane of an image that counts as level, in steps of `place_of`
 PLANE_STEP_PX = 8  # spacing of the pixels to whose depth the plane is fitted
 
 
@@ -96,15 +98,17 @@ class ForwardScatter:
         """
         grid = self.surroundings
         images: list[Radiance] = [np.asarray(cv2.pyrDown(floor), np.float32)]
-        places: list[Place] = [place]
+        places, by_light = [place], False
         while len(images) < len(self._tables):
             if len(images) == grid.level:
                 inner = np.s_[grid.pad : grid.pad + len(images[-1]), grid.pad : grid.pad + images[-1].shape[1]]
                 outer, outer_place = around
+                by_light = np.abs(outer_place[inner] - places[-1]).max() > LEVEL_STEPS
                 outer[inner], outer_place[inner] = images[-1], places[-1]
                 images[-1], places[-1] = outer, outer_place
             images.append(np.asarray(cv2.pyrDown(images[-1]), np.float32))
-            places.append(np.asarray(cv2.pyrDown(places[-1]), np.float32))
+            mean = _place_of_light if by_light else _mean_place
+            places.append(mean(images[-2], images[-1], places[-1]))
         tables = tuple(zip(self._tables, self._widening, strict=True))
         _weigh(images[-1], places[-1], *tables[-1], np.zeros_like(images[-1]))
         for k in reversed(range(len(images) - 1)):
@@ -205,6 +209,17 @@ def _widening(rig: StereoRig, grid: Surroundings, per_depth: Depth, levels: int)
     if grid.level <= levels:
         secants[grid.level - 1] = per_depth
     return [np.ascontiguousarray(np.clip(WIDENING * np.log2(one), 0.0, 1.0), np.float32) for one in secants]
+
+
+def _mean_place(image: Radiance, smaller: Radiance, place: Place) -> Place:
+    return np.asarray(cv2.pyrDown(place), np.float32)
+
+
+def _place_of_light(image: Radiance, smaller: Radiance, place: Place) -> Place:
+    """Returns the place of a smaller level of the pyramid: the mean weighted with the green light of the level."""
+    mean, green = _mean_place(image, smaller, place), smaller[..., 1]
+    of_light = np.asarray(cv2.pyrDown(np.ascontiguousarray(image[..., 1] * place)), np.float32)
+    return np.divide(of_light, green, out=mean, where=green > 0)
 
 
 @kernel(error_model="numpy")

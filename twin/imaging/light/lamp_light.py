@@ -36,7 +36,7 @@ class LampLight:
     """Light of the lamps on particles in the water, in the axes of one camera."""
 
     def __init__(self, sources: LightSources, water: Medium):
-        self.sources, self._water = sources, water
+        self.sources, self.water = sources, water
         soft = water.scatters_repeatedly
         self._tables = [_light(beam, water, "particle")[1] for beam in sources.beam] if soft else None
 
@@ -58,7 +58,7 @@ class LampLight:
         distance = np.maximum(np.linalg.norm(from_lamp, axis=-1), LAMP_RADIUS_M)[..., None]
         from_lamp /= distance
         share = beam_share(from_lamp @ axis, sources.beam[lamp])[..., None]
-        return share * np.exp(-self._water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
+        return share * np.exp(-self.water.attenuation_per_m * distance) / distance**2 * strength, from_lamp
 
 
 def floor_tables(sources: LightSources, water: Medium) -> NDArray[np.float32]:

@@ -21,6 +21,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
 
 from twin.core.records import Array, Depth, Image, Radiance, StereoRig
 from twin.core.threads import in_row_bands
@@ -30,7 +31,7 @@ from twin.imaging.light.forward_scatter import ForwardScatter, Place
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.lamp_light import LampLight, floor_tables, with_a_zero
 from twin.imaging.light.lamps import beam_share, light_sources_in_camera
-from twin.imaging.light.shading import shade
+from twin.imaging.light.shading import RANGE_SCALE_M, shade
 from twin.imaging.light.water import Medium
 from twin.imaging.scene.facets import NO_FACETS, FacetView
 from twin.imaging.scene.materials import Material
@@ -67,7 +68,8 @@ class SceneView(NamedTuple):
     """What the light of an image depends on besides albedo and depth."""
 
     facets: FacetView = NO_FACETS  # triangles of the floor; none: the normals are computed from the depth
-    # (lamps, H, W), and one for the sun if it casts shadows: 0 where the light is blocked, else 1; empty = no shadows
+    # (lamps, H, W), and one for the sun if it casts shadows; empty = no shadows. Bit 0: 0 where the light is blocked,
+    # else 1; the other bits: share of the lamp's scattered light that relief hides, in `shading.HIDDEN_STEPS`
     lit: Lit = NO_SHADOWS
     material: Material | None = None  # reflection of the unscattered light of lamps; None = Lambertian
     objects: ObjectView = NO_OBJECTS  # normals of the pixels that show objects; empty: the image shows the floor alone
@@ -185,6 +187,21 @@ class Optics:
 
         unscattered = np.exp(-self._medium.scattering_per_m * range_m[..., None])
         return WhiteFloor(light, backscatter, unscattered, forward.core(range_m), spread)
+
+    def veil(self, camera: int, surface: WaterSurface | None, pixel: Array, range_m: Array) -> Array:
+        """Returns the backscatter (n, 3) between a camera and ranges (n,) [m] at pixels (n, 2), column and row [cd/m2].
+
+        `surface` is that of `SceneView`.
+        """
+        *_, of_lamps, rays = self._tables(camera)
+        table = self._with_veil(of_lamps, rays, self._calm_surface if surface is None else surface)
+        rows, cols, ranges, _ = table.shape
+        if not ranges:
+            return np.zeros((len(pixel), 3))
+        last_px = np.array([self._rig.width_px - 1, self._rig.height_px - 1])
+        across, down = (pixel * np.array([cols - 1, rows - 1]) / last_px).T
+        at = np.stack([down, across, range_m / (range_m + RANGE_SCALE_M) * (ranges - 1)])
+        return np.stack([map_coordinates(table[..., k], at, order=1, mode="nearest") for k in range(3)], axis=-1)
 
     def around(self, albedo: Image, depth: Depth, camera: int, scene: SceneView = BARE_FLOOR) -> tuple[Radiance, Place]:
         """Returns the argument `around` of `ForwardScatter.add`; with single scattering, there is none."""

@@ -13,6 +13,7 @@ from twin.imaging.scene.materials import add_reflected
 from twin.kernels import kernel
 
 FAR_M = 1e6  # a pixel with a greater depth shows no floor
+HIDDEN_STEPS = 127  # steps of the hidden share of scattered light in `optics.SceneView.lit`
 RANGE_SCALE_M = 2.0  # scale of the tables with equal steps of r / (r + scale), r the range or the distance from a lamp
 #: Columns and rows, each different, relative to the centre of a pixel, at which it samples the facets [px].
 SAMPLES = np.array([(-7, -7), (-5, -1), (-3, 5), (-1, -5), (1, 1), (3, 7), (5, -3), (7, 3)], np.float32) / 16
@@ -76,9 +77,12 @@ def shade(
         for k in range(lamps.shape[0]):
             _illuminate(lamps[k], depth[v], y, focal, normal, lamp)
             if shadowed:
-                shown = lit[k, v]
+                for u in range(width):
+                    shown[u] = lit[k, v, u] & np.uint8(1)
             if softened:
                 _add_soft_lamp(lamps[k], soft[k], lamp, shown, material is None, lookup, light)
+                if shadowed:
+                    _hide_scattered(lamps[k], soft[k], lamp[0], lit[k, v], lookup, light)
             if material is not None or not softened:
                 for u in range(width):
                     lamp[0, u] = lamp[0, u] if shown[u] else np.float32(0.0)
@@ -304,6 +308,27 @@ def _add_soft_lamp(lamp, soft, lamplight, lit, direct, lookup, light):
         light[0, u] += e * red * r
         light[1, u] += e * green * g
         light[2, u] += e * blue * b
+
+
+@kernel(forceinline=True, fastmath=_FAST, error_model="numpy")
+def _hide_scattered(lamp, soft, lamplight, lit, lookup, light):
+    """Subtracts the scattered light that relief hides (see `lit`) from `light` (3, W), after `_add_soft_lamp`."""
+    one, per_step = np.float32(1.0), np.float32(1 / HIDDEN_STEPS)
+    _, n_rows, n_cols, _ = soft.shape
+    cell, _, part_of_row, part_of_col = lookup
+    size, stride, flat = np.int32(4 * n_rows * n_cols), np.uint32(4 * n_cols), soft.reshape(-1)
+    for u in range(light.shape[1]):
+        hidden = lit[u] >> np.uint8(1)
+        if hidden == 0:
+            continue
+        i, w, s = np.uint32(cell[u] % size), part_of_row[u], part_of_col[u]
+        places = i, i + np.uint32(4), i + stride, i + stride + np.uint32(4)
+        shares = (one - w) * (one - s), (one - w) * s, w * (one - s), w * s
+        r, g, b = sum_of_entries(flat, places, shares)  # pyright: ignore
+        e = lamplight[u] * np.float32(hidden) * per_step
+        light[0, u] -= e * lamp[7] * r
+        light[1, u] -= e * lamp[8] * g
+        light[2, u] -= e * lamp[9] * b
 
 
 @kernel(forceinline=True, fastmath=_FAST, error_model="numpy")

@@ -36,7 +36,7 @@ class Shadows:
     def __init__(self, floor: Heights, rig: StereoRig, lamp_positions_m: list[Array], to_sun: Array | None = None):
         height = np.ascontiguousarray(floor.height_m, np.float32)
         # heights of the nodes, highest heights of each cell and of each block of cells; first node, spacing [m]
-        self._grid = height, *_tops(height), floor.west_m, floor.south_m, floor.spacing_m
+        self._grid = height, *tops_of(height), floor.west_m, floor.south_m, floor.spacing_m
         self._rig, self._lamps, self._to_sun = rig, lamp_positions_m, to_sun
 
     def lit(self, depth: Depth, world_from_camera: Array, camera: int, label: NDArray[np.uint16] | None = None) -> Lit:
@@ -61,7 +61,7 @@ def direction_to_casting_sun(daylight: Daylight) -> Array | None:
     return np.array(daylight.source.to_sun) if slanted else None
 
 
-def _tops(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def tops_of(height: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Returns the heights [m] of the highest corner of each cell and of the highest node of each block of cells."""
     cells = np.maximum(np.maximum(height[:-1, :-1], height[:-1, 1:]), np.maximum(height[1:, :-1], height[1:, 1:]))
     starts = [np.arange(0, n, BLOCK_CELLS) for n in cells.shape]
@@ -175,7 +175,7 @@ def _any_dark(row):
 
 
 @kernel(error_model="numpy", inline="always")
-def _point_of(depth, focal, pose, v, u):
+def point_of(depth, focal, pose, v, u):
     z = np.float64(depth[v, u])
     scale = z / focal
     x, y = (u - 0.5 * (depth.shape[1] - 1)) * scale, (v - 0.5 * (depth.shape[0] - 1)) * scale
@@ -188,9 +188,9 @@ def _point_of(depth, focal, pose, v, u):
 def _cast(grid, depth, focal, pose, lamp, v, u):
     """Returns DARK if the floor occludes `lamp` (3,) as seen from the point in pixel (v, u), else CLEAR."""
     height, cell_tops, block_tops, west, south, spacing = grid
-    x, y, z = _point_of(depth, focal, pose, v, u)
+    x, y, z = point_of(depth, focal, pose, v, u)
     to = (lamp[0] - x) / spacing, (lamp[1] - y) / spacing, lamp[2] - z
-    dark = _occluded(height, cell_tops, block_tops, (x - west) / spacing, (y - south) / spacing, z, *to)
+    dark = occluded(height, cell_tops, block_tops, (x - west) / spacing, (y - south) / spacing, z, *to)
     return DARK if dark else CLEAR
 
 
@@ -205,7 +205,7 @@ def _grid_steps(at, along, cell, size):
 
 
 @kernel(error_model="numpy")
-def _occluded(height, cell_tops, block_tops, x, y, z, dx, dy, dz):
+def occluded(height, cell_tops, block_tops, x, y, z, dx, dy, dz):
     """Returns whether the floor is above the ray from (x, y, z) to (x + dx, y + dy, z + dz); x, y in cells, z [m]."""
     rows, cols = block_tops.shape
     r = min(max(int(np.floor(y / BLOCK_CELLS)), 0), rows - 1)
@@ -229,7 +229,7 @@ def _occluded(height, cell_tops, block_tops, x, y, z, dx, dy, dz):
 
 @kernel(error_model="numpy")
 def _occluded_in_block(height, cell_tops, block_top, x, y, z, dx, dy, dz, t, end, block_r, block_c):
-    """Returns the result of `_occluded` for the part of the ray from t to `end`, which lies in one block."""
+    """Returns the result of `occluded` for the part of the ray from t to `end`, which lies in one block."""
     first_r, first_c = block_r * BLOCK_CELLS, block_c * BLOCK_CELLS
     last_r = min(first_r + BLOCK_CELLS, cell_tops.shape[0]) - 1
     last_c = min(first_c + BLOCK_CELLS, cell_tops.shape[1]) - 1

@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 from twin.core import geometry
 from twin.core.records import Array, Depth, StereoRig
 from twin.core.threads import in_row_bands
+from twin.imaging.scene.facets import Heights
 from twin.imaging.scene.mesh_raster import NEAR_M, ObjectView, Projection, Target, draw_meshes
 from twin.imaging.scene.object_view import Objects
 from twin.kernels import kernel
 
+FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes east, south, down
 STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
 MARGIN_PX = 2.0  #: margin of a map around these points, in its pixels
 WIDEST_TANGENT = 5.0  #: largest tangent of half the field of view of a map; points outside the map count as lit
@@ -74,6 +76,17 @@ class ObjectShadows:
         x = (cols - (width - 1) / 2) / self._focal_px * z
         y = (rows[:, None] - (height - 1) / 2) / self._focal_px * z
         return np.stack([x, y, z], axis=-1)[np.isfinite(z)]
+
+
+def heights_with(objects: Objects, floor: Heights) -> NDArray[np.float32]:
+    """Returns the heights of the nodes of a floor (rows, cols) with the objects on it, but for plants that sway [m]."""
+    (rows, cols), per_m = floor.height_m.shape, 1 / floor.spacing_m
+    view = Projection(per_m, -floor.west_m * per_m, floor.south_m * per_m + rows - 1, -np.inf, False)
+    down_m = np.ascontiguousarray(-floor.height_m[::-1], np.float32)
+    drawn = objects.in_view(FROM_ABOVE, view, (rows, cols), 0.0)
+    still = [item for item in drawn if not objects.placed[item.label - 1].model.sways]
+    draw_meshes(still, view, Target(down_m))
+    return np.ascontiguousarray(-down_m[::-1])
 
 
 def _lamp_view(lamp_m: Array, points: Array, shape: tuple[int, int]) -> _LightView | None:
