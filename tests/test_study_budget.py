@@ -91,7 +91,7 @@ def test_what_the_surrogate_refuses_is_flown_rendered_on_request_with_the_time_t
     n = int(unknown.unmodelled.sum())
     known = run(True, render_refused=True)
     line = next(line for line in capsys.readouterr().err.splitlines() if "Flying rendered" in line)
-    assert line.startswith(f"Flying rendered the {n} surveys that the surrogate refuses: about ")
+    assert line.startswith(f"Flying rendered what the surrogate refuses, {n} of 64 surveys: about ")
     assert "on one core each (a rough estimate)" in line and line.endswith(" in total")
     assert n > 20 and known.n_rendered == n and not known.unmodelled.any() and known.evaluated.all()
     assert unknown.pass_probability.value < known.pass_probability.value < unknown.pass_probability.most

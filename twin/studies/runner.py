@@ -124,7 +124,7 @@ def _render_refused(study: Study, folder: Path, log: ResultsLog, fleet: Fleet, a
     survey_s, source = rendered_time(rows.values(), chosen[0].scenario, longest_s)
     time_told = f"about {duration(survey_s)} on one core each ({source}), {duration(survey_s * len(chosen))} in total"
     fleet.progress.print_line(
-        f"Flying rendered the {len(chosen)} surveys that the surrogate refuses: "
+        f"Flying rendered what the surrogate refuses, {len(chosen)} of {len(rows)} surveys: "
         + (time_told if longest_s else "their time is not known before the first one")
     )
     fleet.progress.begin(fleet.progress.done + len(chosen))
