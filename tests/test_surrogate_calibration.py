@@ -284,6 +284,16 @@ def test_a_survey_of_a_study_outside_the_fit_is_a_refused_row(tmp_path):
     assert row["status"] == "refused" and "median overlap" in row["reason"]
 
 
+def test_a_map_that_the_error_model_cannot_give_is_a_refused_row(tmp_path, monkeypatch):
+    def sample_patch(*_):
+        raise FloatingPointError("the error model gives a height that is not finite")
+
+    monkeypatch.setattr("twin.surrogate.map_model.MapModel.sample_patch", sample_patch)
+    given = scenario()
+    row = fly(Survey(0, 1, {}, given, given.fingerprint(), tmp_path / "runs" / "0", "none"))
+    assert row["status"] == "refused" and row["unmodelled"] and "not finite (allowed: imaging.fidelity" in row["reason"]
+
+
 def test_extrapolate_of_the_command_line_sets_the_key_of_every_survey():
     for extrapolate in (True, False):
         study = study_command.load("turbidity", study_command.StudyOptions(extrapolate=extrapolate))

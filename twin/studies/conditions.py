@@ -1,4 +1,4 @@
-"""Conditions of a study's surveys: its rig, what is idealised, and the sea trial (scenes/sea_trial.toml)."""
+"""Conditions of a study's surveys: its rig, what is idealised, and the sea trial (scenes/conditions/sea_trial.toml)."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def _missing(study: Study) -> tuple[dict[str, Any], dict[str, Distribution]]:
 def _preset() -> dict[str, Any]:
     from twin import scenes
 
-    return read_toml(Path(scenes.__file__).parent / "sea_trial.toml")[0]
+    return read_toml(Path(scenes.__file__).parent / "conditions" / "sea_trial.toml")[0]
 
 
 def _sets(tree: Mapping[str, Any], key: str) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from threading import Lock
 from typing import Any, NamedTuple
 
@@ -108,13 +109,15 @@ class SurrogateVision:
         frame_errors: error distribution of the current frame-to-frame motions; None if there are no points to track.
         n_corners: `corner_count`.
 
-    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`.
+    Raises UnmodelledError if marine snow prevents all matches at `Matchability.medium_depth_m`; so does `build_map` if
+    the error model gives a height that is not finite.
     """
 
     runs_in_background = False  # sampling a link takes less time than a thread switch
 
     def __init__(self, mission: Mission, model: ErrorModel, true_pose: Callable[[], Array], stopwatch: StageTimer):
         scenario, terrain = mission.scenario, mission.terrain
+        self._unmodelled = partial(unmodelled, mission)
         rng, settings = streams(scenario.seed)["surrogate"], scenario.estimator_settings()
         self.matchability = matchability = _matchability(mission)
         self.view = view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
@@ -366,7 +369,10 @@ class SurrogateVision:
         for k, cov in enumerate(result.node_cov):
             observed, is_last = following, k == len(true) - 1
             following = None if is_last else map_model.observe(true[k + 1], estimated[k + 1])
-            patch = observed and map_model.sample_patch(observed, following, cov, self.model, noise, rng)
+            try:
+                patch = observed and map_model.sample_patch(observed, following, cov, self.model, noise, rng)
+            except FloatingPointError as error:  # so that a study counts it as unknown, not as failed
+                raise self._unmodelled([(str(error), RENDERED)]) from None
             if patch is not None:
                 mapper.fuse(patch)
             progress(k + 1)
