@@ -171,6 +171,8 @@ def test_the_source_is_named():
     )
     assert provenance_of(WaterConfig(jerlov="9C")) == "Jerlov 9C (Solonenko & Mobley 2015), turbidity 1"
     assert provenance_of(WaterConfig(jerlov="clear")) == "clear, turbidity 1"
+    # a visibility replaces the scattering of the source
+    assert provenance_of(WaterConfig(visibility_m=6)) == "Jerlov IB (Solonenko & Mobley 2015), visibility 6 m"
 
 
 @pytest.mark.parametrize("jerlov", ["I", "IB", "3C"])
@@ -188,6 +190,7 @@ def test_the_clarity_of_oceanic_waters_is_that_of_the_field():
     assert 35 < clarity(WaterConfig(jerlov="I")).secchi_m < 80
     assert 1 < clarity(WaterConfig(jerlov="9C")).secchi_m < 6
     assert clarity(WaterConfig(jerlov="clear")) == (np.inf, np.inf)
+    assert str(clarity(WaterConfig(jerlov="clear"))) == "unlimited visibility"
 
 
 @pytest.mark.parametrize(

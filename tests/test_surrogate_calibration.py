@@ -13,6 +13,7 @@ from twin.core.records import StereoObservation
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError, TwinError
 from twin.imaging.camera.true_cameras import make_true_cameras
+from twin.report.headline import headline
 from twin.scenario.file import load_scenario
 from twin.studies.flight import fly
 from twin.studies.surveys import Survey, surveys
@@ -143,11 +144,25 @@ def test_the_estimated_yaw_of_the_report_is_that_of_the_rows():
     assert observation.row_spread_ratio == pytest.approx(ratio) and ratio > 1.1
 
 
+def test_the_view_is_corrected_for_a_yaw_that_the_estimators_find():
+    view, _, rig = view_of("calibration_error.right_yaw_deg=0.1")
+    rows, points = MeasuredRows(view, rig, 11, np.random.default_rng(0)), floor_points(rig, 100)
+    corrected = rows.correct_yaw(np.deg2rad(0.1), 1e-5)
+    offset, left = (np.abs(one.measure(points)[:, 2] - points[:, 2]).max() for one in (view, corrected))
+    assert offset == pytest.approx(np.deg2rad(0.1), rel=0.6) and left < 0.02 * offset
+
+
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory):
     """Metrics of short surveys, by name of the errors."""
     names, folder = ("ideal", "baseline", "focal"), tmp_path_factory.mktemp("runs")
     return {n: survey.run(scenario(*ERRORS.get(n, ())), folder / n, outputs=()).metrics for n in names}
+
+
+def test_metrics_contain_the_visibility_of_the_water(flown):
+    water = flown["ideal"]["water"]
+    assert 0 < water["visibility_m"] < np.inf and 0 < water["secchi_m"] < np.inf
+    assert f"(visibility {water['visibility_m']:.2g} m)" in headline(flown["ideal"], scenario().model_dump())
 
 
 def test_a_survey_with_a_longer_baseline_maps_the_floor_two_percent_too_near(flown):

@@ -121,9 +121,10 @@ def _filled(values: Array, clearer: Array, murkier: Array) -> Array:
 def provenance_of(water: WaterConfig) -> str:
     """Returns the name and the source of a scenario's water as text.
 
-    If another source has the same Jerlov type, the text also compares the scattering coefficients b of both sources.
+    If another source has the same Jerlov type, the text also compares the scattering coefficients b of both sources,
+    unless a visibility determines the scattering.
     """
-    if not water.is_jerlov_type:
+    if not water.is_jerlov_type or water.visibility_m is not None:
         return water.label
     here = _scattering_at(_COMPARED_NM, water.jerlov, water.source)
     others = [

@@ -101,6 +101,8 @@ class Clarity(NamedTuple):
     secchi_m: float  #: depth at which a white disk disappears [m], 8 / (c + Kd) (Preisendorfer 1986)
 
     def __str__(self) -> str:
+        if np.isinf(self.visibility_m):
+            return "unlimited visibility"
         return f"visibility {self.visibility_m:.2g} m, Secchi depth {self.secchi_m:.2g} m"
 
 
