@@ -162,7 +162,7 @@ def flown(tmp_path_factory):
 def test_metrics_contain_the_visibility_of_the_water(flown):
     water = flown["ideal"]["water"]
     assert 0 < water["visibility_m"] < np.inf and 0 < water["secchi_m"] < np.inf
-    assert f"(visibility {water['visibility_m']:.2g} m)" in headline(flown["ideal"], scenario().model_dump())
+    assert f", visibility {water['visibility_m']:.2g} m" in headline(flown["ideal"], scenario().model_dump())
 
 
 def test_a_survey_with_a_longer_baseline_maps_the_floor_two_percent_too_near(flown):

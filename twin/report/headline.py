@@ -121,7 +121,7 @@ def conditions(scenario: Mapping[str, Any], visibility_m: float | None = None) -
     if jerlov == "clear" and not custom:
         kind, turbidity = "clear water", 1.0
     scattering = f" with {turbidity:g} times its scattering" if turbidity != 1 else ""
-    seen = f" (visibility {visibility_m:.2g} m)" if visibility_m else ""
+    seen = f", visibility {visibility_m:.2g} m" if visibility_m else ""
     rig = scenario.get("rig", {}).get("title")
     cameras = f' with the rig "{rig}"' if rig else ""
     below = "smoothed floor" if plan.get("height") == "floor" else "reference plane"
