@@ -117,6 +117,7 @@ def test_parameters_that_no_survey_determines_keep_the_values_of_the_compared_mo
         assert getattr(fitted, name) == pytest.approx(getattr(COMPARED, name), rel=1e-3), name
 
 
+@pytest.mark.long
 def test_the_fit_finds_the_scatter_between_surveys():
     """40 surveys: the scatter from median absolute values has a relative standard error of about 0.2."""
     rng = np.random.default_rng(1)
@@ -124,6 +125,7 @@ def test_the_fit_finds_the_scatter_between_surveys():
     assert fit_error_model(surveys, COMPARED).survey_scatter == pytest.approx(0.2, rel=0.4)
 
 
+@pytest.mark.long
 def test_a_few_gross_links_do_not_determine_the_bias_of_keyframes():
     surveys = [simulated(np.random.default_rng(k), TRUE) for k in range(20)]
     gross = surveys[0].samples | {"consecutive_product_images": [-50.0] * 3}
