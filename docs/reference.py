@@ -1,11 +1,23 @@
-"""Writes the reference of all keys of scenarios and studies from their models: `python docs/reference.py FOLDER`."""
+"""Writes the reference of the keys of scenarios, studies and metrics: `python docs/reference.py FOLDER`."""
 
+import inspect
 import json
 import re
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from twin.judge.consistency import consistency_metrics
+from twin.judge.map_error import map_metrics
+from twin.judge.metrics import empty_metrics
+from twin.judge.network_errors import link_metrics, stage_metrics
+from twin.judge.orthomosaic_errors import OrthomosaicJudge
+from twin.judge.survey_quality import self_check_metrics, stereo_quality
+from twin.judge.swaths import control_metrics, overlap_metrics
+from twin.judge.trajectory_errors import track_metrics, trajectory_metrics
+from twin.judge.verdict import MORE_IS_BETTER
+from twin.report.number_formats import unit_of
 from twin.scenario.model import Scenario
 from twin.studies.study_file import Study
 
@@ -19,6 +31,22 @@ SCENARIO_NOTE = (
     "[scenario guide](../guide/scenario.md)."
 )
 STUDY_NOTE = "What studies and tunings do with them is in\n[studies and tuning](../guide/studies.md)."
+METRICS_HEAD = """# Metrics
+
+Written by `python docs/reference.py docs/reference` from the functions in `twin/judge/` that compute `metrics.json`.
+A value that cannot be computed is null. `[require]` of a scenario or study limits any of them: from above, or from
+below where the table says "at least". `status` is "complete", "degraded" (a check of the estimators failed) or
+"aborted"; `reason` says why. The final path is after the alignment of all keyframes, the online one what the vehicle
+knew on the way, f2f the motion from frame to frame alone.
+
+"""
+#: Functions that compute sections of metrics.json; their docstrings describe the keys.
+_METRICS: dict[str, Callable[..., Any]] = {
+    "trajectory": trajectory_metrics, "map": map_metrics, "orthomosaic": OrthomosaicJudge.metrics,
+    "consistency": consistency_metrics, "self_check": self_check_metrics, "vision": stereo_quality,
+    "links": link_metrics, "stages": stage_metrics, "tracks": track_metrics, "control": control_metrics,
+    "overlap": overlap_metrics,
+}  # fmt: skip
 _TITLES = {"lamps": "[[lamps]]", "beacons": "[[beacons]]", "objects": "[[objects]]", "together": "[[together]]"}
 _UNIT = re.compile(r"\s*(?<!with )(?<!needs )\[([^\[\],]+)\](?=$|;)")
 _BOUNDS = {
@@ -33,7 +61,31 @@ def pages() -> dict[str, str]:
         + _tables(Scenario.model_json_schema()),
         "study.md": HEAD.format("Study keys", "a study", STUDY_NOTE)
         + _tables(Study.model_json_schema(), "Distribution"),
+        "metrics.md": METRICS_HEAD + _metrics(),
     }
+
+
+def _metrics() -> str:
+    """Returns one table for each section of metrics.json, under the description by the function that computes it."""
+    parts, empty = [], empty_metrics()
+    for section, function in _METRICS.items():
+        text = re.split(r"\n\s*(?:Args|Raises):", inspect.getdoc(function) or "")[0]
+        rows = ["| key | unit | `[require]` |", "|---|---|---|"]
+        for key in _leaves(section, empty[section]):
+            limit = "at least" if key.startswith(MORE_IS_BETTER) else "at most"
+            rows.append(f"| `{key}` | {unit_of(key)} | {limit} |")
+        table = "\n".join(rows) if len(rows) > 2 else "A list with one entry for each track."
+        parts.append(f"## `{section}`\n\n{text.strip()}\n\n{table}\n")
+    return "\n".join(parts)
+
+
+def _leaves(name: str, value: Any) -> Iterator[str]:
+    """Yields the dotted keys of the numbers under a key."""
+    if isinstance(value, dict) and value:
+        for key, part in value.items():
+            yield from _leaves(f"{name}.{key}", part)
+    elif not isinstance(value, list):
+        yield name
 
 
 def _tables(schema: dict[str, Any], *definitions: str) -> str:

@@ -21,7 +21,7 @@ SMALL = ["terrain.texture_px_m=0.02", "plan.tracks=1", "plan.area_m=[2.0, 1.6]"]
 
 
 def summary_of(*overrides):
-    return plan_summary.summarise(prepare(load_scenario("reef", [*SMALL, *overrides])))
+    return plan_summary.summarise(prepare(load_scenario("reef", ["rig.model=ideal", *SMALL, *overrides])))
 
 
 @pytest.fixture(scope="module")

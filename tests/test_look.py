@@ -21,7 +21,7 @@ SMALL = ["rig.image_width_px=128", "rig.image_height_px=96", "terrain.grid_m=0.1
 
 
 def mission(*overrides):
-    return prepare(load_scenario("reef", [*SMALL, *overrides]))
+    return prepare(load_scenario("reef", ["rig.model=ideal", *SMALL, *overrides]))
 
 
 @pytest.fixture(scope="module")

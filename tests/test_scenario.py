@@ -315,7 +315,7 @@ def test_an_imu_exists_only_with_its_section(tmp_path):
 
 
 def test_a_sensor_exists_only_with_its_section_and_survives_a_round_trip(tmp_path):
-    assert load_scenario("quickstart").sensor is None
+    assert load_scenario("paper").sensor is None
     scenario = load_scenario(written(tmp_path, "[sensor]\nbits = 8\nreadout_ms = 12.5"))
     assert scenario.sensor.bits == 8 and scenario.sensor.bayer
     assert load_scenario(written(tmp_path, dump_toml(scenario))).sensor == scenario.sensor

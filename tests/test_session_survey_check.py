@@ -92,8 +92,14 @@ def test_only_a_lasting_departure_from_the_path_is_a_finding():
 def test_removed_rectification_errors_are_reported():
     error = EpipolarError(np.array([1e-3, 0, 0, 0]), np.full(4, 1e-5), np.array([1e-3, 0, 0, 2e-3]))
     result = replace(result_at(np.zeros((1, 3))), quality=EstimationQuality(epipolar=error))
-    (note,) = calibration_notes(result, mission().rig)
-    assert "pitch of +0.057 deg" in note and f"{2e-3 * mission().rig.focal_px:+.2f} px" in note
+    rig = mission().rig
+    (note,) = calibration_notes(result, rig)
+    assert "pitch of +0.057 deg" in note and f"{2e-3 * rig.focal_px:+.2f} px" in note
+    rotated = replace(result, quality=EstimationQuality(epipolar=error._replace(removed=np.array([1e-3, 0, 0, 0]))))
+    stated, exact = replace(rig, yaw_sigma_rad=4e-4), replace(rig, yaw_sigma_rad=0.0)
+    assert calibration_notes(rotated, stated) == [] and len(calibration_notes(rotated, exact)) == 1
+    assert len(calibration_notes(rotated, replace(rig, yaw_sigma_rad=3e-4))) == 1
+    assert len(calibration_notes(result, stated)) == 1
     untouched = replace(result, quality=EstimationQuality(epipolar=error._replace(removed=np.zeros(4))))
     assert calibration_notes(untouched, mission().rig) == []
 

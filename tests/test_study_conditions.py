@@ -58,5 +58,6 @@ def test_a_study_without_sampled_keys_is_flown_in_one_condition(tmp_path):
 )
 def test_pages_name_rig_idealisations_and_sea_trial(tmp_path, line, sentence):
     lines = condition_lines(study_of(tmp_path, line))
-    assert lines[0].startswith("Rig: ") and any("no motion blur" in text for text in lines)
+    assert lines[0] == "Rig: machine-vision pair, dome ports."
+    assert any("no marine snow" in text for text in lines) == (not line)
     assert sentence in lines[-1]

@@ -37,7 +37,13 @@ from twin.world.mission import prepare
 from twin.world.pilot import make_pilot
 
 SCENES = sorted(file.stem for file in Path(scenes.__file__).parent.glob("*.toml"))
-SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=2", "plan.area_m=[2.4,1.2]", "control.hold_s=1.0"]
+SHORT = [
+    "rig.model=ideal",
+    'imaging.fidelity="surrogate"',
+    "plan.tracks=2",
+    "plan.area_m=[2.4,1.2]",
+    "control.hold_s=1.0",
+]
 MODEL = error_model_file.load().model
 LAMPS = "lamps=[{position_m=[0.25, 0.35, -0.05], pan_deg=-8.0}, {position_m=[0.25, -0.35, -0.05], pan_deg=8.0}]"
 

@@ -26,7 +26,13 @@ from twin.surrogate.snow_noise import snow_effect
 from twin.surrogate.surrogate_world import SurrogateWorld
 from twin.world.mission import prepare
 
-SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=1", "plan.area_m=[1.6,1.0]", "control.hold_s=0.5"]
+SHORT = [
+    "rig.model=ideal",
+    'imaging.fidelity="surrogate"',
+    "plan.tracks=1",
+    "plan.area_m=[1.6,1.0]",
+    "control.hold_s=0.5",
+]
 DEPTHS_M = np.linspace(1.2, 2.4, 5)
 #: Scenarios in which every kind of error is present.
 ERRORS = {

@@ -25,7 +25,13 @@ from twin.surrogate_fit.fit import SurveyStatistics, comparisons, fit_error_mode
 from twin.surrogate_fit.rendered_surveys import all_statistics, comparison_model, fit_to_surveys
 from twin.world.mission import prepare
 
-SHORT = ['imaging.fidelity="surrogate"', "plan.tracks=2", "plan.area_m=[2.4,1.2]", "control.hold_s=1.0"]
+SHORT = [
+    "rig.model=ideal",
+    'imaging.fidelity="surrogate"',
+    "plan.tracks=2",
+    "plan.area_m=[2.4,1.2]",
+    "control.hold_s=1.0",
+]
 MODEL = error_model_file.load().model
 COMPARED = comparison_model(MODEL)
 #: Error model of surveys to which models are fitted in these tests.

@@ -78,7 +78,8 @@ def test_a_floor_without_photo_is_painted_in_full_only_for_images(tmp_path, fide
 @pytest.mark.parametrize(("text", "errors"), BAD_SENSORS)
 def test_invalid_sensors_are_reported_by_line_all_at_once(tmp_path, text, errors):
     file = tmp_path / "sensor.toml"
-    file.write_text(f'extends = "{load_scenario("reef").source.path}"\n{text}\n')
+    (tmp_path / "ideal.toml").write_text('extends = "reef"\nrig.model = "ideal"\n')
+    file.write_text(f'extends = "ideal.toml"\n{text}\n')
     with pytest.raises(ScenarioError) as caught:
         prepare(load_scenario(file))
     assert caught.value.lines == [f"{file}:{error}" for error in errors]

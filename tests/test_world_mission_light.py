@@ -55,7 +55,7 @@ SMALL = ["terrain.grid_m=0.1", "terrain.texture_px_m=0.02"]
 )
 def test_invalid_light_is_reported(overrides, fault):
     with pytest.raises(ScenarioError, match=fault) as raised:
-        prepare(load_scenario("reef", [*SMALL, *overrides]))
+        prepare(load_scenario("reef", ["rig.model=ideal", *SMALL, *overrides]))
     assert len(raised.value.lines) == 1
 
 

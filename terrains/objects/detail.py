@@ -116,8 +116,9 @@ def parts_of(mesh: Mesh) -> Parts:
     cosine = np.minimum((normals @ axis[..., None])[..., 0].min(axis=1), 1.0)
     behind = (normals * (centre[:, None] - corners[:, :, 0])).sum(axis=2).max(axis=1)
     known = (cosine > 0) & ~thin.reshape(n, -1).any(axis=1)
-    cosine, sine = np.where(known, cosine, 0.0), np.where(known, np.sqrt(1 - cosine**2), 1.0)
-    return Parts(centre, (high - low) / 2, axis, np.stack([cosine, sine], axis=1), np.where(known, behind, np.inf))
+    cosine = np.where(known, cosine, 0.0)
+    cone = np.stack([cosine, np.sqrt(1 - cosine**2)], axis=1)
+    return Parts(centre, (high - low) / 2, axis, cone, np.where(known, behind, np.inf))
 
 
 def _normals(corners: Array) -> tuple[Array, Array]:

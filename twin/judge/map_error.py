@@ -32,7 +32,7 @@ def map_metrics(elevation: ElevationMap | None, truth: Truth) -> dict[str, float
     - median e|, and LE90 the 90th percentile of |e| (linear error at 90 %). sigma_ratio is the RMS of error / sigma, 1
     for correct standard deviations. completeness_area and le90_area_m are over the cells of the asked area, where a
     cell without an estimate (a hole) counts as an infinite error; an infinite percentile is None. median_m is the
-    median of |e|, and gross_share the fraction of cells with |e| > GROSS_M. floor_* and objects_* are over the cells
+    median of |e|, and gross_share the fraction of cells with |e| > 0.1 m. floor_* and objects_* are over the cells
     whose highest surface is the floor or an object; without objects, all cells are floor and objects_* are None.
     """
     if elevation is None:

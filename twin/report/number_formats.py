@@ -9,7 +9,7 @@ from typing import Any
 DASH = "–"  # noqa: RUF001
 #: Units by the suffix of a metric's name.
 _UNITS = {
-    "_m": " m", "_s": " s", "_ms": " ms", "_deg": " deg", "_px": " px", "_percent": " %", "_mb": " MiB",
+    "_m": "m", "_s": "s", "_ms": "ms", "_deg": "deg", "_px": "px", "_percent": "%", "_mb": "MiB",
 }  # fmt: skip
 
 
@@ -68,8 +68,12 @@ def plain(value: Any) -> str:
 
 def with_unit(name: str, value: float | None) -> str:
     """Returns a number as `plain` with the unit that its dotted name ends with, e.g. "0.02 m"; a dash for None."""
-    unit = next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
-    return plain(value) + (unit if value is not None else "")
+    return DASH if value is None else f"{plain(value)} {unit_of(name)}".rstrip()
+
+
+def unit_of(name: str) -> str:
+    """Returns the unit of a metric, which its dotted name ends with; "" if it has none."""
+    return next((unit for suffix, unit in _UNITS.items() if name.endswith(suffix)), "")
 
 
 def area_le90(elevation: Mapping[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Published tables of absorption and scattering from which a scenario can take its water type."""
+"""Names, citations and water types of the published tables of absorption and scattering in the package `jerlov`."""
 
 from __future__ import annotations
 

@@ -6,12 +6,13 @@ import numpy as np
 
 from twin.core.quality import Finding
 from twin.core.records import Array, ElevationMap, StereoRig, SurveyResult
-from twin.estimate.self_check import check_survey
+from twin.estimate.self_check import MAX_ROW_OFFSET_PX, check_survey
 from twin.world.mission import Mission
 
 MIN_AREA_MAPPED = 0.9  # smallest fraction of the asked area that the map may cover
 MAX_OFF_COURSE = 0.25  # largest ratio of distance from the planned path to shorter side of the image footprint
 _OFF_COURSE_S = 1.0  # shorter departures from the path are ignored
+_EXPECTED = 3.0  # largest rotation of the right camera that its calibration leads to expect [standard deviations]
 
 
 def survey_findings(
@@ -23,12 +24,15 @@ def survey_findings(
 
 
 def calibration_notes(result: SurveyResult, rig: StereoRig) -> list[str]:
-    """Returns a sentence on the rectification errors that were removed, if any."""
+    """Returns a sentence on the rectification errors that were removed, if they exceed those stated for the rig."""
     epipolar = result.quality.epipolar
     if epipolar is None or not epipolar.removed.any():
         return []
     pitch, _, roll = np.rad2deg(epipolar.removed[:3])
     shift_px = rig.focal_px * epipolar.removed[3]
+    expected_deg = _EXPECTED * np.rad2deg(rig.yaw_sigma_rad)
+    if max(abs(pitch), abs(roll)) <= expected_deg and abs(shift_px) <= MAX_ROW_OFFSET_PX:
+        return []
     return [
         f"The right camera is misaligned: a pitch of {pitch:+.3f} deg, a roll of {roll:+.3f} deg and a row offset of"
         f" {shift_px:+.2f} px were estimated and removed."

@@ -26,6 +26,7 @@ from twin.studies.statistics import Array
 
 PASSED, NOT_PASSED, LIMIT, POINTS = COLOURS["final"], COLOURS["f2f"], COLOURS["limit"], COLOURS["link"]
 _MAX_POINTS = 3000
+_LONGEST_LABEL = 20  # characters
 
 
 def draw_all(analysis: StudyAnalysis, compared: bool) -> dict[str, str]:
@@ -139,11 +140,18 @@ def _shade_answers(axes: Axes, analysis: StudyAnalysis, key: str) -> None:
             axes.axvspan(low, high, color=colour, alpha=0.18, linewidth=6 if low == high else 0)
 
 
+def _short(value: str) -> str:
+    """Returns the label of a value: of a file its name, of a long text its beginning."""
+    name = value.rpartition("/")[2]
+    return name if len(name) <= _LONGEST_LABEL else f"{name[: _LONGEST_LABEL - 1]}…"
+
+
 def _grouped(axes: Axes, analysis: StudyAnalysis, key: str, chosen: Mask) -> tuple[NDArray[np.int64], Array]:
     """Formats the x axis for a key; returns the group of each chosen survey and the x position of each group."""
     values, (groups, names) = analysis.key_numbers(key), analysis.key_groups(key, chosen)
     if values is None:
-        axes.set_xticks(range(len(names)), names, rotation=25 if max(len(name) for name in names) > 8 else 0)
+        short = [_short(name) for name in names]
+        axes.set_xticks(range(len(names)), short, rotation=25 if max(len(name) for name in short) > 8 else 0)
         axes.set_xlim(-0.5, len(names) - 0.5)
         return groups, np.arange(len(names), dtype=float)
     is_log = value_axis(axes.xaxis, values, ticks=6)

@@ -1,4 +1,4 @@
-"""Fusion of height patches into the elevation map, its standard deviation and the orthomosaic."""
+"""Fusion of height patches into the elevation map by a Kalman filter of each cell."""
 
 from __future__ import annotations
 
@@ -219,6 +219,7 @@ def _remove_propagated(
 def _fuse_cells(
     row, col, height, variance, systematic, camera, gate, heights, variances, systematics, cameras
 ):  # fmt: skip
+    """Kalman update of the cells' heights and variances with those of new patches."""
     for i in range(height.shape[0]):
         for j in range(height.shape[1]):
             z = height[i, j]
