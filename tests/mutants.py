@@ -76,14 +76,14 @@ MUTANTS = [
         ("twin/imaging/light/phase_function.py", "(1 - g**2) / (4 * np.pi * ((1 - g) ** 2 + 4 * g * np.sin(angle / 2) ** 2) ** 1.5)", "(1 - g**2) / (4 * np.pi * ((1 - g) ** 2 + 4 * g * np.sin(angle / 2) ** 2))", "imaging_phase_function"),
         ("twin/imaging/camera/sensor.py", "np.sqrt(read_variance + shot_variance * signal)", "np.sqrt(read_variance + shot_variance)", "imaging_sensor"),
         ("twin/imaging/camera/sensor.py", "self.share = 1 - np.exp(-1 / (frame_rate_hz * lag_s))", "self.share = np.exp(-1 / (frame_rate_hz * lag_s))", "imaging_sensor"),
-        ("twin/imaging/camera/lens.py", "bend = 2 * (lens.k1 + r2 * (2 * lens.k2 + 3 * r2 * lens.k3))", "bend = 2 * (lens.k1 + r2 * (lens.k2 + 3 * r2 * lens.k3))", "imaging_lens"),
-        ("twin/imaging/light/backscatter.py", "return light * phase[..., None, :] * water.scattering_per_m", "return light * phase[..., None, :] * water.scattering_per_m / 2", "imaging_daylight imaging_optics"),
+        ("twin/imaging/camera/lens.py", "3 * lens.k1, 5 * lens.k2, 7 * lens.k3", "3 * lens.k1, 3 * lens.k2, 7 * lens.k3", "imaging_lens"),
+        ("twin/imaging/light/backscatter.py", "return light * phase[..., None, :] * water.scattering_per_m", "return light * phase[..., None, :] * water.scattering_per_m / 2", "imaging_optics"),
         ("twin/imaging/scene/sway.py", "vertices[:, 2] -= deflection**2 / (2 * height_m)", "vertices[:, 2] -= deflection**2 / height_m", "imaging_sway"),
         ("twin/imaging/reference/directions.py", "low, high = (k / cells) ** 4, ((k + 1) / cells) ** 4", "low, high = (k / cells) ** 2, ((k + 1) / cells) ** 2", "imaging_reference imaging_photons"),
         # estimators
         ("twin/estimate/vision/motion_filter.py", "velocity * (interval_s**2 / 3), shared", "velocity * interval_s**2, shared", "estimate_motion_filter"),
         ("twin/estimate/vision/stereo.py", "return measured, joint / rig.focal_px**2", "return measured, joint / rig.focal_px", "estimate_motion estimate_link_noise"),
-        ("twin/estimate/vision/stereo.py", "(self.accumulated_cov - earlier.accumulated_cov)", "(self.accumulated_cov + earlier.accumulated_cov)", "estimate_network estimate_positioning"),
+        ("twin/estimate/vision/stereo.py", "(self.accumulated_cov - earlier.accumulated_cov)", "(self.accumulated_cov + earlier.accumulated_cov)", "estimate_wide_search"),
         ("twin/estimate/vision/epipolar.py", "matrix @ translation / focal_baseline", "matrix @ translation * focal_baseline", "estimate_disparity estimate_depth_filter estimate_motion"),
         ("twin/estimate/vision/light_pattern.py", "np.maximum(1 - variance / np.maximum(mean**2, 1e-12), 0) * mean", "mean", "estimate_light_pattern"),
         ("twin/estimate/mapping/depth_filter.py", "variance = (depth * depth / focal_baseline * disparity.sigma_px) ** 2", "variance = (depth / focal_baseline * disparity.sigma_px) ** 2", "estimate_depth_filter"),
@@ -98,7 +98,7 @@ MUTANTS = [
         ("twin/estimate/navigation/vertical.py", "up = ahead * information[0][:, None] + back[::-1] * information[1][:, None]", "up = ahead * information[1][:, None] + back[::-1] * information[0][:, None]", "estimate_vertical"),
         ("twin/estimate/adjustment/pose_graph.py", "damping / 10 if damping > _MIN_DAMPING else 0.0", "damping * 10 if damping > _MIN_DAMPING else 0.0", "estimate_pose_graph"),
         ("twin/estimate/adjustment/pose_graph.py", 'shared = cov @ (-equations.shared_gradient - np.einsum("nak,na->k", equations.border, poses))', "shared = cov @ -equations.shared_gradient", "estimate_pose_graph estimate_aiding"),
-        ("twin/estimate/link_selection.py", "return 1 / (1 - min(overlap, _LARGEST_OVERLAP))", "return 1 / (2 - min(overlap, _LARGEST_OVERLAP))", "estimate_network estimate_link_noise"),
+        ("twin/estimate/link_selection.py", "return 1 / (1 - min(overlap, _LARGEST_OVERLAP))", "return 1 / (2 - min(overlap, _LARGEST_OVERLAP))", "estimate_positioning"),
         ("twin/estimate/self_check.py", "quality.frames_lost / max(n, 1), MAX_FRAMES_LOST", "quality.frames_lost / max(2 * n, 1), MAX_FRAMES_LOST", "estimate_self_check"),
         # judge
         ("twin/judge/consistency.py", "in_camera = np.einsum(\"nji,nj->ni\"", "in_camera = np.einsum(\"nij,nj->ni\"", "judge_metrics judge_trajectory"),
@@ -110,12 +110,12 @@ MUTANTS = [
         ("twin/judge/verdict.py", "value >= limit if more_is_better(name) else value <= limit", "value > limit if more_is_better(name) else value < limit", "judge_metrics"),
         # exchange
         ("twin/datasets/ros2/bag_writer.py", "return air_pa + PASCAL_PER_METRE * (surface_m - height_m)", "return air_pa + PASCAL_PER_METRE * (height_m - surface_m)", "exchange_ros2"),
-        ("twin/exchange/geotiff.py", "cell = grid.cell_m / origin.metres_per_unit", "cell = grid.cell_m * origin.metres_per_unit", "exchange_map terrains_georeference"),
+        ("twin/exchange/geotiff.py", "cell = grid.cell_m / origin.metres_per_unit", "cell = grid.cell_m * origin.metres_per_unit", "world_placement"),
         ("twin/exports/attitude.py", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(pitch)), float(np.rad2deg(roll))", "float(np.rad2deg(yaw)) % 360.0, float(np.rad2deg(roll)), float(np.rad2deg(pitch))", "exchange_datasets"),
         # plug-ins, world, surrogate, sessions
         ("twin/plugin/guard.py", "max(error, turned) > _ROTATION_TOLERANCE", "error > _ROTATION_TOLERANCE", "plugin_guard"),
         ("twin/plugin/guard.py", "function(*copy.deepcopy(arguments))", "function(*arguments)", "plugin_guard"),
-        ("twin/world/planning.py", "(duration_s + hold_s * plan.n_tracks)", "(duration_s + hold_s)", "world_mission hostile_input"),
+        ("twin/world/planning.py", "(duration_s + hold_s * plan.n_tracks)", "(duration_s + hold_s)", "world_planning"),
         ("twin/world/path_checks.py", "2 * int(reach_m * side / terrain.spacing_m) + 1", "2 * int(reach_m * side / terrain.spacing_m / 8) + 1", "world_slopes"),
         ("twin/world/planning.py", "extent = height_m / request.altitude_m /", "extent = height_m**0 /", "world_slopes"),
         ("controllers/camera_surface.py", "self.max_climb * run_m / rise_m", "2 * self.max_climb * run_m / rise_m", "world_slopes"),
@@ -189,7 +189,9 @@ def tests_pass(tests, mutant=None):
     """Returns whether test modules pass in a copy of the project, with a mutant if one is given."""
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder) / "project"
-        shutil.copytree(ROOT, copy, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache"))
+        shutil.copytree(
+            ROOT, copy, symlinks=True, ignore=shutil.ignore_patterns(".git", ".venv", "runs", "__pycache__", ".*_cache")
+        )
         if mutant:
             file = copy / mutant.file
             file.write_text(file.read_text(encoding="utf-8").replace(mutant.old, mutant.new), encoding="utf-8")

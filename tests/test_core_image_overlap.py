@@ -42,6 +42,15 @@ def test_overlap_over_a_level_floor_is_that_of_the_footprints(step_m, floor_m):
     assert image_overlap(level(floor_m), first, across, RIG)[0] == pytest.approx(max(0, 1 - step_m / width_m), abs=1e-9)
 
 
+@pytest.mark.parametrize("aside_m", [0.61, 0.623, 0.64, 0.66])
+def test_parts_of_cells_count_where_the_second_image_is_taken_from_lower_down(aside_m):
+    """From half the height, the footprint has half the sides; it ends in the middle of cells of the first image."""
+    width_m, length_m = (2.0 * pixels / RIG.focal_px for pixels in (RIG.width_px, RIG.height_px))
+    shown_m = width_m / 2 + width_m / 4 - aside_m
+    found = image_overlap(level(), looking_down(0, 0, 2), looking_down(0, aside_m, 1), RIG)[0]
+    assert found == pytest.approx(shown_m / width_m * (length_m / 2) / length_m, abs=1e-6)
+
+
 def test_over_a_step_each_half_of_the_image_has_the_overlap_of_its_height():
     y = np.arange(-400, 401) * 0.01
     field = height_field(np.where(y > 0, 0.5, 0.0)[:, None] * np.ones((1, 801)), 0.01, -4.0, -4.0)

@@ -12,7 +12,7 @@ from twin.imaging.light.illumination import Illumination, daylight_at
 from twin.imaging.light.lamp_light import LampLight
 from twin.imaging.light.lamps import LED_BEAM, beam_share, colour, light_sources_in_camera
 from twin.imaging.light.optics import Optics, SceneView, WaterSurface
-from twin.imaging.light.phase_function import Scatterer, phase_of
+from twin.imaging.light.phase_function import Scatterer, phase_at, phase_of
 from twin.imaging.light.spectra import CENTRE_NM, NM, WIDTH_NM, band_weights, spectrum_of
 from twin.imaging.light.water import (
     downwelling_per_m,
@@ -120,6 +120,17 @@ def optics_and_sources(jerlov, camera, sun=ABOVE):
     water = WaterConfig(jerlov=jerlov)
     optics = optics_with(water, TWO_LAMPS, sun, altitude_m=2.0)
     return optics, optics.lamp_light[camera], medium(water, "single")
+
+
+@WORLDS
+def test_the_veil_of_daylight_scattered_once_is_a_geometric_series(jerlov):
+    """Light falls as exp(-K z) to the depth z below the camera, and is lost as exp(-c r) over the range r to it."""
+    water, day = medium(WaterConfig(jerlov=jerlov), "single"), optics_and_sources(jerlov, 0)[1].sources.daylight
+    optics, cosine = optics_with(WaterConfig(jerlov=jerlov), (), ABOVE, altitude_m=2.0), rays()[CENTRE][2]
+    lost = day.attenuation_per_m * cosine + day.camera_loss_per_m
+    phase = phase_at(water.scatterers, np.array([-cosine]))[0]
+    expected = day.illuminance_lx * water.scattering_per_m * phase * -np.expm1(-lost * 2.0 / cosine) / lost
+    np.testing.assert_allclose(optics.radiance(*floor(2.0, 0), 0)[CENTRE], expected, rtol=0.01)
 
 
 @WORLDS

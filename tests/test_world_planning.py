@@ -19,7 +19,7 @@ from twin.terrains import Terrain, TextureSource
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread
 from twin.world.mission import prepare
 from twin.world.path_checks import check_thrust, climb_slope
-from twin.world.planning import plan_survey, planned_keyframes, survey_request
+from twin.world.planning import MAX_FRAMES, check_plan_size, plan_survey, planned_keyframes, survey_request
 from twin.world.top_surface import true_heights
 
 SMALL = ["terrain.texture_px_m=0.2", "plan.area_m=[3.0, 1.6]", "plan.altitude_m=2.0"]
@@ -282,3 +282,10 @@ def test_without_a_current_a_level_plan_needs_no_check():
     hopeless = dataclasses.replace(mission.plan, speed_mps=9.0)
     check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, hopeless)  # that is `check_speed`'s
     assert survey_request(mission.scenario, mission.terrain).along_scale == 1
+
+
+def test_the_time_at_the_start_of_each_track_counts_in_the_size_of_a_plan():
+    hold_s = 0.7 * MAX_FRAMES / 30.0
+    check_plan_size(plan_survey(scenario("plan.tracks=1"), None), hold_s)
+    with pytest.raises(TwinError, match="frames"):
+        check_plan_size(plan_survey(scenario("plan.tracks=2"), None), hold_s)
