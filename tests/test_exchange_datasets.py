@@ -27,6 +27,8 @@ from twin.exports import ifdo, metashape, nerfstudio
 from twin.exports.attitude import yaw_pitch_roll_deg
 from twin.exports.camera_models import true_calibration
 from twin.exports.formats import FORMATS, check_needs, chosen_formats
+from twin.recordings.opened_dataset import ReplayOptions
+from twin.recordings.rectification import rectification
 from twin.scenario.model import Scenario
 
 N = 5
@@ -352,6 +354,21 @@ def turned(seconds, rate_hz=120.0):
     readings = ImuReadings(np.arange(len(values)) / rate_hz, values[:, :3], values[:, 3:])
     path = Trajectory(np.arange(0, len(values), 24) / rate_hz, bodies[::24] @ RIG.body_from_camera)
     return RecordedImu(readings, rate_hz, NOISE), path
+
+
+def test_standard_deviations_of_the_calibration_survive_in_a_euroc_folder(contents, tmp_path):
+    rig = replace(contents.rig, yaw_sigma_rad=6e-4, baseline_sigma=5e-4)
+    euroc.export(replace(contents, rig=rig), tmp_path)
+    stated = read_dataset(tmp_path)[0].calibration
+    read = rectification(ReplayOptions().with_sigmas(stated), 30.0).rig
+    assert (read.yaw_sigma_rad, read.baseline_sigma) == pytest.approx((6e-4, 5e-4))
+    given = ReplayOptions(rotation_sigma_deg=0.1, baseline_sigma_mm=0.0).with_sigmas(stated)
+    assert (given.rotation_sigma_deg, given.baseline_sigma) == (0.1, 0.0)
+    with pytest.raises(TwinError, match="rotation_sigma_deg: 3 .*0 to 2"):
+        ReplayOptions(rotation_sigma_deg=3.0).with_sigmas(stated)
+    file = tmp_path / "mav0" / "cam1" / "sensor.yaml"
+    file.write_text(file.read_text().replace("baseline_sigma_mm", "baseline_sigma"))
+    assert "calibration_error.baseline_sigma_mm is missing" in str(read_dataset(tmp_path)[0].calibration)
 
 
 def test_true_heights_lie_beside_the_true_poses_of_a_euroc_folder(contents, tmp_path):

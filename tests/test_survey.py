@@ -163,7 +163,8 @@ def test_every_aid_reaches_position_and_alignment(tmp_path):
 
 @pytest.mark.long
 def test_mosaic_and_alignment_can_be_left_out(tmp_path):
-    result = fly(tmp_path / "run", "estimate.use_ga=false", "estimate.use_f2m=false", "plan.area_m=[0.3, 0.5]")
+    keys = "rig.model=ideal", "estimate.use_ga=false", "estimate.use_f2m=false", "plan.area_m=[0.3, 0.5]"
+    result = fly(tmp_path / "run", *keys)
     assert result.status == "complete"
     assert result.metrics["trajectory"]["final"]["ate_rmse_m"] < 0.05
     assert result.metrics["timing"]["stages"]["ga"]["count"] == 0

@@ -13,6 +13,7 @@ import trimesh
 from twin import terrains
 from twin.errors import TwinError
 from twin.scenario.model import ObjectConfig, Scenario, TerrainConfig
+from twin.terrains import Terrain
 from twin.terrains.ground_cover import COVERS
 from twin.terrains.objects import mesh_file, scattering
 from twin.terrains.objects.coloured_mesh import Mesh, with_colours
@@ -70,12 +71,13 @@ def test_the_triangles_of_a_textured_file_are_limited_however_many_parts_it_has(
 
 
 def textured_square(shift_m=0.0):
-    """Returns a square with a texture that is dark in the west and bright in the east, over 2 m."""
+    """Returns a square with a texture whose red and blue increase to the east, and its green to the north, over 2 m."""
     from PIL import Image
 
-    ramp = np.repeat(np.linspace(0, 255, 256).astype(np.uint8)[None, :, None], 3, axis=2).repeat(4, axis=0)
+    east = np.tile(np.linspace(0, 255, 256).astype(np.uint8), (256, 1))
+    ramp = np.stack([east, east.T[::-1], east], axis=2)
     corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float) + [shift_m, 0, 0]
-    uv = np.array([[0.001, 0], [0.999, 0], [0.999, 1], [0.001, 1]])
+    uv = np.array([[0.001, 0.001], [0.999, 0.001], [0.999, 0.999], [0.001, 0.999]])
     visual = trimesh.visual.TextureVisuals(uv, image=Image.fromarray(ramp))
     return trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False)
 
@@ -84,7 +86,7 @@ def test_a_texture_becomes_the_colours_of_the_vertices(tmp_path):
     textured_square().export(tmp_path / "square.glb")
     mesh = read(tmp_path / "square.glb")
     assert mesh_file.TEXTURED_FACES / 4 < len(mesh.faces) <= mesh_file.TEXTURED_FACES
-    assert np.abs(mesh.colours[:, 0] - (mesh.vertices_m[:, 0] + 1) / 2 * 255).max() < 2
+    assert np.abs(mesh.colours[:, :2] - (mesh.vertices_m[:, :2] + 1) / 2 * 255).max() < 2
 
 
 def material_box(factor, texture=None):
@@ -198,6 +200,14 @@ def test_sizes_are_log_normal():
     logs = np.log(sizes / 0.1)
     assert abs(logs.mean()) < 3 * 0.3 / np.sqrt(480) and 0.24 < logs.std() < 0.3  # a cut at 2 sigma takes 4 %
     assert np.abs(logs).max() <= 0.6 + 1e-9
+
+
+def test_the_slope_of_a_plane_is_its_angle_whatever_the_reach():
+    nodes_m = np.arange(41) * 0.1 - 2.0
+    height_m = np.tan(np.deg2rad(20.0)) * (0.6 * nodes_m + 0.8 * nodes_m[:, None])
+    plane = Terrain(height_m.astype(np.float32), 0.1, -2.0, -2.0, np.zeros((2, 2, 3), np.uint8), 2.0)
+    for reach_m in (0.1, 0.35):
+        np.testing.assert_allclose(scattering.slope_deg(plane, np.zeros(1), np.ones(1), reach_m), 20.0, rtol=1e-4)
 
 
 @pytest.mark.parametrize(("ground", "steep"), [("sand", False), ("slopes", True)])

@@ -374,6 +374,15 @@ def replay(
         Path | None,
         option("True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.", "FILE"),
     ] = None,
+    rotation_sigma: Annotated[
+        float | None,
+        option(
+            "Standard deviation of the rotation between the cameras since the calibration; estimates the yaw.", "DEG"
+        ),
+    ] = None,
+    baseline_sigma: Annotated[
+        float | None, option("The same of the distance between the cameras; estimates the baseline.", "MM")
+    ] = None,
     as_json: MetricsJson = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
@@ -386,6 +395,7 @@ def replay(
     options = recorded.ReplayOptions(
         calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer),
         topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
+        rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma,
     )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:

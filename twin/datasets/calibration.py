@@ -13,6 +13,8 @@ from twin.core.geometry import Array
 from twin.core.records import StereoRig
 from twin.errors import TwinError
 
+#: Fields of a `StereoCalibration` that say how far it can be from the truth, and their largest values.
+SIGMAS = {"rotation_sigma_deg": 2.0, "baseline_sigma_mm": 20.0}
 _MOST_PX = 16384  # largest side of an image
 _LONGEST_BASELINE_M = 10.0
 _SHORTEST_FOCAL = 0.05  # smallest focal length as a fraction of the image size; a fisheye lens of 180 degrees has 0.3
@@ -56,6 +58,10 @@ class StereoCalibration:
     file: Path = Path()  #: file of the calibration, for messages
     #: RMS distance between image points by these models and by the cameras to which they were fitted; 0: exact.
     residual_px: float = 0.0
+    #: standard deviations of the rotation between the cameras about each axis, and of their distance, since the
+    #: calibration; 0: exact
+    rotation_sigma_deg: float = 0.0
+    baseline_sigma_mm: float = 0.0
 
     @property
     def baseline_m(self) -> float:
@@ -64,6 +70,11 @@ class StereoCalibration:
     @property
     def left_from_right(self) -> Array:
         return geometry.inverse(self.right_from_left)
+
+    @property
+    def baseline_sigma(self) -> float:
+        """Returns the standard deviation of the relative change of the baseline."""
+        return self.baseline_sigma_mm / 1000 / self.baseline_m
 
     def left_from(self, side: str) -> Array:
         """Returns the pose (4, 4) of the "left" or the "right" camera in the axes of the left one."""
@@ -115,6 +126,9 @@ def checked(calibration: StereoCalibration) -> StereoCalibration:
         faults.append(("the rotation between the cameras is not a rotation matrix", ""))
     else:
         faults.append(_wrong_baseline(pose))
+    for key, most in SIGMAS.items():
+        if not 0 <= (sigma := getattr(calibration, key)) <= most:
+            faults.append((f"{key}: {sigma:g}", f"0 to {most:g}"))
     if fault := next(filter(None, faults), None):
         raise TwinError(str(calibration.file), *fault)
     return replace(calibration, right_from_left=geometry.nearest_rigid(pose))

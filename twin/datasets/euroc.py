@@ -5,8 +5,10 @@ In the files, times are in nanoseconds and true poses those of the body; in a `D
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +16,8 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig, Trajectory
-from twin.datasets.calibration import StereoCalibration, checked, is_rigid
+from twin.datasets.calibration import SIGMAS, StereoCalibration, checked, is_rigid
+from twin.datasets.calibration_values import numbers_of, table_of
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, trajectory_of, value_or_error
 from twin.datasets.image_copy import copy_images
 from twin.datasets.kalibr import camera_of, pose_of
@@ -23,6 +26,7 @@ from twin.datasets.sensor_folders import pose_table, read_folder, timestamp_ns, 
 from twin.datasets.text_files import inside, read_table, read_yaml, text_rows
 from twin.errors import TwinError
 
+_ERROR = "calibration_error"  # key of our own, beside those of EuRoC, for standard deviations of the calibration
 _CAMERAS = {"left": "cam0", "right": "cam1"}
 _TRUTH = ("state_groundtruth_estimate0", "pose_groundtruth", "vicon0")  # folders with true poses; the first is written
 _TRUE_MAP = "dem_truth.tif"  # file of true heights in such a folder
@@ -94,7 +98,12 @@ def _calibration(root: Path) -> StereoCalibration | None:
     trees = [read_yaml(file) for file in files]
     left, right = (camera_of(tree, file) for tree, file in zip(trees, files, strict=True))
     body_from_left, body_from_right = (pose_of(tree, "T_BS", file) for tree, file in zip(trees, files, strict=True))
-    return checked(StereoCalibration(left, right, geometry.inverse(body_from_right) @ body_from_left, files[1]))
+    calibration = StereoCalibration(left, right, geometry.inverse(body_from_right) @ body_from_left, files[1])
+    if (error := trees[1].get(_ERROR)) is not None:
+        given = table_of(error, files[1])
+        sigmas = {key: float(numbers_of(given.get(key), files[1], f"{_ERROR}.{key}", (1,))[0]) for key in SIGMAS}
+        calibration = replace(calibration, **sigmas)
+    return checked(calibration)
 
 
 def _body_from_left(root: Path) -> Array | None:
@@ -116,7 +125,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     """
     root, rig = folder / "mav0", contents.rig
     _write_camera(root / "cam0", rig, rig.body_from_camera)
-    _write_camera(root / "cam1", rig, rig.body_from_camera @ rig.left_from_right)
+    _write_camera(root / "cam1", rig, rig.body_from_camera @ rig.left_from_right, with_error=True)
 
     def stem(side: str, frame: RecordedFrame) -> Path:
         return root / _CAMERAS[side] / "data" / str(timestamp_ns(frame.time_s))
@@ -131,7 +140,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     return [root]
 
 
-def _write_camera(folder: Path, rig: StereoRig, body_from_camera: Array) -> None:
+def _write_camera(folder: Path, rig: StereoRig, body_from_camera: Array, with_error: bool = False) -> None:
     (folder / "data").mkdir(parents=True, exist_ok=True)
     tree = {
         "sensor_type": "camera",
@@ -143,6 +152,9 @@ def _write_camera(folder: Path, rig: StereoRig, body_from_camera: Array) -> None
         "distortion_model": "radial-tangential",
         "distortion_coefficients": [0.0] * 4,
     }
+    if with_error and (rig.yaw_sigma_rad or rig.baseline_sigma):
+        sigmas = math.degrees(rig.yaw_sigma_rad), 1000 * rig.baseline_sigma * rig.baseline_m
+        tree[_ERROR] = dict(zip(SIGMAS, sigmas, strict=True))
     write_sensor(folder, tree)
 
 

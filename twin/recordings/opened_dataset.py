@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -13,6 +13,7 @@ from twin.core.geometry import Array
 from twin.core.records import Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.user_files import is_file, resolved
+from twin.datasets.calibration import SIGMAS, StereoCalibration, checked
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.calibration_values import READ
 from twin.datasets.dataset import Dataset
@@ -53,6 +54,9 @@ class ReplayOptions:
             whose poses the map is built; None: the estimators of `twin.estimate`.
         aiding: whether recorded readings of pressure, attitude, DVL and IMU are used.
         true_map: GeoTIFF of the true heights [m] in the frame of the true poses; None: that of the data set.
+        rotation_sigma_deg, baseline_sigma_mm: standard deviations of the rotation between the cameras (about each axis)
+            and of the baseline since the calibration; above 0, yaw and baseline are estimated. None: those of the data
+            set, which are 0 unless the twin exported it.
     """
 
     calibration: Path | None = None
@@ -66,6 +70,13 @@ class ReplayOptions:
     estimator: str | None = None
     aiding: bool = True
     true_map: Path | None = None
+    rotation_sigma_deg: float | None = None
+    baseline_sigma_mm: float | None = None
+
+    def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
+        """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
+        given = {key: value for key in SIGMAS if (value := getattr(self, key)) is not None}
+        return checked(replace(calibration, **given)) if given else calibration
 
 
 class OpenedDataset(NamedTuple):
@@ -109,7 +120,7 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
     if calibration is None:
         raise TwinError(str(folder), "has no calibration", f"--calibration FILE: {READ}")
-    frames = RecordedFrames(dataset, _sound(calibration), options.bayer)
+    frames = RecordedFrames(dataset, options.with_sigmas(_sound(calibration)), options.bayer)
     truth = _truth(dataset, frames, None if in_bag else options.truth)
     pair = inspect_pair(frames.first_pair(), frames.rectification.rig, options.settings)
     if pair.swapped:

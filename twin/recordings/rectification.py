@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal, NamedTuple
 
 import cv2
@@ -54,7 +55,7 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Recti
     assert left.size_px is not None
     width_px, height_px = left.size_px
     if is_rectified(calibration):
-        rig = _rig(left.matrix, calibration.baseline_m, left.size_px, frame_rate_hz)
+        rig = _rig(left.matrix, calibration, left.size_px, frame_rate_hz)
         equal = np.abs(left.matrix - right.matrix).max() < _EQUAL_PX
         return Rectification(rig, np.eye(4), (None, None if equal else _maps(right, np.eye(3), rig)))
     if left.kind != right.kind:
@@ -73,7 +74,7 @@ def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Recti
     left_turn, right_turn, projection, _ = (np.asarray(turn, np.float64) for turn in turns)
     if not (np.isfinite(projection).all() and projection[0, 0] > 1):
         raise TwinError(str(calibration.file), "the views of the two cameras do not overlap", "a stereo pair")
-    rig = _rig(projection[:, :3], calibration.baseline_m, left.size_px, frame_rate_hz)
+    rig = _rig(projection[:, :3], calibration, left.size_px, frame_rate_hz)
     maps = _maps(left, left_turn, rig), _maps(right, right_turn, rig)
     return Rectification(rig, geometry.pose(left_turn.T, np.zeros(3)), maps)
 
@@ -92,15 +93,17 @@ def is_rectified(calibration: StereoCalibration) -> bool:
     return bool(parallel and aligned and equal and not left.distortion.any() and not right.distortion.any())
 
 
-def _rig(matrix: Array, baseline_m: float, size_px: tuple[int, int], frame_rate_hz: float) -> StereoRig:
+def _rig(matrix: Array, calibration: StereoCalibration, size_px: tuple[int, int], frame_rate_hz: float) -> StereoRig:
     return StereoRig(
         width_px=size_px[0],
         height_px=size_px[1],
         focal_px=float(matrix[0, 0]),
-        baseline_m=baseline_m,
+        baseline_m=calibration.baseline_m,
         frame_rate_hz=frame_rate_hz,
         focal_y_px=None if matrix[0, 0] == matrix[1, 1] else float(matrix[1, 1]),
         principal_point_px=(float(matrix[0, 2]), float(matrix[1, 2])),
+        yaw_sigma_rad=math.radians(calibration.rotation_sigma_deg),
+        baseline_sigma=calibration.baseline_sigma,
     )
 
 
