@@ -56,12 +56,13 @@ def test_the_pass_probability_includes_aborted_surveys(study, analysis):
     assert f"{analysis.passed.sum()} of 64 surveys were completed" in sentences.headline(analysis)
 
 
-def test_failed_surveys_are_not_counted(tmp_path):
+def test_failed_surveys_are_unknown_results(tmp_path):
     study = study_of(tmp_path)
     half = analyse(study, tmp_path, lambda survey: fail(survey) if survey.sample % 2 else fly(survey))
     assert half.evaluated.sum() == 6
-    assert half.pass_probability.value == half.passed[half.evaluated].mean()
-    failed = "6 more surveys failed because of the computer or the program and are not counted"
+    n_passed = int(half.passed.sum())
+    assert half.pass_probability == wilson_interval(n_passed, 6, unknown=6)
+    failed = "6 surveys failed because of the computer or the program, so their results are unknown"
     assert failed in sentences.headline(half)
 
 
@@ -105,8 +106,9 @@ def test_a_single_failed_survey_is_singular(tmp_path):
     study = study_of(tmp_path)
     rest = analyse(study, tmp_path, lambda survey: fail(survey) if survey.sample == 3 else fly(survey))
     headline = sentences.headline(rest)
-    assert " 1 more survey failed because of the computer or the program and is not counted; if it had not " in headline
-    assert headline.endswith("Use --resume to fly it again.")
+    assert headline.endswith(
+        "1 survey failed because of the computer or the program, so its result is unknown; --resume flies it again."
+    )
 
 
 def test_warnings_of_repeated_surveys_count_once(tmp_path):

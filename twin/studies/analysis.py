@@ -77,10 +77,10 @@ class RefusedSample(NamedTuple):
 class StudyAnalysis:
     """Statistics of the results table of a study; the table and the array attributes (n,) have one row per survey.
 
-    Refused and failed surveys have no result and are excluded from every statistic except the lists of reasons. Those
-    that only the surrogate refuses (`unmodelled`) count in pass probabilities, as unknown results, and in the bounds of
-    metrics, as values that may be anything. Surveys of the same scenario with the same seed are identical and count
-    once, except in `sobol`.
+    Refused surveys have no result and are excluded from every statistic except the lists of reasons. Those that only
+    the surrogate refuses (`unmodelled`), and failed ones, are `unknown`: they count in pass probabilities, as unknown
+    results, and in the bounds of metrics, as values that may be anything. Surveys of the same scenario with the same
+    seed are identical and count once, except in `sobol`.
 
     `planned` is the number of surveys of the study; None: all of them are in the table.
     """
@@ -93,8 +93,9 @@ class StudyAnalysis:
         unmodelled = self.refused & (self.numbers("unmodelled") == 1)
         self.duplicate = self._duplicates(~self.failed & (unmodelled | ~self.refused))
         self.unmodelled = unmodelled & ~self.duplicate
+        self.unknown = self.unmodelled | self.failed
         self.evaluated = ~(self.refused | self.failed | self.duplicate)
-        self.counted = self.evaluated | self.unmodelled  # in pass probabilities
+        self.counted = self.evaluated | self.unknown  # in pass probabilities
         self.complete = self.evaluated & (self.status == "complete")
         self.keys = [key for key in study.varied_keys if f"vary.{key}" in rows.column_names]
         self.limits = self._limits()
@@ -159,7 +160,7 @@ class StudyAnalysis:
 
     def proportion(self, chosen: Mask | NDArray[np.int64]) -> Proportion:
         """Returns the pass probability of the chosen surveys, which are all in `counted`."""
-        return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unmodelled[chosen])
+        return statistics.clustered_proportion(self.passed[chosen], self.clusters[chosen], self.unknown[chosen])
 
     @property
     def requirement_missed(self) -> bool:
@@ -189,7 +190,7 @@ class StudyAnalysis:
     def _metric_summary(self, name: str) -> MetricSummary:
         included = self.included(name)
         data, clusters = self.numbers(name)[included], self.clusters[included]
-        further = self.clusters[self.unmodelled]
+        further = self.clusters[self.unknown]
         median, bound = (
             statistics.bootstrap_with_unknown(data, lambda v, q=q: statistics.percentile(v, q), clusters, further)
             for q in (50.0, 5.0 if more_is_better(name) else 95.0)
@@ -247,7 +248,7 @@ class StudyAnalysis:
         """Returns the results of the surveys that count in pass probabilities, in the order of the table."""
         chosen, required = self.counted, self.required_probability
         required = np.nan if required is None else required
-        return PassRecord(self.passed[chosen], self.clusters[chosen], required, self.unmodelled[chosen])
+        return PassRecord(self.passed[chosen], self.clusters[chosen], required, self.unknown[chosen])
 
     @cached_property
     def regressions(self) -> dict[str, KeyRegression]:

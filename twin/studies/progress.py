@@ -51,7 +51,7 @@ class StudyProgress:
 
     def add(self, row: Row) -> None:
         self.ended.update(["all", row["status"]])
-        self.ended.update(passed=has_passed(row), unmodelled=bool(row.get("unmodelled")))
+        self.ended.update(passed=has_passed(row), unknown=row["status"] == "failed" or bool(row.get("unmodelled")))
         if self.print_surveys:
             line = survey_line(row)
             self.print_line(line if self.bar else f"{self.done}/{self.total} {line}; {self}")
@@ -81,7 +81,7 @@ class StudyProgress:
         evaluated = self.done - self.ended["failed"] - self.ended["refused"]
         if not evaluated:
             return failures
-        estimate = wilson_interval(self.ended["passed"], evaluated, unknown=self.ended["unmodelled"])
+        estimate = wilson_interval(self.ended["passed"], evaluated, unknown=self.ended["unknown"])
         most = f" to {100 * estimate.most:.0f}" if estimate.most > estimate.value else ""
         passing = f"{100 * estimate.value:.0f}{most} % pass ({100 * estimate.low:.0f} to {100 * estimate.high:.0f} %)"
         return f"{passing}, {failures}" if failures else passing

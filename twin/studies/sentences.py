@@ -242,12 +242,11 @@ def _failed(analysis: StudyAnalysis) -> list[str]:
     n = int(analysis.failed.sum())
     if not n:
         return []
-    lowest = percent(float(analysis.passed.sum()) / (n + int(analysis.counted.sum())))
-    many, one = (f"{n} more surveys", "are", "none of them had", "them"), ("1 more survey", "is", "it had not", "it")
-    subject, verb, none, again = one if n == 1 else many
+    subject, result, again = (
+        ("1 survey", "its result is", "it") if n == 1 else (f"{n} surveys", "their results are", "them")
+    )
     return [
-        f"{subject} failed because of the computer or the program and {verb} not counted; if {none} passed, the pass "
-        f"probability would be {lowest}. Use --resume to fly {again} again."
+        f"{subject} failed because of the computer or the program, so {result} unknown; --resume flies {again} again."
     ]
 
 

@@ -62,8 +62,14 @@ def wilson_interval(successes: float, n: float, unknown: int = 0) -> Proportion:
     return Proportion(p, low if p > 0 else 0.0, high if p < 1 else 1.0, p)  # exact bounds at 0 and 1
 
 
-def exact_interval(successes: int, n: int) -> Proportion:
-    """Returns the proportion of successes in independent trials with its interval by Clopper and Pearson (1934)."""
+def exact_interval(successes: int, n: int, unknown: int = 0) -> Proportion:
+    """Returns the proportion of successes in independent trials with its interval by Clopper and Pearson (1934).
+
+    `unknown` is the number of further trials, whose outcome is unknown.
+    """
+    if unknown:
+        worst, best = (exact_interval(successes + k, n + unknown) for k in (0, unknown))
+        return Proportion(worst.value, worst.low, best.high, best.value)
     if n <= 0:
         return Proportion(np.nan, 0.0, 1.0, np.nan)
     low = betaincinv(successes, n - successes + 1, (1 - LEVEL) / 2) if successes else 0.0

@@ -30,7 +30,7 @@ class Verification(NamedTuple):
 
     @property
     def probability(self) -> Proportion:
-        return exact_interval(self.n_passed, self.surveys - self.n_failed)
+        return exact_interval(self.n_passed, self.surveys - self.n_failed, self.n_failed)
 
     @property
     def shown(self) -> bool:
@@ -40,8 +40,7 @@ class Verification(NamedTuple):
     @property
     def needed(self) -> float:
         """Returns the number of rendered surveys that show the required pass probability, if no more of them fail."""
-        n_missed = self.surveys - self.n_failed - self.n_passed
-        return trials_to_show(self.required, n_missed) + self.n_failed
+        return trials_to_show(self.required, self.surveys - self.n_passed)
 
     @property
     def rejected(self) -> bool:
