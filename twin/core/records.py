@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.links import Links
 from twin.core.quality import EstimationQuality
+from twin.core.refraction import FlatPort
 
 Image = NDArray[np.uint8]
 Map = NDArray[np.float32]
@@ -48,6 +49,7 @@ class StereoRig:
     #: the baseline since the calibration; 0: exact, and not estimated.
     yaw_sigma_rad: float = 0.0
     baseline_sigma: float = 0.0
+    port: FlatPort | None = None  #: flat ports in front of the lenses, for which matched points are corrected
 
     @property
     def fx_px(self) -> float:
@@ -105,6 +107,18 @@ class StereoRig:
     def normalised(self, pixels: NDArray[np.floating]) -> Array:
         """Returns normalised coordinates (n, 2) = (pixel - principal point) / focal length of pixels (n, 2)."""
         return (pixels.astype(np.float64) - [self.cx_px, self.cy_px]) / self.focals_px
+
+    def without_refraction(self, left: NDArray[Any], right: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Returns the pixels (..., 2) of matched points in both images as pinhole cameras would see them."""
+        if self.port is None:
+            return left, right
+        depth_m = self.fx_px * self.baseline_m / np.maximum(left[..., 0] - right[..., 0], 0.5)
+        centre = np.array([self.cx_px, self.cy_px])
+        first, second = (
+            self.port.pinhole_positions((px - centre) / self.focals_px, depth_m) * self.focals_px + centre
+            for px in (left, right)
+        )
+        return first, second
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from pydantic_core import CoreSchema, PydanticCustomError
 
 from twin.core import geometry
 from twin.core.records import SensorNoise, StereoRig
+from twin.core.refraction import FlatPort
 from twin.core.settings import EstimatorSettings
 from twin.core.user_files import path_problem
 from twin.errors import TwinError
@@ -337,6 +338,12 @@ class PortConfig(Section):
     calibrated_at_m: float = Field(default=0.0, ge=0, le=100)
     """depth along the optical axis for which images are rectified exactly, as after a calibration in water; 0: the port
     is modelled as a change of focal length [m]"""
+
+    def believed(self) -> FlatPort | None:
+        """Returns the flat port that the estimators know, without its tilt; None if there is none or none is known."""
+        if self.kind != "flat" or not self.calibrated_at_m:
+            return None
+        return FlatPort(self.distance_m, self.thickness_m, self.glass_index, self.water_index, self.calibrated_at_m)
 
 
 class CalibrationErrorConfig(Section):
@@ -805,7 +812,7 @@ class Scenario(Section):
         return StereoRig(
             *size, focal_px, rig.baseline_m, rig.frame_rate_hz, body_from_camera,
             yaw_sigma_rad=float(np.deg2rad(error.rotation_sigma_deg)),
-            baseline_sigma=error.baseline_sigma_mm / 1000 / rig.baseline_m,
+            baseline_sigma=error.baseline_sigma_mm / 1000 / rig.baseline_m, port=self.port.believed(),
         )  # fmt: skip
 
     def believed_noise(self) -> SensorNoise:

@@ -102,7 +102,7 @@ def measured_view(cameras: TrueCameras, rig: StereoRig, depths_m: Array) -> Meas
         return IDEAL_VIEW
     axes = _axes(rig, depths_m)
     grid = np.stack(np.meshgrid(*axes, indexing="ij")[::-1], axis=-1)  # x, y, disparity
-    left, right = _images(cameras, rig, grid)
+    left, right = (rig.normalised(px) for px in rig.without_refraction(*_images_px(cameras, rig, grid)))
     removed = _removed(left, right, grid, rig)
     right = _without(right, removed)
     (x, y), (x_right, y_right) = (np.moveaxis(image, -1, 0) for image in (left, right))
@@ -122,13 +122,13 @@ def _axes(rig: StereoRig, depths_m: Array) -> tuple[Array, Array, Array]:
     return disparity, y, x
 
 
-def _images(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, Array]:
-    """Returns the normalised positions (..., 2) of points (..., 3) in the left and the right rectified image."""
+def _images_px(cameras: TrueCameras, rig: StereoRig, grid: Array) -> tuple[Array, Array]:
+    """Returns the pixels (..., 2) of points (..., 3) in the left and the right rectified image."""
     depth_m = rig.baseline_m / grid[..., 2:]
     points_m = (np.concatenate([grid[..., :2], np.ones_like(depth_m)], axis=-1) * depth_m).reshape(-1, 3)
     to_right_m = np.array([cameras.rendered_rig.baseline_m, 0.0, 0.0])
     left, right = (
-        rig.normalised(cameras.project(points_m - offset, camera)).reshape(*grid.shape[:-1], 2)
+        cameras.project(points_m - offset, camera).reshape(*grid.shape[:-1], 2)
         for camera, offset in enumerate((np.zeros(3), to_right_m))
     )
     return left, right

@@ -117,11 +117,20 @@ def _measure_depth(
     stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
     stereo = stereo.with_sigma_below(np.minimum(MAX_STEREO_SIGMA_PX, MAX_RELATIVE_SIGMA * stereo.disparity_px))
     search_range.update(stereo.disparity_px)
+    if rig.port is not None:
+        stereo = stereo._replace(disparity_px=_without_refraction(stereo.disparity_px, rig))
     if yaw_rad:
         column = (np.arange(left.shape[1]) - stereo.disparity_px - rig.cx_px) / rig.focal_px  # in the right image
         offset_px = (yaw_rad * rig.focal_px * (1 + column**2)).astype(np.float32)
         stereo = stereo._replace(disparity_px=stereo.disparity_px - offset_px)
     return pair[0], left, depth_filter.stereo_depth(stereo, rig)
+
+
+def _without_refraction(disparity_px: Map, rig: StereoRig) -> Map:
+    """Returns disparities (H, W) [px] as pinhole cameras would see them."""
+    row, column = np.mgrid[: rig.height_px, : rig.width_px].astype(np.float64)
+    left, right = rig.without_refraction(np.stack([column, row], -1), np.stack([column - disparity_px, row], -1))
+    return (left[..., 0] - right[..., 0]).astype(np.float32)
 
 
 def _advance(

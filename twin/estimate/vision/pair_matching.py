@@ -70,7 +70,8 @@ class PairMatcher:
         ok &= self._in_view(points, other_from_node)
         source_cov = (in_left.cov[ok] + in_right.cov[ok]) / 2
         cov = left_warp[ok] @ source_cov @ left_warp[ok].transpose(0, 2, 1)
-        left_px, right_px, node_points = in_left.points[ok], in_right.points[ok], points.subset(ok)
+        left_px, right_px = rig.without_refraction(in_left.points[ok], in_right.points[ok])
+        node_points = points.subset(ok)
         cov *= stereo.row_noise_ratio(left_px, right_px, cov) ** 2
         measured, measured_cov = stereo.fuse(left_px, right_px, cov, rig)
         left_shift = patches.locking_shifts(left_px, left_warp[ok], self.patch_px)

@@ -162,10 +162,11 @@ def match_stereo_points(
     in_view = well_inside(pixels - np.column_stack([mean_px, np.zeros(len(pixels))]), rig, patch_px)
     ok = match.ok & satisfies_epipolar(pixels, match.points) & in_view
     source = pixels[ok].astype(np.float64)
-    noise_ratio = row_noise_ratio(source, match.points[ok], match.cov[ok])
-    measured, cov = fuse(source, match.points[ok], match.cov[ok] * noise_ratio**2, rig)
+    source, matched = rig.without_refraction(source, match.points[ok])
+    noise_ratio = row_noise_ratio(source, matched, match.cov[ok])
+    measured, cov = fuse(source, matched, match.cov[ok] * noise_ratio**2, rig)
     xyz = np.column_stack([measured[:, :2], np.ones(len(measured))]) * (rig.baseline_m / measured[:, 2:])
-    rows = match.points[ok, 1] - pixels[ok, 1]
+    rows = matched[:, 1] - source[:, 1]
     return StereoPoints(pixels[ok], slope[ok], mean_px[ok].astype(np.float64), measured, cov, xyz, rows, noise_ratio)
 
 
