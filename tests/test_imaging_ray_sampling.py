@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.ndimage import map_coordinates
 
 from twin.core import geometry
 from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
@@ -105,23 +106,22 @@ def test_without_motion_rays_are_sampled_at_their_intersections():
     expected = sample_rays(light, depth, met_px(depth, POSITIONS, PARALLAX))
     for motion in (None, row_motion(np.zeros(6))):
         found = sample_rays(light, depth, POSITIONS, PARALLAX, motion)
-        np.testing.assert_allclose(found, expected, atol=3e-4)  # positions are rounded by 1e-4 px
+        # positions are rounded by 1e-4 px; rows at the border cross it
+        np.testing.assert_allclose(found[4:-4], expected[4:-4], atol=1e-3)
 
 
-def test_sampling_equals_the_definition_of_the_spline():
-    """Also at the border and beyond it, where the pixels of the border are repeated."""
+def test_sampling_equals_the_interpolating_spline_of_scipy_without_negative_light():
     rng = np.random.default_rng(1)
-    light, at = rng.random((20, 30, 3), np.float32), rng.uniform(-4, 34, (9, 11, 2)).astype(np.float32)
+    light, at = rng.random((20, 30, 3), np.float32), rng.uniform(1, (28, 18), (9, 11, 2)).astype(np.float32)
+    exact = [map_coordinates(band, at.astype(float)[..., ::-1].transpose(2, 0, 1), order=3, mode="mirror")
+             for band in light.astype(float).transpose(2, 0, 1)]  # fmt: skip
+    expected = np.maximum(np.stack(exact, -1), 0.0)
+    assert (expected == 0).any()
+    np.testing.assert_allclose(sample_rays(light, light[..., 0] + 1, at), expected, atol=1e-4)
 
-    def spline(t):
-        t = abs(t)
-        return (4 - 6 * t**2 + 3 * t**3) / 6 if t < 1 else max(2 - t, 0.0) ** 3 / 6
 
-    expected = np.zeros((9, 11, 3))
-    for v, u in np.ndindex(9, 11):
-        x, y = at[v, u].astype(float)
-        for j in range(int(np.floor(y)) - 1, int(np.floor(y)) + 3):
-            for i in range(int(np.floor(x)) - 1, int(np.floor(x)) + 3):
-                pixel = light[np.clip(j, 0, 19), np.clip(i, 0, 29)]
-                expected[v, u] += spline(x - i) * spline(y - j) * pixel
-    np.testing.assert_allclose(sample_rays(light, light[..., 0] + 1, at), expected, atol=2e-6)
+def test_sampling_at_the_pixels_adds_no_blur():
+    light = np.random.default_rng(2).random((20, 30, 3), np.float32)
+    v, u = np.mgrid[2:18, 2:28].astype(np.float32)
+    found = sample_rays(light, light[..., 0] + 1, np.stack([u, v], -1))
+    np.testing.assert_allclose(found, light[2:18, 2:28], atol=3e-5)

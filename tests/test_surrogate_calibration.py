@@ -90,7 +90,7 @@ def test_the_measured_column_and_disparity_are_those_of_the_rectified_images(nam
     points = floor_points(rig)
     xyz = np.column_stack([points[:, :2], np.ones(len(points))]) * (rig.baseline_m / points[:, 2:])
     offset = np.array([cameras.rendered_rig.baseline_m, 0.0, 0.0])
-    left, right = cameras.project(xyz, 0), cameras.project(xyz - offset, 1)
+    left, right = rig.without_refraction(cameras.project(xyz, 0), cameras.project(xyz - offset, 1))
     right_xy = rig.normalised(right)
     columns_px = right[:, 0] - rig.focal_px * view.removed[2] * right_xy[:, 1]  # cancels the roll
     columns_px += rig.focal_px * view.removed[0] * right_xy[:, 0] * right_xy[:, 1]  # and the pitch

@@ -15,7 +15,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.records import Array, Depth, Radiance
 from twin.core.threads import in_row_bands
-from twin.imaging.camera.resample import Positions, spline_row, unpack
+from twin.imaging.camera.resample import Positions, spline_coefficients, spline_row, unpack
 from twin.kernels import kernel
 
 INTERSECTION_STEPS = 4  # maximum; each multiplies the error by the parallax times the slope of the floor
@@ -43,7 +43,7 @@ def sample_rays(
     """
     out, near = np.empty((*positions.shape[:2], 3), np.float32), np.reciprocal(depth)
     moves = None if motion is None else (np.ascontiguousarray(motion.twist, np.float64), *motion[1:])
-    scene = np.ascontiguousarray(light).reshape(len(light), -1), near, positions, parallax_px_m, moves
+    scene = spline_coefficients(light), near, positions, parallax_px_m, moves
     in_row_bands(lambda first, end: _sample_rays(*scene, out, first, end), len(positions))
     return out
 
@@ -57,7 +57,10 @@ def _sample_rays(source, near, positions, parallax, motion, out, first, end):
             unpack(positions[v].reshape(-1), rays[0], rays[1])
         else:
             _hit_row(near, positions, parallax, motion, v, v == first, rays, cells)
-        spline_row(source, rays[0], rays[1], weights, cells, out[v].reshape(-1))
+        filled = out[v].reshape(-1)
+        spline_row(source, rays[0], rays[1], weights, cells, filled)
+        for k in range(filled.size):
+            filled[k] = max(filled[k], np.float32(0.0))  # beside an edge, a spline can pass below zero
 
 
 @kernel(forceinline=True, error_model="numpy", fastmath={"contract"})

@@ -1,10 +1,12 @@
 """Resampling of images at subpixel positions by cubic B-splines in single precision.
 
-OpenCV's warps round positions to 1/32 px. For radiance (`ray_sampling`), the B-spline is the point spread function of a
-pixel; sensor images are interpolated after a prefilter (Unser et al. 1993, doi 10.1109/78.193221).
+OpenCV's warps round positions to 1/32 px. A prefilter (Unser et al. 1993, doi 10.1109/78.193221) makes the splines pass
+through the pixels, so that resampling adds no blur of its own: a port without refraction changes no image.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,13 +28,19 @@ TAPS = 8  # pixels to each side in the prefilter of rows; POLE^9 is 7e-6
 
 def interpolate(image: Image, positions: Positions) -> Image:
     """Returns the image (h, w, 3) interpolated from `image` (H, W, 3) at `positions`; exact at pixel centres."""
-    spline, out = image.reshape(len(image), -1).astype(np.float32), np.empty((*positions.shape[:2], 3), np.uint8)
+    spline, out = spline_coefficients(image), np.empty((*positions.shape[:2], 3), np.uint8)
+    in_row_bands(lambda first, end: _fill_from(spline, positions, out, first, end), len(positions))
+    return out
+
+
+def spline_coefficients(image: NDArray[Any]) -> NDArray[np.float32]:
+    """Returns the coefficients (H, 3 W) of the cubic B-spline through the pixels of an image (H, W, 3)."""
+    spline = image.reshape(len(image), -1).astype(np.float32)
     in_row_bands(lambda first, end: _filter_columns(spline, first, end), spline.shape[1])
     wide = cv2.copyMakeBorder(spline.reshape(image.shape), 0, 0, TAPS, TAPS, cv2.BORDER_REFLECT_101)
     flat = wide.reshape(len(wide), -1)
     in_row_bands(lambda first, end: _filter_rows(flat, spline, first, end), len(spline))
-    in_row_bands(lambda first, end: _fill_from(spline, positions, out, first, end), len(positions))
-    return out
+    return spline
 
 
 @kernel
@@ -144,11 +152,15 @@ def _filter_block(image, first, end):
 def _filter_rows(wide, image, first, end):
     """Fills rows of an image (H, 3 W) with the coefficients of rows that are mirrored by TAPS.
 
-    The two filters have the symmetric impulse response -6 p / (1 - p^2) p^|n|, summed up to |n| = `TAPS`; along rows, a
-    convolution is faster than a recursion, which has to wait for the previous pixel.
+    The two filters have the symmetric impulse response -6 p / (1 - p^2) p^|n|, summed up to |n| = `TAPS` and divided by
+    the sum of its values, so that even light stays; along rows, a convolution is faster than a recursion, which has to
+    wait for the previous pixel.
     """
     pole = np.float32(POLE)
-    middle_weight = np.float32(-6.0) * pole / (np.float32(1.0) - pole * pole)
+    sum_of_powers = 1.0
+    for i in range(1, TAPS + 1):
+        sum_of_powers += 2 * POLE**i
+    middle_weight = np.float32(1 / sum_of_powers)
     for v in range(first, end):
         row, line = image[v], wide[v]
         for k in range(row.size):
