@@ -72,6 +72,21 @@ def test_an_episode_that_follows_the_plan_covers_the_area_and_ends_with_the_plan
     env.close()
 
 
+def test_a_velocity_moves_the_target_in_the_axes_of_the_vehicle():
+    """Forward, left and up, at a heading of 90 deg after a quarter turn: forward is north, left is west."""
+    env = make()
+    env.reset(seed=1)
+    inner = env.unwrapped
+    for yaw, forward, left in ((0.0, [1, 0, 0], [0, 1, 0]), (np.pi / 2, [0, 1, 0], [-1, 0, 0])):
+        for action, direction in (([1, 0, 0, 0], forward), ([0, 1, 0, 0], left), ([0, 0, 1, 0], [0, 0, 1])):
+            before = inner._target._replace(yaw=yaw)
+            inner._target = before
+            inner._command(np.array(action, float))
+            moved = inner._target.position - before.position
+            np.testing.assert_allclose(moved / np.linalg.norm(moved), direction, atol=1e-12)
+    env.close()
+
+
 def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
     env = make(action="thrust", reward="track")
     _, info = env.reset(seed=3)

@@ -70,6 +70,13 @@ def test_undistort_inverts_distort(k, p):
         np.testing.assert_allclose(undistort(distort(tangents, lens), lens), tangents, atol=1e-9)
 
 
+@pytest.mark.parametrize("k", [(-0.4, 0.0, 0.0), (-0.3, -0.1, 0.0), (-0.1, -0.2, -0.05), (0.1, -0.2, 0.02)])
+def test_the_fold_is_the_first_maximum_of_the_distorted_radius(k):
+    r = np.linspace(0.0, 3.0, 300001)
+    distorted = r * (1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6)
+    assert fold(Distortion(*k)) == pytest.approx(r[np.argmax(np.diff(distorted) < 0)], abs=2e-5)
+
+
 def test_coordinates_beyond_the_fold_are_nan():
     """With k1 = -0.4 no ray is imaged beyond r (1 + k1 r^2) at r^2 = -1 / (3 k1)."""
     lens = Distortion(k1=-0.4)
