@@ -49,6 +49,7 @@ class StereoRig:
     #: the baseline since the calibration; 0: exact, and not estimated.
     yaw_sigma_rad: float = 0.0
     baseline_sigma: float = 0.0
+    readout_s: float = 0.0  #: time from the exposure of the first row to that of the last; 0: global shutter
     port: FlatPort | None = None  #: flat ports in front of the lenses, for which matched points are corrected
 
     @property

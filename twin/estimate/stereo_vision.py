@@ -137,6 +137,7 @@ class StereoVision:
         self._points, self._depth_m = points, depth_m.astype(np.float32)
         self.spool.put(row, left, corrected, (self._gray, gray))
         self.matcher.removed_yaw[row] = float(self.calibration.removed[1])
+        self.matcher.twists[row] = self.f2f.filter.velocity.copy()
         self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left, corrected)))
         return points
 

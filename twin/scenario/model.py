@@ -812,7 +812,8 @@ class Scenario(Section):
         return StereoRig(
             *size, focal_px, rig.baseline_m, rig.frame_rate_hz, body_from_camera,
             yaw_sigma_rad=float(np.deg2rad(error.rotation_sigma_deg)),
-            baseline_sigma=error.baseline_sigma_mm / 1000 / rig.baseline_m, port=self.port.believed(),
+            baseline_sigma=error.baseline_sigma_mm / 1000 / rig.baseline_m, 
+            readout_s=self.sensor.readout_ms / 1000 if self.sensor else 0.0, port=self.port.believed(),
         )  # fmt: skip
 
     def believed_noise(self) -> SensorNoise:

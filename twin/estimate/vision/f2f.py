@@ -12,6 +12,7 @@ from twin.core.records import StereoRig
 from twin.estimate.vision import matching, observation_equations, two_view_motion
 from twin.estimate.vision.motion_filter import MotionFilter
 from twin.estimate.vision.observation_equations import PairMeasurements
+from twin.estimate.vision.rolling_shutter import at_mid_exposure
 from twin.estimate.vision.stereo import StereoPoints
 from twin.estimate.vision.two_view_motion import Motion, PairMotionSettings
 
@@ -77,6 +78,7 @@ class FrameToFrame:
         """Makes a new keyframe, with its normalised left image, the reference, with the strongest of its points."""
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
+        measured = at_mid_exposure(measured, self.filter.velocity, self.rig)
         self._reference_cov = np.zeros((6, 6))
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
@@ -153,7 +155,9 @@ class FrameToFrame:
         tracked, ok = matching.track(reference.image, image, reference.pixels, guess, self.patch_px, levels)
         pixels, measured, cov = tracked[ok], reference.measured[ok], reference.cov[ok]
         current, current_cov = np.zeros_like(measured), np.zeros_like(cov)
-        current[:, :2], current_cov[:, :2, :2] = self.rig.normalised(pixels), cov[:, :2, :2]
+        seen = np.column_stack([self.rig.normalised(pixels), self.rig.baseline_m / points[ok, 2]])
+        current[:, :2] = at_mid_exposure(seen, self.filter.velocity, self.rig)[:, :2]
+        current_cov[:, :2, :2] = cov[:, :2, :2]
         current_cov[:, 2, 2] = _UNKNOWN_VARIANCE
         inflation = matching.variance_inflation(pixels, self.patch_px)
         settings = PairMotionSettings(variance_inflation=inflation, n_measured=2)

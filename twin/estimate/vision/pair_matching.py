@@ -15,6 +15,7 @@ from twin.core.settings import COMMON_BIAS_PX, MIN_INLIER_SHARE
 from twin.estimate.vision import matching, observation_equations, patches, stereo, two_view_motion
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.observation_equations import PairMeasurements, PixelLocking
+from twin.estimate.vision.rolling_shutter import at_mid_exposure
 from twin.estimate.vision.stereo import Keyframe, StereoPoints
 
 _LEVELS = 2  # pyramid levels above the full image
@@ -33,11 +34,13 @@ class PairMatcher:
 
     Attributes:
         removed_yaw: yaw of the right camera for which the images of a keyframe were corrected, by frame index [rad].
+        twists: twist of the camera (6,) at a keyframe, by frame index, for the correction of a rolling shutter.
     """
 
     def __init__(self, rig: StereoRig, spool: ImageSpool, patch_px: int):
         self.rig, self.spool, self.patch_px = rig, spool, patch_px
         self.removed_yaw: dict[int, float] = {}
+        self.twists: dict[int, Array] = {}
         self._workers = ThreadPoolExecutor(2)
 
     def close(self) -> None:
@@ -107,7 +110,7 @@ class PairMatcher:
         The estimation starts from the closed form (Negahdaripour & Madjidi 2003, eq. 2), or from the motion between the
         current poses if that fails. None if too few points are matched or too few of them are inliers.
         """
-        a, b = (self._turned(z, node.yaw_rad, at) for z, at in zip(matched.measured[:2], (other, node), strict=True))
+        a, b = (self._corrected(z, node.yaw_rad, at) for z, at in zip(matched.measured[:2], (other, node), strict=True))
         measured = matched.measured._replace(a=a, b=b)
         predicted = geometry.inverse(other.world_from_camera) @ node.world_from_camera
         closed_form = two_view_motion.exact_depth_motion(measured.a, measured.b, self.rig.baseline_m, predicted)
@@ -124,7 +127,9 @@ class PairMatcher:
         yaw = motion.yaw and motion.yaw._replace(estimate=motion.yaw.estimate + yaw_rad, removed_rad=yaw_rad)
         return motion._replace(closed_form=closed_form, yaw=yaw)
 
-    def _turned(self, points: Array, yaw_rad: float, keyframe: Keyframe) -> Array:
-        """Returns points (n, 3) measured in the images of a keyframe, corrected for a yaw of the right camera."""
+    def _corrected(self, points: Array, yaw_rad: float, keyframe: Keyframe) -> Array:
+        """Returns points (n, 3) of a keyframe, corrected for a yaw of the right camera and a rolling shutter."""
         remaining = yaw_rad - self.removed_yaw.get(keyframe.row, 0.0)
-        return points - remaining * observation_equations.change_by_yaw(points) if remaining else points
+        if remaining:
+            points = points - remaining * observation_equations.change_by_yaw(points)
+        return at_mid_exposure(points, self.twists.get(keyframe.row), self.rig)
