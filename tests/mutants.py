@@ -148,7 +148,11 @@ MUTANTS = [
         ("twin/estimate/self_calibration.py", 'np.einsum("nji,nj->ni", rotation, moved)', 'np.einsum("nij,nj->ni", rotation, moved)', "estimate_self_calibration"),
         ("twin/estimate/adjustment/pose_graph.py", "derivatives, shared - at)", "derivatives, shared + 0 * at)", "estimate_self_calibration"),
         ("twin/estimate/mapping/map_builder.py", "stereo.disparity_px - offset_px", "stereo.disparity_px + offset_px", "estimate_self_calibration"),
-        ("twin/estimate/vision/pair_matching.py", "return points - remaining * ", "return points + remaining * ", "estimate_self_calibration"),
+        ("twin/estimate/vision/pair_matching.py", "points = points - remaining * ", "points = points + remaining * ", "estimate_self_calibration"),
+        ("twin/estimate/vision/rolling_shutter.py", "(rig.height_px - 1) - 0.5)", "(rig.height_px - 1) + 0.5)", "estimate_rolling_shutter"),
+        ("twin/core/refraction.py", "(1 / depth_m - 1 / self.rectified_m)", "(1 / depth_m + 1 / self.rectified_m)", "core_refraction"),
+        ("twin/imaging/camera/resample.py", "np.float32(1 / sum_of_powers)", "np.float32(1.0)", "imaging_ray_sampling"),
+        ("twin/studies/analysis.py", "self.unknown = self.unmodelled | self.failed", "self.unknown = self.unmodelled", "study_report"),
         ("twin/scenario/model.py", "np.random.SeedSequence(self.seed, spawn_key", "np.random.SeedSequence(0, spawn_key", "scenario_rigs"),
         ("twin/core/interrupts.py", "error = error.__cause__ or error.__context__", "error = None", "interrupts"),
     ]
