@@ -8,7 +8,7 @@ from judge_synthetic import survey
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from twin.core import geometry
-from twin.core.quality import DisparityOffset, EpipolarError, EstimationQuality
+from twin.core.quality import CalibrationEstimate, DisparityOffset, EpipolarError, EstimationQuality
 from twin.core.records import StereoObservation, StereoRig
 from twin.estimate.calibration_errors import disparity_offset, mean_views
 from twin.estimate.self_check import check_survey
@@ -214,3 +214,15 @@ def test_the_value_of_a_finding_of_a_row_offset_is_comparable_with_its_limit():
     result = replace(survey_result(), quality=quality(), stereo_observations=[OBSERVATION._replace(row_offset_px=-0.3)])
     (finding,) = check_survey(result, RIG)
     assert finding.value == 0.3 > finding.limit and "-0.30 px" in finding.sentence
+
+
+def test_a_yaw_that_the_calibration_leads_to_expect_is_no_finding_for_an_estimator_that_does_not_calibrate_itself():
+    """0.04 deg is within 3 sigma of 0.02 deg, not of 0.01; what a self-calibration leaves is judged as before."""
+    known = {sigma: replace(RIG, yaw_sigma_rad=np.deg2rad(sigma)) for sigma in (0.02, 0.01)}
+    plugin = replace(survey_result(), quality=quality(epipolar=YAW), stereo_observations=[OBSERVATION])
+    calibrated = replace(
+        plugin, quality=quality(epipolar=YAW, calibration=CalibrationEstimate(0.0, 0.0, np.eye(2) * 1e-8))
+    )
+    assert check_survey(plugin, known[0.02]) == []
+    assert [found.check for found in check_survey(plugin, known[0.01])] == ["yaw"]
+    assert [found.check for found in check_survey(calibrated, known[0.02])] == ["yaw"]
