@@ -95,11 +95,12 @@ def _calibration(root: Path) -> StereoCalibration | None:
     files = [root / camera / "sensor.yaml" for camera in _CAMERAS.values()]
     if not all(file.is_file() for file in files):
         return None
-    trees = [read_yaml(file) for file in files]
+    trees = [dict(table_of(read_yaml(file), file)) for file in files]
+    error = trees[1].pop(_ERROR, None)
     left, right = (camera_of(tree, file) for tree, file in zip(trees, files, strict=True))
     body_from_left, body_from_right = (pose_of(tree, "T_BS", file) for tree, file in zip(trees, files, strict=True))
     calibration = StereoCalibration(left, right, geometry.inverse(body_from_right) @ body_from_left, files[1])
-    if (error := trees[1].get(_ERROR)) is not None:
+    if error is not None:
         given = table_of(error, files[1])
         sigmas = {key: float(numbers_of(given.get(key), files[1], f"{_ERROR}.{key}", (1,))[0]) for key in SIGMAS}
         calibration = replace(calibration, **sigmas)

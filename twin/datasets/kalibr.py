@@ -20,7 +20,7 @@ _COEFFICIENTS = "distortion_coeffs", "distortion_coefficients"  # of Kalibr, and
 _READ = ("camera_model", "intrinsics", "distortion_model", "resolution", *_COEFFICIENTS)
 _IRRELEVANT = (
     "cam_overlaps", "rostopic", "T_cam_imu", "timeshift_cam_imu", "sensor_type", "comment", "camera_id", "rate_hz",
-    "T_BS", "T_cn_cnm1", "calibration_error",
+    "T_BS", "T_cn_cnm1",
 )  # fmt: skip
 
 

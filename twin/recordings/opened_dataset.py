@@ -13,7 +13,7 @@ from twin.core.geometry import Array
 from twin.core.records import Trajectory
 from twin.core.settings import EstimatorSettings
 from twin.core.user_files import is_file, resolved
-from twin.datasets.calibration import SIGMAS, StereoCalibration, checked
+from twin.datasets.calibration import SIGMAS, StereoCalibration
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.calibration_values import READ
 from twin.datasets.dataset import Dataset
@@ -76,7 +76,10 @@ class ReplayOptions:
     def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
         """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
         given = {key: value for key in SIGMAS if (value := getattr(self, key)) is not None}
-        return checked(replace(calibration, **given)) if given else calibration
+        for key, value in given.items():
+            if not 0 <= value <= SIGMAS[key]:
+                raise TwinError(key, f"{value:g}", f"0 to {SIGMAS[key]:g}")
+        return replace(calibration, **given)
 
 
 class OpenedDataset(NamedTuple):
