@@ -78,6 +78,20 @@ def test_vignetting_is_the_fourth_power_of_the_cosine():
 
 
 @pytest.mark.parametrize("bayer", [False, True])
+def test_the_shading_correction_makes_a_uniform_field_uniform_and_its_borders_noisier(bayer):
+    sensor = sensor_with(vignetting_power=4.0, shading_correction=True, bayer=bayer)
+    light, setting = uniform(20.0), sensor.meter(uniform(20.0))
+    image = sensor.image(light, setting, None).astype(int)
+    assert np.ptp(image.reshape(-1, 3), axis=0).max() <= 1 < image.min()
+    np.testing.assert_allclose(sensor.levels(light, setting), image, atol=1.5)
+    rng = np.random.default_rng(0)
+    noise = np.std([sensor.image(light, setting, rng) for _ in range(20)], axis=0)
+    share = vignetting(scenario().believed_rig(), 4.0)[0, 0]  # shot noise: variance 1 / share of that of the axis
+    corner, middle = noise[[0, 1, -2, -1]][:, [0, 1, -2, -1]].mean(), noise[70:80, 95:105].mean()
+    assert corner / middle == pytest.approx(share**-0.5, rel=0.1)
+
+
+@pytest.mark.parametrize("bayer", [False, True])
 @pytest.mark.parametrize("gain", [1.0, 4.0])
 def test_the_photon_transfer_curve_recovers_gain_and_read_noise(gain, bayer):
     sensor, rng = sensor_with(read_noise_e=4.0, bayer=bayer), np.random.default_rng(1)

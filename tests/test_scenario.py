@@ -28,8 +28,8 @@ TOP_KEYS = (
 )
 SENSOR_KEYS = (
     "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "
-    "full_well_e, read_noise_e, bits, bayer, vignetting_power, motion_blur, readout_ms, tone_curve, white_balance, "
-    "white_gains, white_temperature_k"
+    "full_well_e, read_noise_e, bits, bayer, vignetting_power, shading_correction, motion_blur, readout_ms, "
+    "tone_curve, white_balance, white_gains, white_temperature_k"
 )
 IMU_KEYS = (
     "rate_hz, gyroscope_noise_density, gyroscope_random_walk, gyroscope_bias_sigma_radps, accelerometer_noise_density, "

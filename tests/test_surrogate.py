@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from twin import scenes, survey
+from twin.app.look import render_view
 from twin.core import geometry
 from twin.core.height_field import cast_pixels, height_field
 from twin.core.timing import Stopwatch
@@ -84,6 +85,40 @@ def test_a_ray_that_misses_the_terrain_has_infinite_depth(reef):
     outside = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([50.0, 0, 2.0]))
     for pose in (up, outside):
         assert np.isinf(cast_pixels(field_of(reef.terrain), pose[None], reef.rig, np.array([[160.0, 120.0]]))).all()
+
+
+@functools.cache
+def rendered_over_expected(*sets):
+    """Returns noise and gradients of rendered images of a level floor, relative to those of `FloorImages`."""
+    m = mission("terrain.kind=flat", "water.jerlov=IB", "plan.speed_mps=0.7", *sets)
+    images, moving = FloorImages(m.scenario, m.illumination), np.array([0, 0, 0, 0.7, 0, 0])
+    (albedo,) = floor_albedos(images, m.terrain, np.array([2.0]))
+    expected = images.matched(albedo, 2.0, np.random.default_rng(0))
+    views = [render_view(m, (x, 0.0, 2.0), moving if m.scenario.sensor is not None else None) for x in (-0.4, 0.0, 0.4)]
+    noise = np.mean([matching.gray(view.noise.astype(np.float32)).std() for view in views])
+    found = [noise / (matching.gray(expected.noise).std() / np.sqrt(2))]
+    for axis in (0, 1):
+        gradients = [np.diff(matching.gray(view.decomposed.noise_free), axis=axis).std() for view in views]
+        found.append(np.mean(gradients) / np.diff(matching.gray(expected.signal), axis=axis).std())
+    return found
+
+
+@pytest.mark.parametrize("sensor", ["sensor.bits=12", 'sensor.tone_curve="srgb"', 'sensor.white_balance="grey_world"'])
+def test_noise_and_texture_of_the_images_are_those_of_rendered_images(sensor):
+    """Oracle: sensor, lens, port and shutter of the rendered stereo camera; both textures are filtered differently."""
+    ideal = rendered_over_expected("rig.model=ideal")
+    assert ideal[0] == pytest.approx(1.0, abs=0.05)
+    real = rendered_over_expected("rig.model=machine_vision_dome", sensor)
+    np.testing.assert_allclose(real, ideal, rtol=0.15)
+
+
+def test_motion_and_aberrations_blur_the_images_of_which_the_bound_is_computed():
+    long = ["sensor.exposure_max_ms=30", "sun.illuminance_lx=5", "lamps=[]"]
+    still, fast, soft = (
+        bounds_px(mission(*long, *sets), np.array([2.0]))[0]
+        for sets in (["plan.speed_mps=0.05"], ["plan.speed_mps=0.7"], ["plan.speed_mps=0.05", "lens.blur_px=[1,1,1]"])
+    )
+    assert fast > 1.2 * still and soft > 1.5 * still
 
 
 def raster_fraction(vision):
@@ -366,7 +401,7 @@ def light_of(m, depth_m):
     images = FloorImages(m.scenario, m.illumination)
     (albedo,) = floor_albedos(images, m.terrain, np.array([2.0]))
     noise = images.matched(albedo, depth_m, np.random.default_rng(0)).noise
-    return images.components(albedo, depth_m).direct, noise
+    return images.contrast(images.components(albedo, depth_m)), noise
 
 
 def test_lamps_make_the_centre_of_the_image_more_precise_than_its_sides_and_daylight_does_not():

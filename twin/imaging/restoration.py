@@ -52,7 +52,8 @@ class Restoration:
             self._shadows = Shadows(floor, rig, positions_m, to_sun)
             self._halos = LampHalos(floor, sources, illumination.water)
         self._signal = linear_signal(scenario)
-        power = 0.0 if scenario.sensor is None else scenario.sensor.vignetting_power
+        sensor = scenario.sensor
+        power = 0.0 if sensor is None or sensor.shading_correction else sensor.vignetting_power
         self._vignetting = vignetting(rig, power)[..., None]
         self._sunny = bool(illumination.daylight.surface_lx.any())
         self._reference_depth_m = illumination.daylight.reference_depth_m

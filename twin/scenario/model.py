@@ -266,6 +266,8 @@ class SensorConfig(Section):
     """Bayer filter (RGGB) with interpolated colours; false: three bands per pixel"""
     vignetting_power: float = Field(default=4.0, ge=0, le=8)
     """irradiance falls with this power of the cosine of the field angle; 4: natural vignetting, 0: none"""
+    shading_correction: bool = False
+    """the camera divides its images by the vignetting, as with a flat field; it amplifies the noise near the borders"""
     motion_blur: bool = True
     """motion during the exposure blurs the image"""
     readout_ms: float = Field(default=0.0, ge=0, le=1000)

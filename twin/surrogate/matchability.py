@@ -1,10 +1,11 @@
 """Matchability of the floor: the Cramér-Rao bound of image matching, and the unevenness of the floor under a patch.
 
-The bound is computed from images of a level floor, simulated with the scenario's texture, light and sensor. Let g be
-the gradient along a row of the part of the grey image that the texture causes, and s the standard deviation of the
-image noise. The standard deviation of the measured shift between two patches of p x p pixels is at least
-c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound). Veil and unevenness of the light do not move with the floor, so
-the image of a floor with the same mean albedo, but without texture, is subtracted.
+The bound is computed from images of a level floor, simulated with the scenario's texture, light, lens and sensor, at
+the planned speed. Let g be the gradient of the part of the grey image that the texture causes, and s the standard
+deviation of the image noise. The standard deviation of the measured shift between two patches of p x p pixels along
+one axis is at least c = sqrt(2) s / (p rms(g)) pixels (Cramér-Rao bound), g being the gradient along this axis. Motion
+blurs images along one axis, so c^2 is averaged over both. Veil and unevenness of the light do not move with the floor,
+so the image of a floor with the same mean albedo, but without texture, is subtracted.
 
 In turbid water most corners of the full image are noise. The estimators then bin the images (`choose_binning`), and the
 bound is that of the binned images, in their pixels.
@@ -22,11 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin import terrains
+from twin.core import geometry
 from twin.core.geometry import BODY_FROM_DOWN_CAMERA, Array, pose
 from twin.core.records import Image, Radiance, StereoRig
 from twin.estimate.vision import matching
 from twin.estimate.vision.stereo import BINNINGS
-from twin.imaging.camera.photo_sensor import sensor_of
+from twin.imaging.camera.lens_psf import LensPsf
+from twin.imaging.camera.photo_sensor import Sensor, sensor_of
+from twin.imaging.camera.sensor import ExposureSetting
+from twin.imaging.camera.shutter import integrate
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, RenderedView, StampedPose
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
@@ -45,6 +50,7 @@ _LARGEST_UNEVENNESS = 2.0  # largest unevenness with which a patch is counted, r
 _BLOCKS = (6, 8)  # rows and columns of blocks of the image in `PositionDependence`
 _PATCHES, _SAMPLES = 300, 9  # patches sampled for the unevenness; height samples along each side of a patch
 _BOUND_LIMITS_PX = 1e-9, 1e6  # bounds that replace zero and infinity between tabulated depths
+_SMALL_CONTRAST = 0.01  # relative change of the light with which the slope of the tone curve is computed
 _WEAKEST = 0.05  # smallest RMS gradient of a window that is counted, relative to that of the image
 
 
@@ -76,31 +82,29 @@ class MatchedImages(NamedTuple):
 
     def bound_px(self, patch_px: int, binning: int) -> float:
         """Returns the Cramér-Rao bound of a patch's position [px of the images binned to `binning`]."""
-        gradient = float(np.sqrt(np.mean(np.diff(matching.gray(self.signal, binning), axis=1) ** 2)))
-        return float(matching.gray(self.noise, binning).std()) / (patch_px * max(gradient, 1e-6))
+        signal = matching.gray(self.signal, binning)
+        gradients = [max(float(np.sqrt(np.mean(np.diff(signal, axis=axis) ** 2))), 1e-6) for axis in (0, 1)]
+        noise = float(matching.gray(self.noise, binning).std())
+        return noise / patch_px * math.sqrt(sum(gradient**-2 for gradient in gradients) / 2)
 
 
 class FloorImages:
-    """Simulated images of a level floor under the vehicle, without shadows, which the surrogate does not model.
-
-    Tone curve and white balance scale texture and noise of a pixel alike, so that images are linear, in white light.
-    """
+    """Simulated images of a level floor under the vehicle, without shadows, which the surrogate does not model."""
 
     def __init__(self, scenario: Scenario, illumination: Illumination):
         imaging = scenario.imaging.model_copy(update={"shadows": False})
-        linear = {"tone_curve": "linear", "white_balance": "white_light"}
-        sensor = scenario.sensor and scenario.sensor.model_copy(update=linear)
-        self.scenario = scenario.model_copy(update={"imaging": imaging, "sensor": sensor})
+        self.scenario = scenario.model_copy(update={"imaging": imaging})
         self.rig, self.illumination = scenario.believed_rig(), illumination
         self._formation = ImageFormation(self.scenario, illumination, None, np.random.default_rng(0))
-
-    def radiance(self, albedo: Image, depth_m: float) -> Radiance:
-        return self._formation.radiance_without_snow(self._level_floor(albedo, depth_m))
+        self._psf = LensPsf(scenario, self.rig)
+        ahead = np.array([0.0, 0.0, 0.0, scenario.plan.speed_mps, 0.0, 0.0])
+        self._twist = geometry.adjoint(geometry.inverse(self.rig.body_from_camera)) @ ahead
 
     def matched(self, albedo: Image, depth_m: float, rng: np.random.Generator) -> MatchedImages:
-        light, sensor = self.radiance(albedo, depth_m), sensor_of(self.scenario, self.rig)
-        setting = sensor.meter(light)
-        signal = _levels(light, setting.gain) - _levels(self.radiance(_mean_colour(albedo), depth_m), setting.gain)
+        view, even = self._level_floor(albedo, depth_m), self._level_floor(_mean_colour(albedo), depth_m)
+        sensor, setting = self._metered(view)
+        light = self._recorded(view, sensor, setting)
+        signal = sensor.levels(light, setting) - sensor.levels(self._recorded(even, sensor, setting), setting)
         first, second = (sensor.image(light, setting, rng).astype(np.float32) for _ in range(2))
         return MatchedImages(signal, first - second)
 
@@ -108,11 +112,36 @@ class FloorImages:
         """Returns the components of the light of a floor that has the mean colour of an albedo image."""
         return self._formation.components(self._level_floor(_mean_colour(albedo), depth_m))
 
-    def snow_views(self, albedo: Image, depth_m: float) -> list[list[Radiance]]:
-        """Returns views (H, W, 3) of a floor without snow, and the same with different particles of marine snow."""
+    def contrast(self, light: RadianceComponents) -> NDArray[np.float32]:
+        """Returns the grey levels (H, W, 3) that a small texture of unit contrast adds to the image of a floor."""
+        sensor = sensor_of(self.scenario, self.rig)
+        setting = sensor.meter(light.total)
+        brighter = np.asarray(light.total + np.float32(_SMALL_CONTRAST) * light.direct, np.float32)
+        return (sensor.levels(brighter, setting) - sensor.levels(light.total, setting)) / np.float32(_SMALL_CONTRAST)
+
+    def snow_levels(self, albedo: Image, depth_m: float) -> list[list[NDArray[np.float32]]]:
+        """Returns noise-free images (H, W, 3) of a floor without snow, and the same with different particles."""
         view = self._level_floor(albedo, depth_m)
         views = [view._replace(pose=shifted) for shifted in snow_poses(view.pose)]
-        return [[*map(light, views)] for light in (self._formation.radiance_without_snow, self._formation.radiance)]
+        sensor, setting = self._metered(view)
+        return [
+            [sensor.levels(self._recorded(one, sensor, setting, snow), setting) for one in views]
+            for snow in (False, True)
+        ]
+
+    def _metered(self, view: RenderedView) -> tuple[Sensor, ExposureSetting]:
+        sensor = sensor_of(self.scenario, self.rig)
+        return sensor, sensor.meter(self._formation.radiance(view))
+
+    def _recorded(self, view: RenderedView, sensor: Sensor, setting: ExposureSetting, snow: bool = False) -> Radiance:
+        """Returns the light (H, W, 3) on the sensor of the camera, which moves with the planned speed."""
+        motion = sensor.motion(self._twist, setting, len(view.depth))
+        light = self._psf.out_of_focus(self._formation.radiance_without_snow(view), view.depth)
+        if motion is not None:
+            light = integrate(light, view.depth, self.rig.focal_px, motion._replace(rolls_later=True))
+        if snow:
+            self._formation.add_snow(light, view, motion)
+        return self._psf.transfer(light)
 
     def _level_floor(self, albedo: Image, depth_m: float) -> RenderedView:
         world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))
@@ -122,10 +151,6 @@ class FloorImages:
 
 def _mean_colour(albedo: Image) -> Image:
     return np.broadcast_to(albedo.mean(axis=(0, 1)).round().astype(np.uint8), albedo.shape).copy()
-
-
-def _levels(light: Radiance, gain: float) -> NDArray[np.float32]:
-    return np.minimum(np.float32(255 * gain) * light, np.float32(255))
 
 
 class Matchability:
@@ -161,7 +186,7 @@ class Matchability:
         found = [images.matched(albedo, z, rng) for albedo, z in zip(albedos, self.depths_m, strict=True)]
         self._set_image_scale(images, albedos, found)
         light = images.components(albedos[_MIDDLE], self.medium_depth_m)
-        self.dependence = position_dependence(light.direct, found[_MIDDLE].noise)
+        self.dependence = position_dependence(images.contrast(light), found[_MIDDLE].noise)
         signal = matching.gray(found[_MIDDLE].signal, self.binning)
         self.texture = window_texture(signal, self.dependence.gradients)
         self.unevenness_px = unevenness_px(scenario, terrain, self.depths_m, locate, self.binning)
@@ -209,11 +234,9 @@ def in_snow(
     images: FloorImages, albedo: Image, depth_m: float, matched: MatchedImages, binning: int
 ) -> tuple[float, float]:
     """Returns the bound [px of the binned images] and the fraction of matches that remain in snow, at one depth."""
-    clean, snowy = images.snow_views(albedo, depth_m)
-    gain = sensor_of(images.scenario, images.rig).meter(snowy[0]).gain
     noise = float(matching.gray(matched.noise, binning).std()) / np.sqrt(2)
-    signals = [[matching.gray(_levels(light, gain), binning) for light in lights] for lights in (clean, snowy)]
-    variance_px2, share = snow_effect(signals[0], signals[1], noise, images.scenario.estimator_settings().patch_px)
+    clean, snowy = ([matching.gray(one, binning) for one in views] for views in images.snow_levels(albedo, depth_m))
+    variance_px2, share = snow_effect(clean, snowy, noise, images.scenario.estimator_settings().patch_px)
     return float(np.sqrt(variance_px2)), share
 
 
@@ -233,7 +256,7 @@ def position_dependence(contrast: Radiance, noise: NDArray[np.float32]) -> Posit
     """Returns the dependence of matching on the position; `NO_DEPENDENCE` if a block has no light or no noise.
 
     Light, veil and blur vary over the image, and with them the gradients of a texture and the noise. The gradients of
-    an even texture are proportional to the unscattered light `contrast` (H, W, 3) of an even floor. The squares of
+    an even texture are proportional to `FloorImages.contrast` (H, W, 3) of an even floor. The squares of
     gradients and noise, `MatchedImages.noise`, are averaged over each block; the logarithm of the noise is smoothed by
     a polynomial in the position.
     """

@@ -32,6 +32,7 @@ class PhotoSensor:
         rig = scenario.believed_rig()
         self._sensor = sensor
         self._vignetting = vignetting(rig if raw_rig is None else raw_rig, sensor.vignetting_power)
+        self._flat = 1 / self._vignetting if sensor.shading_correction else np.ones_like(self._vignetting)
         self._electrons_per_cd_s = electrons_per_cd(sensor, scenario.port.water_index)
         top, self._black_dn = float((1 << sensor.bits) - 1), float(round(BLACK_SHARE * (1 << sensor.bits)))
         self._top_dn, self._dn_per_e = top, (top - self._black_dn) / sensor.full_well_e
@@ -73,6 +74,13 @@ class PhotoSensor:
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
         return self.develop(self.raw(light, setting, rng), setting.white)
 
+    def levels(self, light: Radiance, setting: ExposureSetting) -> NDArray[np.float32]:
+        """Returns the noise-free image (H, W, 3) of a radiance image [grey levels, not rounded]."""
+        signal = light * (self._vignetting[..., None] * np.array(self.signal_per_cd(setting)))
+        signal = np.minimum(np.minimum(signal, 1.0) * self._flat[..., None], 1.0)
+        levels = 255 * tone(signal, self._sensor.tone_curve)
+        return np.asarray(levels, np.float32)
+
     def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
         """Returns the linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]."""
         white = self._white.of_white_light if setting.white is None else np.array(setting.white)
@@ -90,7 +98,8 @@ class PhotoSensor:
         """Returns the 8-bit RGB image (H, W, 3) of raw digital numbers; `white` None = the balance of white light."""
         toned = np.empty(raw.shape, np.uint8)
         tones = self._tone_table(self._white.of_white_light if white is None else np.array(white))
-        bands = raw.reshape(*raw.shape[:2], -1), tones, toned.reshape(*raw.shape[:2], -1)
+        shading = self._flat, np.float32(self._black_dn), np.float32(self._top_dn)
+        bands = raw.reshape(*raw.shape[:2], -1), tones, *shading, toned.reshape(*raw.shape[:2], -1)
         in_row_bands(lambda first, end: _tone(*bands, first, end), len(raw))
         if raw.ndim == 3:
             return toned
@@ -127,9 +136,11 @@ def _weighted_mean(light, weights):
 
 
 @kernel
-def _tone(raw, tones, out, first, end):
+def _tone(raw, tones, flat, black, top, out, first, end):
     _, width, bands = raw.shape
+    zero, half = np.float32(0.0), np.float32(0.5)
     for v in range(first, end):
         for u in range(width):
             for k in range(bands):
-                out[v, u, k] = tones[(v & 1) + (u & 1) if bands == 1 else k, raw[v, u, k]]
+                number = black + (np.float32(raw[v, u, k]) - black) * flat[v, u] + half
+                out[v, u, k] = tones[(v & 1) + (u & 1) if bands == 1 else k, int(min(max(number, zero), top))]

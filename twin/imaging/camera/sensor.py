@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core.records import Array, Exposure, Image, Radiance
 from twin.core.threads import in_row_bands
@@ -92,6 +93,10 @@ class PlainSensor:
 
     def image(self, light: Radiance, setting: ExposureSetting, rng: np.random.Generator | None) -> Image:
         return expose(light, setting.gain, self._imaging, rng)
+
+    def levels(self, light: Radiance, setting: ExposureSetting) -> NDArray[np.float32]:
+        """Returns the noise-free image (H, W, 3) of a radiance image [grey levels, not rounded]."""
+        return np.minimum(np.float32(255 * setting.gain) * light, np.float32(255))
 
     def signal_per_cd(self, setting: ExposureSetting) -> Exposure:
         return setting.gain, setting.gain, setting.gain
