@@ -121,6 +121,7 @@ class SurrogateVision:
         rng, settings = streams(scenario.seed)["surrogate"], scenario.estimator_settings()
         self.matchability = matchability = _matchability(mission)
         self.view = view = measured_view(mission.true_cameras, mission.rig, matchability.depths_m)
+        self._tracked_view = view  # of the keyframe whose points are tracked
         self.floor = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
         self.rig = rig = mission.rig.binned(matchability.binning)
         heights = true_heights(mission.grid, terrain.height_at)
@@ -213,7 +214,7 @@ class SurrogateVision:
         """Samples the positions of the raster points `hits` in a stereo pair, and keeps the keyframe's truth."""
         points, rig, matchability = self._true_points(hits, depth_m), self.rig, self.matchability
         bound_px, n = float(matchability.bound_at(mean_m)), len(points)
-        measured = self.view.measure(points)
+        measured, self._tracked_view = self.view.measure(points), self.view
         noise = self._rng.standard_normal((*_RASTER, 3))
         n_tracked = F2F_POINTS / overlap_inflation(F2F_POINTS, rig, self.settings.patch_px)
         unit_cov = sampling.unit_motion_cov(measured, rig.baseline_m, n_tracked)
@@ -253,7 +254,7 @@ class SurrogateVision:
             return  # vision is lost until the next keyframe
         root, cov = self._motion_errors(float(model.difference_sigma_px(self.latest.bound_px)))
         independent = 1 / np.sqrt(1 + model.f2f_anticorrelation**2)
-        gain = self.view.motion_gain(self.latest.points, self.rig.baseline_m)
+        gain = self._tracked_view.motion_gain(self.latest.points, self.rig.baseline_m)
         self.frame_errors = FrameErrors(independent * root, cov, model.f2f_anticorrelation, gain)
         self.last_normals, self._tracking_cov = np.zeros(6), cov
 
