@@ -87,6 +87,7 @@ def test_the_shading_correction_makes_a_uniform_field_uniform_and_its_borders_no
     rng = np.random.default_rng(0)
     noise = np.std([sensor.image(light, setting, rng) for _ in range(20)], axis=0)
     share = vignetting(scenario().believed_rig(), 4.0)[0, 0]  # shot noise: variance 1 / share of that of the axis
+    assert image.mean() == pytest.approx(255 * scenario().imaging.gray_level, rel=0.02)  # metered as delivered
     corner, middle = noise[[0, 1, -2, -1]][:, [0, 1, -2, -1]].mean(), noise[70:80, 95:105].mean()
     assert corner / middle == pytest.approx(share**-0.5, rel=0.1)
 

@@ -33,6 +33,7 @@ class PhotoSensor:
         self._sensor = sensor
         self._vignetting = vignetting(rig if raw_rig is None else raw_rig, sensor.vignetting_power)
         self._flat = 1 / self._vignetting if sensor.shading_correction else np.ones_like(self._vignetting)
+        self._delivered = self._vignetting * self._flat
         self._electrons_per_cd_s = electrons_per_cd(sensor, scenario.port.water_index)
         top, self._black_dn = float((1 << sensor.bits) - 1), float(round(BLACK_SHARE * (1 << sensor.bits)))
         self._top_dn, self._dn_per_e = top, (top - self._black_dn) / sensor.full_well_e
@@ -52,10 +53,10 @@ class PhotoSensor:
 
     def meter(self, light: Radiance) -> ExposureSetting:
         """Returns this frame's exposure, and meters `light` (H, W, 3); the first frame is metered on itself."""
-        mean = _weighted_mean(light, self._vignetting)
+        mean = _weighted_mean(light, self._delivered)
         white = self._white.factors(mean, self._exposure.share)
         relative = white / self._white.of_white_light
-        highlights = highlight(light[METERED] * self._vignetting[METERED][..., None] * relative)
+        highlights = highlight(light[METERED] * self._delivered[METERED][..., None] * relative)
         return self._setting(self._exposure.gain_for(float((mean * relative).max()), highlights), white)
 
     def _setting(self, gain: float, white: Array) -> ExposureSetting:
