@@ -215,6 +215,24 @@ def test_tracking_is_lost_where_too_few_points_would_be_matched_between_frames(r
         assert vision.latest.bound_px == pytest.approx(0.01, rel=0.3)
 
 
+def test_frames_are_tracked_with_the_yaw_that_was_known_when_their_points_were_measured():
+    m = mission("rig.model=ideal", "calibration_error.right_yaw_deg=0.1", "calibration_error.rotation_sigma_deg=0.1")
+    yaw_rad = np.deg2rad(m.scenario.true_calibration_error().right_yaw_deg)
+    vision = SurrogateVision(m, MODEL, lambda: m.start, Stopwatch())
+
+    def gain():
+        vision.restart_tracking()
+        return vision.frame_errors.gain - np.eye(6)
+
+    observe_keyframes(vision, [m.start], [m.start])
+    wrong = gain()
+    assert np.abs(wrong).max() > 0.01
+    vision.correct_yaw(yaw_rad, 1e-6)
+    np.testing.assert_array_equal(gain(), wrong)
+    assert vision.observe_stereo(None, 1) is not None
+    assert np.abs(gain()).max() < 0.1 * np.abs(wrong).max()
+
+
 def lamp_share_of(m, depth_m=2.0):
     images = FloorImages(m.scenario, m.illumination)
     (albedo,) = floor_albedos(images, m.terrain, np.array([2.0]))
