@@ -154,7 +154,7 @@ MUTANTS = [
         ("twin/surrogate/matchability.py", "return self._psf.transfer(light)", "return light", "surrogate"),
         ("twin/imaging/camera/photo_sensor.py", "self._delivered = self._vignetting * self._flat", "self._delivered = self._vignetting", "imaging_photons"),
         ("twin/core/refraction.py", "(1 / depth_m - 1 / self.rectified_m)", "(1 / depth_m + 1 / self.rectified_m)", "core_refraction"),
-        ("twin/imaging/camera/resample.py", "np.float32(1 / sum_of_powers)", "np.float32(1.0)", "imaging_ray_sampling"),
+        ("twin/core/resample.py", "np.float32(1 / sum_of_powers)", "np.float32(1.0)", "imaging_ray_sampling"),
         ("twin/studies/analysis.py", "self.unknown = self.unmodelled | self.failed", "self.unknown = self.unmodelled", "study_report"),
         ("twin/scenario/model.py", "np.random.SeedSequence(self.seed, spawn_key", "np.random.SeedSequence(0, spawn_key", "scenario_rigs"),
         ("twin/core/interrupts.py", "error = error.__cause__ or error.__context__", "error = None", "interrupts"),

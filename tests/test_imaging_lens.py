@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.ndimage import map_coordinates
 
+from twin.core.resample import interpolate
 from twin.core.timing import Stopwatch
 from twin.errors import ScenarioError
 from twin.imaging.camera.lens import Distortion, distort, fold, undistort
 from twin.imaging.camera.ray_sampling import sample_rays
-from twin.imaging.camera.resample import interpolate
 from twin.imaging.camera.true_cameras import make_true_cameras
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.light.illumination import illumination_of

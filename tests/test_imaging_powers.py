@@ -3,7 +3,7 @@
 import numpy as np
 from numba import njit
 
-from twin.imaging.light.vector_math import LOG2_E, two_to
+from twin.core.vector_math import LOG2_E, two_to
 
 
 @njit

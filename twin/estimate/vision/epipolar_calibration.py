@@ -13,11 +13,10 @@ from errors of the calibration.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core import geometry
+from twin.core import geometry, resample
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import Image, StereoRig
@@ -122,10 +121,9 @@ class EpipolarCalibration:
         offset[1, 2] = self.removed[3] * rig.focal_px
         source_from_result = offset @ matrix @ geometry.exp(np.append(-self.removed[:3], np.zeros(3)))[:3, :3]
         source_from_result = source_from_result @ np.linalg.inv(matrix)
-        flags = cv2.WARP_INVERSE_MAP | cv2.INTER_LANCZOS4
-        size = (rig.width_px, rig.height_px)
-        warped = cv2.warpPerspective(right, source_from_result, size, flags=flags, borderMode=cv2.BORDER_REPLICATE)
-        return np.asarray(warped, np.uint8)
+        v, u = np.mgrid[: rig.height_px, : rig.width_px]
+        at = np.stack([u, v, np.ones_like(u)], axis=-1) @ source_from_result.T
+        return resample.interpolate(right, (at[..., :2] / at[..., 2:]).astype(np.float32))
 
     def report(self) -> EpipolarError:
         sigma = np.sqrt(np.diag(np.linalg.inv(self._information)))

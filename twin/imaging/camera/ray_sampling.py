@@ -14,8 +14,8 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.records import Array, Depth, Radiance
+from twin.core.resample import Positions, spline_coefficients, spline_row, unpack
 from twin.core.threads import in_row_bands
-from twin.imaging.camera.resample import Positions, spline_coefficients, spline_row, unpack
 from twin.kernels import kernel
 
 INTERSECTION_STEPS = 4  # maximum; each multiplies the error by the parallax times the slope of the floor

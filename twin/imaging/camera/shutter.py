@@ -21,8 +21,8 @@ import numpy as np
 
 from twin.core.interpolation import catmull_rom_weights
 from twin.core.records import Array, Depth, Radiance
+from twin.core.resample import sum_row
 from twin.core.threads import in_row_bands
-from twin.imaging.camera.resample import sum_row
 from twin.kernels import kernel
 
 SHORT_PX = 2.8  # largest column and row extent of a path for the 3 x 3 kernel; at sqrt(8) px its weights are equal

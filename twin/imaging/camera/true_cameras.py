@@ -13,16 +13,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core import geometry
+from twin.core import geometry, resample
 from twin.core.records import Array, Depth, Image, Radiance, StereoRig
+from twin.core.resample import Positions
 from twin.errors import TwinError
 from twin.imaging.camera import lens as lenses
 from twin.imaging.camera import port as ports
-from twin.imaging.camera import resample
 from twin.imaging.camera.lens import Distortion
 from twin.imaging.camera.port import Pinhole
 from twin.imaging.camera.ray_sampling import RowMotion, sample_rays
-from twin.imaging.camera.resample import Positions
 from twin.imaging.camera.shutter import ExposureMotion
 from twin.scenario.model import CalibrationErrorConfig, PortConfig, Scenario
 

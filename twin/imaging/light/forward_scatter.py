@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from twin.core.records import Array, Depth, Radiance, StereoRig
 from twin.core.threads import in_row_bands
+from twin.core.vector_math import sum_of_entries
 from twin.imaging.light.phase_function import BandWater
 from twin.imaging.light.shading import FAR_M, RANGE_SCALE_M
 from twin.imaging.light.spread import NODES_M, camera_mixture, over_path
-from twin.imaging.light.vector_math import sum_of_entries
 from twin.imaging.light.water import Medium
 from twin.kernels import kernel
 

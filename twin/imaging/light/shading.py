@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from twin.imaging.light.vector_math import LOG2_E, sum_of_entries, two_to
+from twin.core.vector_math import LOG2_E, sum_of_entries, two_to
 from twin.imaging.scene.facets import UNIT
 from twin.imaging.scene.materials import add_reflected
 from twin.kernels import kernel

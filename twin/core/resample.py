@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from twin.core.interpolation import bspline_weights
 from twin.core.records import Image
 from twin.core.threads import in_row_bands
-from twin.imaging.light.vector_math import sum_of_pixels
+from twin.core.vector_math import sum_of_pixels
 from twin.kernels import kernel
 
 Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [px]
