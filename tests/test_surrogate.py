@@ -159,7 +159,7 @@ def test_the_matching_bound_grows_without_limit_as_the_floor_disappears():
 def test_images_are_binned_in_turbid_water_and_the_bound_is_that_of_their_pixels():
     """Binned pixels show coarse texture better than the full images do."""
     found, unbinned = [], []
-    for turbidity in (1.0, 2.0, 2.6):
+    for turbidity in (1.0, 2.0, 3.0):
         m = mission('water.jerlov="III"', f"water.turbidity={turbidity}", "sun.illuminance_lx=0")
         matchability = Matchability(m.scenario, m.illumination, m.terrain)
         found.append((matchability.binning, matchability.medium_bound_px))
