@@ -151,7 +151,7 @@ MUTANTS = [
         ("twin/estimate/vision/pair_matching.py", "points = points - remaining * ", "points = points + remaining * ", "estimate_self_calibration"),
         ("twin/estimate/vision/rolling_shutter.py", "(rig.height_px - 1) - 0.5)", "(rig.height_px - 1) + 0.5)", "estimate_rolling_shutter"),
         ("twin/surrogate/vision.py", "gain = self._tracked_view.motion_gain", "gain = self.view.motion_gain", "surrogate"),
-        ("twin/surrogate/matchability.py", "return self._psf.transfer(light)", "return light", "surrogate"),
+        ("twin/surrogate/matchability.py", "motion = sensor.motion(self._twist, setting, len(view.depth))", "motion = None", "surrogate"),
         ("twin/imaging/camera/photo_sensor.py", "self._delivered = self._vignetting * self._flat", "self._delivered = self._vignetting", "imaging_photons"),
         ("twin/core/refraction.py", "(1 / depth_m - 1 / self.rectified_m)", "(1 / depth_m + 1 / self.rectified_m)", "core_refraction"),
         ("twin/core/resample.py", "np.float32(1 / sum_of_powers)", "np.float32(1.0)", "imaging_ray_sampling"),

@@ -16,7 +16,7 @@ from twin.imaging.camera.lens_psf import LensPsf
 from twin.imaging.camera.photo_sensor import PhotoSensor, Sensor, sensor_of
 from twin.imaging.camera.pixels import Raw
 from twin.imaging.camera.sensor import ExposureSetting
-from twin.imaging.camera.shutter import integrate
+from twin.imaging.camera.shutter import ExposureMotion, integrate
 from twin.imaging.camera.true_cameras import TrueCameras, make_true_cameras
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, RenderedView, StampedPose
 from twin.imaging.scene.mesh_raster import ObjectView
@@ -148,15 +148,29 @@ class StereoCamera:
     def _at_raw_pixels(
         self, view: RenderedView, sensor: Sensor, twist_body: Array, setting: ExposureSetting
     ) -> Radiance:
-        """Returns the radiance (h, w, 3) at the raw pixels of a moving camera.
-
-        Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.
-        """
-        depth = view.depth
-        motion = sensor.motion(self.twist_of_camera(view.camera, twist_body), setting, len(depth))
-        light = self._psf.out_of_focus(self._image_formation.radiance_without_snow(view), depth)
+        """Returns the radiance (h, w, 3) at the raw pixels of a moving camera."""
+        motion = sensor.motion(self.twist_of_camera(view.camera, twist_body), setting, len(view.depth))
         if motion is not None:
             motion = motion._replace(rolls_later=self._cameras.sampling is not None)
-            light = integrate(light, depth, self._focal_px, motion)
-        self._image_formation.add_snow(light, view, motion)
-        return self._cameras.sample(self._psf.transfer(light), depth, view.camera, motion=motion)
+        light = light_after_lens(self._image_formation, self._psf, view, self._focal_px, motion)
+        return self._cameras.sample(light, view.depth, view.camera, motion=motion)
+
+
+def light_after_lens(
+    formation: ImageFormation,
+    psf: LensPsf,
+    view: RenderedView,
+    focal_px: float,
+    motion: ExposureMotion | None,
+    snow: bool = True,
+) -> Radiance:
+    """Returns the light (H, W, 3) of a view behind the lens of a moving camera.
+
+    Marine snow, which has other depths and velocities, is drawn with its own blur after lens and motion.
+    """
+    light = psf.out_of_focus(formation.radiance_without_snow(view), view.depth)
+    if motion is not None:
+        light = integrate(light, view.depth, focal_px, motion)
+    if snow:
+        formation.add_snow(light, view, motion)
+    return psf.transfer(light)

@@ -31,10 +31,10 @@ from twin.estimate.vision.stereo import BINNINGS
 from twin.imaging.camera.lens_psf import LensPsf
 from twin.imaging.camera.photo_sensor import Sensor, sensor_of
 from twin.imaging.camera.sensor import ExposureSetting
-from twin.imaging.camera.shutter import integrate
 from twin.imaging.image_formation import ImageFormation, RadianceComponents, RenderedView, StampedPose
 from twin.imaging.light.illumination import Illumination
 from twin.imaging.light.optics import Optics
+from twin.imaging.stereo_camera import light_after_lens
 from twin.scenario.model import Scenario
 from twin.surrogate.snow_noise import snow_effect, snow_poses
 from twin.terrains.ground_cover import DEFAULT_COVERS
@@ -136,12 +136,9 @@ class FloorImages:
     def _recorded(self, view: RenderedView, sensor: Sensor, setting: ExposureSetting, snow: bool = False) -> Radiance:
         """Returns the light (H, W, 3) on the sensor of the camera, which moves with the planned speed."""
         motion = sensor.motion(self._twist, setting, len(view.depth))
-        light = self._psf.out_of_focus(self._formation.radiance_without_snow(view), view.depth)
         if motion is not None:
-            light = integrate(light, view.depth, self.rig.focal_px, motion._replace(rolls_later=True))
-        if snow:
-            self._formation.add_snow(light, view, motion)
-        return self._psf.transfer(light)
+            motion = motion._replace(rolls_later=True)  # the estimators correct the readout
+        return light_after_lens(self._formation, self._psf, view, self.rig.focal_px, motion, snow)
 
     def _level_floor(self, albedo: Image, depth_m: float) -> RenderedView:
         world_from_left = pose(BODY_FROM_DOWN_CAMERA, np.array([0.0, 0.0, self.scenario.plan.altitude_m]))
