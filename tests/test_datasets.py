@@ -171,7 +171,8 @@ def test_rectified_pixels_come_from_where_opencv_projects_their_points(kind):
         expected = project(xyz[:, None], np.zeros(3), np.zeros(3), camera.matrix, camera.distortion)[0][:, 0]
         inside = (pixels > 1).all(axis=1) & (pixels < [318, 238]).all(axis=1)
         assert inside.sum() > 40
-        at = [cv2.remap(one, *pixels[inside].astype(np.float32).T[..., None], cv2.INTER_LINEAR)[:, 0] for one in maps]
+        at = [cv2.remap(one, *pixels[inside].astype(np.float32).T[..., None], cv2.INTER_LINEAR)[:, 0]
+              for one in np.moveaxis(maps, -1, 0)]  # fmt: skip
         # bilinear interpolation between pixels of a smooth map, in 1/32 px
         np.testing.assert_allclose(np.column_stack(at), expected[inside], atol=0.05)
 
@@ -183,7 +184,8 @@ def test_principal_points_that_differ_in_their_columns_shift_the_right_image_onl
     found = rectification(StereoCalibration(*cameras, geometry.inverse(RIG.left_from_right), Path("c")), 1.0)
     image = np.repeat(GRAY[..., None], 3, axis=2)
     assert found.rectified(image, "left") is image
-    np.testing.assert_array_equal(found.rectified(image, "right")[:, :-7], image[:, 7:])
+    difference = found.rectified(image, "right")[:, :-7].astype(int) - image[:, 7:]
+    assert np.abs(difference).max() <= 2 and np.mean(difference != 0) < 0.02  # positions have errors of 1e-5 px
 
 
 def test_grey_colour_raw_and_deep_images_become_rgb(tmp_path):

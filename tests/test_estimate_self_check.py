@@ -120,6 +120,20 @@ def test_rectification_moves_images_by_exact_fractions_of_a_pixel(offset_px):
     assert np.sum(slope * error) / np.sum(slope**2) == pytest.approx(0.0, abs=0.002)
 
 
+@pytest.mark.parametrize("offset_px", [0.05, -0.12])
+def test_rectification_keeps_small_shifts_of_images_with_little_contrast(offset_px):
+    """They change integers by less than 1/2: independent rounding would undo the shift almost completely."""
+    noise = np.random.default_rng(3).normal(0, 0.7, (240, 320, 3))
+    source = np.rint(100 + 20 * gaussian_filter(noise, (1.5, 1.5, 0)) + noise).astype(np.uint8)
+    calibration = EpipolarCalibration()
+    calibration.removed = np.array([0.0, 0.0, 0.0, offset_px / RIG.focal_px])
+    found = calibration.rectify(source, RIG)
+    v, u, band = np.indices(source.shape, float)
+    exact = map_coordinates(source.astype(float), [v + offset_px, u, band], order=3, mode="nearest")
+    slope, error = (x[8:-8, 8:-8] for x in (np.gradient(exact, axis=0), found - exact))
+    assert np.sum(slope * error) / np.sum(slope**2) == pytest.approx(0.0, abs=0.004)
+
+
 def test_repetition_distinguishes_a_tiled_from_a_random_texture():
     tile = texture()[:24, :32]
     assert repetition(texture(), 11) < 0.35

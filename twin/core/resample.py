@@ -23,6 +23,7 @@ Positions = NDArray[np.float32]  #: (h, w, 2) column and row of a source image [
 REACH_PX = 2  # support of the spline to each side
 POLE, MIRRORED = 3**0.5 - 2, 16  # pole of the prefilter, length of its initial sum; POLE^16 is negligible
 BLOCK = 128  # columns filtered at a time, so that they stay in the second-level cache
+EXACT = np.float32(2e-3)  # largest deviation from an integer that is due to single precision
 TAPS = 8  # pixels to each side in the prefilter of rows; POLE^9 is 7e-6
 
 
@@ -45,15 +46,31 @@ def spline_coefficients(image: NDArray[Any]) -> NDArray[np.float32]:
 
 @kernel
 def _fill_from(source, positions, out, first, end):
-    n, least, most = out.shape[1], np.float32(0.0), np.float32(255.0)
+    n = out.shape[1]
     x, y, row = np.empty(n, np.float32), np.empty(n, np.float32), np.empty(3 * n, np.float32)
     weights, cells = np.empty((8, n), np.float32), np.empty(n, np.int32)
     for v in range(first, end):
         unpack(positions[v].reshape(-1), x, y)
         spline_row(source, x, y, weights, cells, row)
-        filled = out[v].reshape(-1)
-        for k in range(row.size):
-            filled[k] = np.uint8(min(max(row[k] + np.float32(0.5), least), most))
+        _round_row(row, out[v].reshape(-1))
+
+
+@kernel
+def _round_row(row, out):
+    """Rounds values (3 w,) to integers from 0 to 255 and adds the remainder of each to the next pixel of its band.
+
+    If the remainders were dropped, shifts by a small part of a pixel would be lost: they change the integers of a
+    source image with little contrast by less than 1/2.
+    """
+    half, least, most = np.float32(0.5), np.float32(0.0), np.float32(255.0)
+    for band in range(3):
+        remainder = np.float32(0.0)
+        for k in range(band, row.size, 3):
+            value = row[k] + remainder
+            rounded = np.floor(min(max(value, least), most) + half)
+            remainder = min(max(value - rounded, -half), half)
+            remainder = remainder if abs(remainder) > EXACT else np.float32(0.0)
+            out[k] = np.uint8(rounded)
 
 
 @kernel

@@ -7,11 +7,11 @@ from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from twin.core import geometry
+from twin.core import geometry, resample
 from twin.core.geometry import Array
 from twin.core.records import Image, StereoRig
+from twin.core.resample import Positions
 from twin.datasets.calibration import RecordedCamera, StereoCalibration
 from twin.errors import TwinError
 
@@ -19,28 +19,29 @@ from twin.errors import TwinError
 #: fractions of the baseline, differences of focal lengths and principal points [px].
 _PARALLEL_RAD, _ACROSS, _EQUAL_PX = 1e-6, 1e-6, 1e-3
 
-_Maps = tuple[NDArray[np.float32], NDArray[np.float32]]
-
 
 class Rectification(NamedTuple):
     """Conversion of recorded images to a rectified pair."""
 
     rig: StereoRig  #: calibration of the rectified pair
     left_from_rectified: Array  #: (4, 4) pose of the rectified left camera in the axes of the recorded one (a rotation)
-    #: for each camera (left, right), the columns (H, W) and the rows (H, W) at which the recorded image is sampled for
-    #: the pixels of the rectified image; None if its recorded images are used unchanged.
-    maps: tuple[_Maps | None, _Maps | None]
+    #: for each camera (left, right), column and row (H, W, 2) at which the recorded image is sampled for the pixels of
+    #: the rectified image [px]; None if its recorded images are used unchanged.
+    maps: tuple[Positions | None, Positions | None]
 
     @property
     def sentence(self) -> str:
         return "rectified as recorded" if self.maps == (None, None) else "rectified by `twin replay`"
 
     def rectified(self, image: Image, side: Literal["left", "right"]) -> Image:
-        """Returns a recorded image of a camera, resampled by cubic interpolation; black outside of it."""
-        maps = self.maps[0 if side == "left" else 1]
-        if maps is None:
+        """Returns a recorded image of a camera, resampled by cubic splines; black outside of it."""
+        positions = self.maps[0 if side == "left" else 1]
+        if positions is None:
             return image
-        return np.asarray(cv2.remap(image, *maps, interpolation=cv2.INTER_CUBIC), np.uint8)
+        rectified = resample.interpolate(image, positions)
+        height, width = image.shape[:2]
+        rectified[((positions < -0.5) | (positions > [width - 0.5, height - 0.5])).any(axis=-1)] = 0
+        return rectified
 
 
 def rectification(calibration: StereoCalibration, frame_rate_hz: float) -> Rectification:
@@ -111,11 +112,11 @@ def _four(camera: RecordedCamera) -> Array:
     return camera.distortion if len(camera.distortion) == 4 else np.zeros(4)
 
 
-def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> _Maps:
-    """Returns columns and rows (H, W) [px] in the recorded image; `turn` is rectified_from_recorded (3, 3)."""
+def _maps(camera: RecordedCamera, turn: Array, rig: StereoRig) -> Positions:
+    """Returns column and row (H, W, 2) [px] in the recorded image; `turn` is rectified_from_recorded (3, 3)."""
     size = rig.width_px, rig.height_px
     if camera.kind == "fisheye":
         maps = cv2.fisheye.initUndistortRectifyMap(camera.matrix, _four(camera), turn, rig.matrix, size, cv2.CV_32FC1)
     else:
         maps = cv2.initUndistortRectifyMap(camera.matrix, camera.distortion, turn, rig.matrix, size, cv2.CV_32FC1)
-    return np.asarray(maps[0], np.float32), np.asarray(maps[1], np.float32)
+    return np.stack(maps, axis=-1).astype(np.float32)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core import resample
 from twin.core.records import Image, Map, Mask
 from twin.kernels import kernel
 
@@ -64,12 +65,12 @@ def binned(image: Pixels, by: int) -> Pixels:
 
 
 def scaled_rows(image: Image, scale: float) -> Image:
-    """Returns an image (H, W, ...) resampled to int(H scale) rows; input row v becomes row (v + 0.5) scale - 0.5."""
+    """Returns an image (H, W, 3) resampled to int(H scale) rows; input row v becomes row (v + 0.5) scale - 0.5."""
     if scale == 1:
         return image
     rows, columns = int(image.shape[0] * scale), image.shape[1]
-    matrix = np.array([[1, 0, 0], [0, scale, 0.5 * scale - 0.5]])
-    return np.asarray(cv2.warpAffine(image, matrix, (columns, rows), borderMode=cv2.BORDER_REPLICATE), np.uint8)
+    positions = np.meshgrid(np.arange(columns), (np.arange(rows) + 0.5) / scale - 0.5)
+    return resample.interpolate(image, np.stack(positions, axis=-1).astype(np.float32))
 
 
 @kernel(fastmath=True)
