@@ -229,7 +229,7 @@ class ImagingConfig(Section):
     """read noise (1 sigma), a fraction of full scale; unused with [sensor]"""
     shot_noise: float = Field(default=0.006, ge=0, le=0.5)
     """shot noise (1 sigma) at full scale, a fraction of it; grows as the root of the signal; unused with [sensor]"""
-    shadows: bool = False
+    shadows: bool = True
     """the sea floor and objects cast shadows in the light of lamps and sun"""
     scattering: ScatteringModel = "full"
     """full: multiple scattering softens the beams, blurs the image and brightens the backscatter; single: light

@@ -35,7 +35,7 @@ MOST_TURNED, TURN_STEPS = 0.95 * np.pi, 500  # largest angle t of a path [rad], 
 FEW = 8  # if the floor sees the lamp and none of this number of paths is blocked, no more are tested
 SEQUENCE = 1.2207440846057596 ** -np.arange(1.0, 4.0)  # steps of a sequence of low discrepancy in 3 dimensions
 BEAM_STEPS = 256  # steps of sqrt(1 - cos(angle from the axis)) from 0 to 1
-STEP_TAN = 0.02  # spacing of the pixels that are tested, in focal lengths
+STEP_TAN = 0.04  # spacing of the pixels that are tested, in focal lengths
 #: A hidden share up to LEAST_HIDDEN counts as none, and ends the growing; up to twice as much, twice the excess counts.
 MOST_HIDDEN, LEAST_HIDDEN = 0.99, 0.04
 #: Light of an open floor that reaches a shadow over two reflections, from the floor and from what hides the lamp

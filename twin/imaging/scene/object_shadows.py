@@ -1,8 +1,8 @@
 """Shadows that objects cast on the floor, on each other and on themselves, in the light of lamps and sun.
 
 For each light, the objects are drawn into a depth image as seen from it (shadow map, Williams 1978), which spans the
-points that the camera sees, with pixels about as large. A point is in the shadow where the map shows an object nearer
-to the light by more than a bias of some pixels.
+points that the camera sees, with pixels about twice as large: lamps are not points, and their shadows are not sharper.
+A point is in the shadow where the map shows an object nearer to the light by more than a bias of some pixels.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from twin.kernels import kernel
 
 FROM_ABOVE: Array = np.diag([1.0, -1.0, -1.0, 1.0])  #: axes east, south, down
 STRIDE_PX = 8  #: spacing of the pixels whose points determine the extent of a map
+MAP_PX = 2.0  #: size of the pixels of a map, in pixels of the image
 MARGIN_PX = 2.0  #: margin of a map around these points, in its pixels
 WIDEST_TANGENT = 5.0  #: largest tangent of half the field of view of a map; points outside the map count as lit
 BIAS_PX = 1.5  #: least distance of an occluder from a point of an object that faces the light, in pixels of the map
@@ -109,9 +110,9 @@ def _sun_view(to_sun: Array, points: Array, shape: tuple[int, int]) -> _LightVie
 def _view_of(
     places: Array, shape: tuple[int, int], camera_from_light: Array, near_m: float, perspective: bool
 ) -> _LightView:
-    """Returns the view of places (n, 2) [tangents or m] with about as many pixels as an image of (rows, cols)."""
+    """Returns the view of places (n, 2) [tangents or m], with pixels of `MAP_PX` for an image of (rows, cols)."""
     low, high = places.min(axis=0), places.max(axis=0)
-    scale = float(np.sqrt(shape[0] * shape[1] / np.maximum(high - low, 1e-3).prod()))
+    scale = float(np.sqrt(shape[0] * shape[1] / np.maximum(high - low, 1e-3).prod())) / MAP_PX
     low, high = low - MARGIN_PX / scale, high + MARGIN_PX / scale
     cols, rows = np.ceil((high - low) * scale).astype(int) + 1
     projection = Projection(scale, -low[0] * scale, -low[1] * scale, near_m, perspective)
