@@ -441,6 +441,7 @@ def test_the_residual_of_a_vertical_is_the_sine_of_its_angle_and_does_not_depend
     np.testing.assert_allclose(exact.residuals(turned[None]), 0, atol=1e-12)
 
 
+@pytest.mark.long
 def test_the_alignment_of_a_chain_with_a_biased_accelerometer_is_consistent():
     """The bias is in every reading: 20 of them give the tilt of the chain with the standard deviation of one.
 

@@ -193,6 +193,7 @@ def test_gross_outliers_are_removed_and_at_most_1_percent_of_the_inliers():
     assert errors_m.max() < 3e-3
 
 
+@pytest.mark.long
 def test_the_number_of_independent_errors_predicts_how_much_the_mean_nees_of_surveys_varies():
     """400 surveys of the same network with other noise: the variance of the mean NEES has a standard error of 10 %."""
     means, independent = [], 0.0

@@ -57,6 +57,7 @@ def test_the_bias_of_the_gyroscope_is_estimated():
     assert np.rad2deg(errors(found, up)).max() < 1.0
 
 
+@pytest.mark.long
 def test_the_standard_deviation_is_consistent_with_the_errors():
     """Errors at three times, each over 200 vehicles: chi-square with 2 degrees of freedom per vehicle.
 

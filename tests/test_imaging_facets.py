@@ -22,6 +22,7 @@ SCENARIO = Scenario.model_validate(
         "rig": {"image_width_px": 160, "image_height_px": 120},
         "lamps": [{"position_m": (0.2, 0.5, 0.0), "beam": ((0.0, 1.0), (90.0, 1.0)), "intensity_cd": 1000.0}],
         "water": {"jerlov": "clear"},
+        "imaging": {"shadows": False},
     }
 )
 RIG = SCENARIO.believed_rig()

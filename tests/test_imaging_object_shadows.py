@@ -9,7 +9,7 @@ from twin.core import geometry
 from twin.core.records import StereoRig
 from twin.imaging.light.shadows import Shadows
 from twin.imaging.scene.mesh_raster import ObjectView
-from twin.imaging.scene.object_shadows import ObjectShadows
+from twin.imaging.scene.object_shadows import MAP_PX, ObjectShadows
 from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.terrains.objects.coloured_mesh import mesh_of
 from twin.terrains.objects.placed_object import PlacedObject, model_of
@@ -46,7 +46,7 @@ def hidden_by_ball(points: np.ndarray, to_light: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("lamp", [None, [0.5, 0.35, 0.05], [-0.3, 0.2, 0.4]])
-def test_the_shadow_of_a_ball_is_exact_to_a_pixel(lamp):
+def test_the_shadow_of_a_ball_is_exact_to_a_pixel_of_the_map(lamp):
     """The sun, a lamp beside the camera and a lamp below it; a pixel of the image spans 11 mm of the floor."""
     depth, view, points = image()
     lamps = np.zeros((0, 3)) if lamp is None else np.array([lamp])  # in the axes of the camera
@@ -55,8 +55,8 @@ def test_the_shadow_of_a_ball_is_exact_to_a_pixel(lamp):
     casting.darken(lit, depth, view, POSE, (0, 0.0))
     to_light = np.broadcast_to(SUN * 100, points.shape) if lamp is None else geometry.transform(POSE, lamps)[0] - points
     beyond, floor = hidden_by_ball(points, to_light), view.label == 0
-    pixel_m = HEIGHT_M / FOCAL
-    assert (beyond[floor] < -pixel_m).sum() > 200
+    pixel_m = MAP_PX * HEIGHT_M / FOCAL
+    assert (beyond[floor] < -pixel_m).sum() > 100
     assert (lit[0][floor & (beyond < -pixel_m)] == 0).all() and (lit[0][floor & (beyond > pixel_m)] == 1).all()
 
 

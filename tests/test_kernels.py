@@ -97,6 +97,7 @@ def test_without_a_folder_to_write_to_the_kernels_are_compiled_in_each_process(p
     assert not list(package.rglob("*.nbi"))
 
 
+@pytest.mark.long
 def test_old_versions_of_a_module_are_removed(package):
     for k in range(twin.kernels._VERSIONS_KEPT + 2):
         (package / "constants.py").write_text(f"HALF = {k}.0\n")

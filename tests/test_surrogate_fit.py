@@ -105,6 +105,7 @@ def map_classes(rng, model, bound_px, lamps, level):
     return rows
 
 
+@pytest.mark.long
 def test_the_fit_recovers_the_error_model_that_surveys_follow():
     surveys = [simulated(np.random.default_rng(k), TRUE) for k in range(30)]
     fitted = fit_error_model(surveys, COMPARED)
