@@ -26,6 +26,7 @@ class CameraSurface:
     spline: RectBivariateSpline  # z [m] as a function of u and v [m]; constant beyond the outermost knots
     area: SurveyArea  # its axes are u and v
     max_climb: float  # greatest slope (rise over run) of a path at cruise speed
+    altitude_m: float  # height z of level paths that coincide with the surface when they are lifted to it
 
     def height_at(self, x_m: Array, y_m: Array) -> Array:
         return self.spline.ev(*self.area.to_legs(x_m, y_m))
@@ -34,7 +35,8 @@ class CameraSurface:
         """Lifts the references of a level path, given at n times, to the surface; returns the new references.
 
         With the surface z(u, v), horizontal velocity w and acceleration a, the vertical velocity is grad(z)' w and the
-        vertical acceleration grad(z)' a + w' H(z) w, with the Hessian H.
+        vertical acceleration grad(z)' a + w' H(z) w, with the Hessian H; those of the path's own changes of height are
+        added.
         """
         u, v = self.area.to_legs(level.position[:, 0], level.position[:, 1])
         slope = np.stack([self.spline.ev(u, v, dx=1), self.spline.ev(u, v, dy=1)], axis=1)
@@ -42,11 +44,12 @@ class CameraSurface:
         w, a = (self.area.vectors_to_legs(part[:, :2]) for part in (level.velocity, level.acceleration))
         bend = uu * w[:, 0] ** 2 + 2 * uv * w[:, 0] * w[:, 1] + vv * w[:, 1] ** 2
         climb, lift = (slope * w).sum(axis=1), (slope * a).sum(axis=1) + bend
-        return level._replace(
-            position=np.column_stack([level.position[:, :2], self.spline.ev(u, v)]),
-            velocity=np.column_stack([level.velocity[:, :2], climb]),
-            acceleration=np.column_stack([level.acceleration[:, :2], lift]),
-        )
+        vertical = np.stack([self.spline.ev(u, v) - self.altitude_m, climb, lift])
+        lifted = (part + np.outer(added, [0, 0, 1]) for part, added in zip(
+            (level.position, level.velocity, level.acceleration), vertical, strict=True
+        ))  # fmt: skip
+        position, velocity, acceleration = lifted
+        return level._replace(position=position, velocity=velocity, acceleration=acceleration)
 
     def pace(self, start: Point, end: Point) -> float:
         """Returns the share of the cruise speed, at most 1, at which a line climbs no faster than with `max_climb`."""
@@ -91,7 +94,7 @@ def surface_above_floor(
     u, v = np.interp(rows, np.arange(len(u)), u), np.interp(cols, np.arange(len(v)), v)
     coarse = _limit_slope(coarse, max_slope[0] * (u[1] - u[0]), max_slope[1] * (v[1] - v[0]))
     coarse = gaussian_filter(coarse, 1.0, mode="nearest")
-    return CameraSurface(RectBivariateSpline(u, v, coarse + altitude_m), area, max_slope[0])
+    return CameraSurface(RectBivariateSpline(u, v, coarse + altitude_m), area, max_slope[0], altitude_m)
 
 
 @kernel

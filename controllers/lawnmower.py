@@ -163,7 +163,8 @@ def _cross_track(
 ) -> tuple[Segment, ...]:
     """Returns the segments of cross lines over the legs, from a start (u, v) [m], at one heading.
 
-    Each spans the legs that it crosses. Where two are joined, the one that ends first is extended.
+    Each spans the legs that it crosses. Where two are joined, the one that ends first is extended. Before the first,
+    the camera rises to the height of the cross lines.
     """
     corners = [start]
     for k, u in enumerate(_cross_positions(legs, request.cross_lines)):
@@ -173,7 +174,8 @@ def _cross_track(
         corners[-1] = corners[-1][0], joint
         corners += [(u, joint), (u, end(crossed))]
     points = _points(request, area, corners)
-    pairs = [(a, b) for a, b in pairwise(points) if math.dist(a, b) > _COINCIDE_M]
+    raised = [(x, y, z + request.cross_rise_m) for x, y, z in points]
+    pairs = [(a, b) for a, b in pairwise([points[0], *raised]) if math.dist(a, b) > _COINCIDE_M]
     return tuple(_line(request, a, b, yaw, is_leg=False) for a, b in pairs)
 
 

@@ -47,6 +47,7 @@ class SurveyRequest(NamedTuple):
     leg_spacing: tuple[tuple[float, float], ...] = ()
     surface: CameraSurface | None = None  # planned height z of the camera; None: `altitude_m` everywhere
     cross_lines: int = 0  # number of lines across the legs of a lawnmower, flown after them
+    cross_rise_m: float = 0.0  # height of the cross lines above the legs
 
     @property
     def footprint_m(self) -> tuple[float, float]:
@@ -122,7 +123,7 @@ class SurveyPlan:
         first, *others = self.paths[track - 1]
         points = np.concatenate([first.points(), *(segment.points()[1:] for segment in others)])
         if self.request.surface is not None:
-            points[:, 2] = self.request.surface.height_at(points[:, 0], points[:, 1])
+            points[:, 2] += self.request.surface.height_at(points[:, 0], points[:, 1]) - self.request.altitude_m
         return points
 
     def outline(self) -> Array:

@@ -7,8 +7,10 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.integrate import cumulative_trapezoid
 
 from twin.controllers import lawnmower, loops
+from twin.controllers.camera_surface import surface_above_floor
 from twin.controllers.forecast import least_clearance
 from twin.controllers.segments import Turn
 from twin.controllers.survey_area import SurveyArea, polygon_area, polygons_area
@@ -254,6 +256,23 @@ def test_cross_lines_are_flown_after_the_legs_at_equal_distances_over_all_of_the
     np.testing.assert_allclose(np.asarray(p.references(p.n_tracks, times).yaw), last.yaw)
     x, y = np.random.default_rng(0).uniform(-3, 3, (2, 500))
     np.testing.assert_array_equal(p.inside_area(x, y), without.inside_area(x, y))
+
+
+@pytest.mark.parametrize("follows", [False, True])
+def test_cross_lines_may_be_flown_higher_than_the_legs(follows):
+    """The camera rises where the legs end; positions are the integral of velocities, and these of accelerations."""
+    surface = surface_above_floor(lambda x, y: 0.2 * np.sin(x), rectangle(), 0.05, 2.0, (1.5, 2.0), (0.5, 2.0))
+    changes = {"cross_lines": 2, "altitude_m": 2.0} | ({"surface": surface} if follows else {})
+    level, p = plan(**changes), plan(**changes, cross_rise_m=0.5)
+    last = p.n_tracks
+    assert p.paths[:-1] == level.paths[:-1] and p.paths[-1][0].direction == (0.0, 0.0, 1.0)
+    np.testing.assert_allclose(p.waypoints(last)[0], level.waypoints(last)[0])
+    np.testing.assert_allclose(p.waypoints(last)[1:], level.waypoints(last) + [0, 0, 0.5])
+    times, _ = p.frames_of_track(last)
+    at = p.references(last, times)
+    for value, rate, tolerance in ((at.position, at.velocity, 2e-3), (at.velocity, at.acceleration, 0.02)):
+        integral = value[0] + cumulative_trapezoid(rate, times, axis=0, initial=0)
+        np.testing.assert_allclose(integral, value, atol=tolerance)
 
 
 def test_cross_lines_of_a_polygon_span_the_legs_that_they_cross():

@@ -20,7 +20,7 @@ from twin.studies.surveys import surveys
 
 PLAN_KEYS = (
     "pattern, area_m, centre_m, centre_crs, heading_deg, along_contours, polygon, turns, altitude_m, speed_mps, "
-    "overlap_along, overlap_across, overlap_reference, height, tracks, cross_lines, clearance_m"
+    "overlap_along, overlap_across, overlap_reference, height, tracks, cross_lines, cross_rise_m, clearance_m"
 )
 TOP_KEYS = (
     "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "

@@ -105,6 +105,10 @@ def test_a_kinematic_vehicle_has_the_commanded_horizontal_velocity():
         (["plan.area_m=[7.0, 7.0]"], "--set: plan.area_m: 7 x 7 m is larger than the terrain (allowed: up to 6.00 x"),
         (["plan.altitude_m=0.7"], "--set: plan.altitude_m: 0.7: the cameras come within "),
         (
+            ["plan.cross_rise_m=0.5"],
+            "--set: plan.cross_rise_m: has no effect without cross lines (allowed: 0, or plan.cross_lines above 0",
+        ),
+        (
             ["vehicle.dynamics=kinematic", "current.velocity_mps=[0.1, 0.0, 0.0]"],
             "--set: current.velocity_mps: has no effect on a kinematic vehicle "
             '(allowed: zero, or vehicle.dynamics = "rigid")',

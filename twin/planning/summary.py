@@ -161,9 +161,11 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
     included = "included" if mission.scenario.imaging.fidelity == "rendered" else "not included"
     objects = f"{len(mission.objects)}, {included} in the properties over the floor"
     n_cross, heading_deg = mission.plan.request.cross_lines, math.degrees(mission.plan.area.heading)
+    rise_m = mission.plan.request.cross_rise_m
+    higher = f", {length(rise_m)} higher" if rise_m else ""
     return [
         (f"tracks L, {of_track} each", f"{mission.plan.n_leg_tracks}"),
-        *([("cross lines", f"{n_cross}, flown after the {swath}s")] if n_cross else []),
+        *([("cross lines", f"{n_cross}, flown after the {swath}s{higher}")] if n_cross else []),
         ("frames per keyframe N", f"{f.n_frames_per_keyframe}"),
         (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
         ("keyframes", f"{f.n_keyframes}"),

@@ -589,6 +589,8 @@ class PlanConfig(Section):
     """number of tracks (two legs, or one loop); 0: enough to cover the area"""
     cross_lines: int = Field(default=0, ge=0, le=100)
     """number of lines across the legs that are flown after them, as a last track; 0: none"""
+    cross_rise_m: float = Field(default=0.0, ge=0, le=20)
+    """height of the cross lines above the legs: a second altitude shows wrong scales [m]"""
     clearance_m: float = Field(default=0.3, ge=0, le=10)
     """smallest allowed vertical distance from the cameras to the sea floor in their images or, with height = "floor",
     within 0.4 m plus this distance around them [m]"""

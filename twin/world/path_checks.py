@@ -202,7 +202,7 @@ def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float]
     A kinematic vehicle, and a path at constant height without current, are not checked.
     """
     current = np.array(current_mps)
-    if vehicle.dynamics == "kinematic" or not (current.any() or plan.follows_floor):
+    if vehicle.dynamics == "kinematic" or not (current.any() or plan.follows_floor or plan.request.cross_rise_m):
         return
     planned = plan.all_references()
     rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity]), 3)
@@ -216,7 +216,7 @@ def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float]
         )  # fmt: skip
     factor = _saturating_factor(vehicle, lambda k: _body_velocities(yaw, k * velocity - current))
     if factor is not None:
-        against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " up the slopes"
+        against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " where it rises"
         raise TwinError(
             "plan.speed_mps", f"{plan.speed_mps:g}: too fast for the thrusters{against}",
             f"up to {np.floor(1000 * factor * plan.speed_mps) / 1000:.3f}",

@@ -97,7 +97,7 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
     return SurveyRequest(
         p.area_m if area is None else area.size_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across,
         p.tracks, rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz, area=area, turns=p.turns,
-        cross_lines=p.cross_lines,
+        cross_lines=p.cross_lines, cross_rise_m=p.cross_rise_m,
     )  # fmt: skip
 
 

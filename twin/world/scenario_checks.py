@@ -22,6 +22,13 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
         problem, allowed = "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
         yield TwinError("current.velocity_mps", problem, allowed)
+    if scenario.plan.cross_rise_m:
+        problem = "has no effect without cross lines" if not scenario.plan.cross_lines else ""
+        problem = (
+            "a kinematic vehicle moves in a horizontal plane" if scenario.vehicle.dynamics == "kinematic" else problem
+        )
+        if problem:
+            yield TwinError("plan.cross_rise_m", problem, "0, or plan.cross_lines above 0 with a rigid vehicle")
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
         yield TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
     if scenario.sensor is not None:
