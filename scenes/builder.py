@@ -1,4 +1,4 @@
-"""MuJoCo model of the scene: the seafloor and a free-floating BlueROV2, which is a mass without a shape.
+"""MuJoCo model of the scene: the seafloor and a free-floating vehicle, which is a mass without a shape.
 
 The floor is divided into textured mesh tiles so that only the tiles in view are rendered. Meshes instead of MuJoCo
 height fields: a mesh is rendered twice as fast because triangles share vertices, its texture is mapped exactly by
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.height_field import grid_triangles
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenes.gl import MjModel, MjSpec, mujoco
 from twin.terrains import Terrain
 
@@ -39,8 +38,13 @@ class SceneModel(NamedTuple):
     tile_high_m: Array
 
 
-def build(terrain: Terrain, timestep_s: float) -> SceneModel:
-    """Compiles floor and vehicle into one MuJoCo model with gravity, without lights, buoyancy, drag and thrust."""
+def build(
+    terrain: Terrain, timestep_s: float, mass_kg: float = 1.0, inertia_kgm2: Array | tuple[float, ...] = (1.0, 1.0, 1.0)
+) -> SceneModel:
+    """Compiles floor and vehicle into one MuJoCo model with gravity, without lights, buoyancy, drag and thrust.
+
+    `inertia_kgm2` are the moments of inertia (3,) of the vehicle about its axes.
+    """
     spec = mujoco.MjSpec()
     spec.modelname = "seabed"
     spec.option.timestep = timestep_s
@@ -52,7 +56,7 @@ def build(terrain: Terrain, timestep_s: float) -> SceneModel:
     body = spec.worldbody.add_body(name="vehicle")  # its origin is the centre of gravity
     body.add_freejoint(name="vehicle")
     body.explicitinertial = True
-    body.mass, body.ipos, body.inertia = BLUEROV2_HEAVY.mass_kg, np.zeros(3), BLUEROV2_HEAVY.inertia_kgm2
+    body.mass, body.ipos, body.inertia = mass_kg, np.zeros(3), np.array(inertia_kgm2)
     model = spec.compile()
     ids = np.array([model.geom(name).id for name in tiles])
     low_m, high_m = (np.array([side(nodes, axis=0) for nodes in tiles.values()]) for side in (np.min, np.max))

@@ -3,7 +3,6 @@
 import numpy as np
 
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 
@@ -17,7 +16,8 @@ def bare_model(timestep_s: float = 1 / 120) -> MjModel:
     spec.option.timestep = timestep_s
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint()
-    body.mass, body.inertia, body.explicitinertial = BLUEROV2_HEAVY.mass_kg, BLUEROV2_HEAVY.inertia_kgm2, True
+    rov = VehicleConfig()
+    body.mass, body.inertia, body.explicitinertial = rov.mass_kg, np.array(rov.inertia_kgm2), True
     return spec.compile()
 
 

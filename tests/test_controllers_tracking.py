@@ -13,21 +13,22 @@ from twin.controllers.survey_plan import SurveyRequest
 from twin.controllers.tracking import commanded_velocity, control_thrusters, rotate_lever_arm
 from twin.core import geometry
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.simulate.autopilot import nominal_controller, top_speed_mps
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.parameters import parameters_of
 from twin.simulate.thrusters import steady_thrust_n
 
 RATE_HZ = 30.0
 LEVER_M = np.array([0.0, 0.075, -0.15])
+ROV = parameters_of(VehicleConfig())
 CONFIGURATION = angular_first(ROV.thrust_configuration)
 
 
 def thrust_of(command):
     """Returns the steady thrust [N] at commands in [-1, 1]."""
-    return steady_thrust_n(command, ROV.thrust_coefficients)
+    return steady_thrust_n(command, ROV.thrust_coefficients, ROV.thrust_table)
 
 
 ALLOCATION = pseudo_inverse_allocation(CONFIGURATION, thrust_of)
@@ -51,7 +52,7 @@ def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors
     start = body_reference(p.reference(1, 0.0)).position
     section = VehicleConfig(**factors)
     rov = MujocoVehicle(bare_model(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
-    controller = nominal_controller(1.2, RATE_HZ)
+    controller = nominal_controller(VehicleConfig(), 1.2, RATE_HZ)
     rows = []
     for track in range(1, p.n_tracks + 1):
         duration = p.track_duration_s(track)
@@ -167,7 +168,7 @@ def test_the_commanded_velocity_is_the_reference_velocity_plus_a_position_correc
 
 
 def test_the_integral_does_not_wind_up_while_thrusters_saturate():
-    controller = nominal_controller(1.2, RATE_HZ)
+    controller = nominal_controller(VehicleConfig(), 1.2, RATE_HZ)
     far = Reference(np.array([50.0, 0.0, 0.0]), np.zeros(3), 0.0, np.zeros(3))
     for _ in range(300):
         command(controller, np.eye(4), np.zeros(6), far)
@@ -180,7 +181,7 @@ def test_station_keeping_in_a_current_works_at_any_heading(yaw):
     reference = Reference(np.zeros(3), np.zeros(3), yaw, np.zeros(3))
     start = geometry.pose(geometry.rotation_from_rpy(0.1, 0.1, yaw + 0.4), np.array([0.2, 0.0, 0.0]))
     rov = MujocoVehicle(bare_model(), VehicleConfig(), np.array([0.1, 0.05, 0.0]), start)
-    controller = nominal_controller(1.2, RATE_HZ)
+    controller = nominal_controller(VehicleConfig(), 1.2, RATE_HZ)
     for _ in range(20 * 30):
         rov.step(command(controller, rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)
     np.testing.assert_allclose(rov.world_from_body[:3, 3], 0, atol=0.005)

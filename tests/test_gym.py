@@ -14,6 +14,7 @@ import twin.gym
 from twin.core import geometry
 from twin.core.records import Readings
 from twin.errors import TwinError
+from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import nominal_controller
 
 pytestmark = pytest.mark.long
@@ -91,7 +92,7 @@ def test_thrust_towards_the_floor_ends_the_episode_with_a_reason():
     env = make(action="thrust", reward="track")
     _, info = env.reset(seed=3)
     assert info["truth"]["distance_to_plan_m"] == pytest.approx(0, abs=1e-9)
-    down = nominal_controller(1.2, 10).allocation.commands(np.array([0, 0, 0, 0, 0, -100.0]))[0]
+    down = nominal_controller(VehicleConfig(), 1.2, 10).allocation.commands(np.array([0, 0, 0, 0, 0, -100.0]))[0]
     terminated = truncated = False
     while not (terminated or truncated):
         _, reward, terminated, truncated, info = env.step(down.astype(np.float32))

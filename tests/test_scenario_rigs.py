@@ -5,7 +5,7 @@ import pytest
 from twin.errors import ScenarioError
 from twin.scenario.file import dump_toml, load_scenario, read_toml, read_tree, with_values
 from twin.scenario.model import Source
-from twin.scenario.rigs import REPLACED, built_in_rigs
+from twin.scenario.model_files import RIG
 
 OWN = """
 title = "mine"
@@ -35,12 +35,12 @@ def scenario(folder, text, *overrides):
     return load_scenario(folder / "scene.toml", overrides)
 
 
-@pytest.mark.parametrize("name", built_in_rigs())
+@pytest.mark.parametrize("name", RIG.built_in())
 def test_every_rig_can_be_flown_in_every_scene_and_says_where_its_numbers_come_from(name):
     for scene in ("quickstart", "paper"):
         assert load_scenario(scene, [f"rig.model={name}"]).rig.title
-    tree, _ = read_toml(built_in_rigs()[name])
-    for section in set(REPLACED) & tree.keys():
+    tree, _ = read_toml(RIG.built_in()[name])
+    for section in set(RIG.replaced) & tree.keys():
         assert any(key.split(".")[0] == section for key in tree["sources"]), section
 
 

@@ -1,4 +1,4 @@
-"""The scene model has the vehicle parameters of the data sheet and the floor of the terrain."""
+"""The scene model has the mass of the vehicle and the floor of the terrain."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import pytest
 
 from twin import terrains
 from twin.core import geometry
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenes.builder import MAX_TILES, TILE_CELLS, SceneModel, build, tile_cells
 from twin.scenes.gl import mujoco
 from twin.terrains import TextureSource
@@ -16,7 +15,7 @@ from twin.terrains import TextureSource
 @pytest.fixture(scope="module")
 def scene() -> SceneModel:
     terrain = terrains.generate("reef", (6.0, 3.7), 0.5, 0.2, 0.05, TextureSource(0.02), 3)
-    return build(terrain, 0.004)
+    return build(terrain, 0.004, 13.5, (0.26, 0.23, 0.37))
 
 
 def data_at(scene: SceneModel, position: np.ndarray, rotation: np.ndarray) -> mujoco.MjData:
@@ -27,21 +26,7 @@ def data_at(scene: SceneModel, position: np.ndarray, rotation: np.ndarray) -> mu
     return data
 
 
-def test_eight_thrusters_control_all_six_degrees_of_freedom() -> None:
-    configuration = BLUEROV2_HEAVY.thrust_configuration
-    assert np.linalg.matrix_rank(configuration) == 6
-    # lever arm of each horizontal thruster in yaw: (0.156 + 0.111) / sqrt(2)
-    assert np.abs(configuration[5, :4]) == pytest.approx(np.full(4, (0.156 + 0.111) * np.sqrt(0.5)))
-    assert np.linalg.norm(BLUEROV2_HEAVY.thruster_directions, axis=1) == pytest.approx(np.ones(8))
-
-
-def test_thrust_curve_agrees_with_the_published_points() -> None:
-    u = np.array([0.25, 0.5, 0.75, 1.0])
-    thrust_n = sum(c * u**p for c, p in zip(BLUEROV2_HEAVY.thrust_coefficients, (9, 7, 5, 3, 1), strict=True))
-    assert thrust_n == pytest.approx([4.6, 16.6, 26.5, 30.4], abs=0.06)
-
-
-def test_the_vehicle_has_the_published_mass_and_inertia_and_falls_freely(scene: SceneModel) -> None:
+def test_the_vehicle_has_the_given_mass_and_inertia_and_falls_freely(scene: SceneModel) -> None:
     model, body = scene.model, scene.model.body("vehicle").id
     assert model.body_mass[body] == 13.5 and model.body_mass.sum() == 13.5
     assert model.body_inertia[body] == pytest.approx([0.26, 0.23, 0.37])

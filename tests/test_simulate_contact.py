@@ -12,7 +12,8 @@ from twin.errors import SurveyAborted
 from twin.scenario.file import load_scenario
 from twin.scenario.model import VehicleConfig
 from twin.simulate.compiled_vehicle import CompiledVehicle
-from twin.simulate.contact import CENTRE_M, HALF_M, floor_field, touches_floor
+from twin.simulate.contact import HullBox, floor_field, touches_floor
+from twin.simulate.parameters import parameters_of
 from twin.surrogate import surrogate_world
 from twin.terrains import Terrain
 from twin.terrains.objects.coloured_mesh import mesh_of
@@ -26,6 +27,8 @@ SMALL = [
     "plan.area_m=[0.4, 0.4]", "plan.altitude_m=1.5", "plan.tracks=1", "control.hold_s=0.4",
 ]  # fmt: skip
 SURROGATE = ["imaging.fidelity=surrogate", "imaging.extrapolate=true"]
+HALF_M, CENTRE_M = parameters_of(VehicleConfig()).half_size_m, parameters_of(VehicleConfig()).hull_centre_m
+BOX = HullBox(HALF_M, CENTRE_M)
 DOWN = np.r_[np.zeros(4), np.full(4, -1.0)]
 
 
@@ -34,7 +37,7 @@ def at(x, y, z, rotation=None):
 
 
 def test_a_level_hull_touches_a_level_floor_where_its_lower_side_reaches_it():
-    floor, bottom = floor_field(np.full((41, 61), 0.3, np.float32), 0.1, -3.0, -2.0), HALF_M[2] - CENTRE_M[2]
+    floor, bottom = floor_field(np.full((41, 61), 0.3, np.float32), 0.1, -3.0, -2.0, BOX), HALF_M[2] - CENTRE_M[2]
     for x, y in [(0.0, 0.0), (-2.9, 1.93), (2.97, -1.99)]:
         assert touches_floor(floor, at(x, y, np.float32(0.3) + bottom - 1e-6))
         assert not touches_floor(floor, at(x, y, np.float32(0.3) + bottom + 1e-6))
@@ -46,7 +49,7 @@ def test_contact_with_relief_agrees_with_points_sampled_on_the_hull(seed):
     """No point of the hull is below the floor where there is no contact; 5 mm farther down, one is."""
     rng = np.random.default_rng(seed)
     spacing, heights = 0.04, rng.normal(0, 0.03, (60, 60)).astype(np.float32)
-    floor = floor_field(heights, spacing, -1.2, -1.2)
+    floor = floor_field(heights, spacing, -1.2, -1.2, BOX)
     rotation = geometry.rotation_from_rpy(*rng.normal(0, 0.3, 3))
     low, high = -1.0, 1.0
     for _ in range(30):
@@ -84,7 +87,7 @@ def test_a_hull_beside_an_object_is_free_and_one_at_its_side_touches_it():
 
 
 def test_the_compiled_vehicle_stops_at_the_timestep_of_the_contact():
-    floor = floor_field(np.zeros((41, 41), np.float32), 0.1, -2.0, -2.0)
+    floor = floor_field(np.zeros((41, 41), np.float32), 0.1, -2.0, -2.0, BOX)
     body = CompiledVehicle(VehicleConfig(), np.zeros(3), at(0, 0, 1.0), 1 / 120, floor)
     free = CompiledVehicle(VehicleConfig(), np.zeros(3), at(0, 0, 1.0), 1 / 120)
     with pytest.raises(SurveyAborted, match=r"contact of the hull with the floor at .* s, x 0.00, y 0.00, z 0.1\d m"):

@@ -7,14 +7,14 @@ from physics_world import IDLE, bare_model, vehicle
 from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.hydrodynamics import acceleration, angular_first
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.parameters import parameters_of
 
 STEP_S = 1 / 120
-HULL = trimmed_hull(VehicleConfig(buoyancy_n=0.0))
+ROV, HULL = parameters_of(VehicleConfig()), trimmed_hull(VehicleConfig(buoyancy_n=0.0))
 
 
 def energy(v, hull=HULL):
@@ -88,7 +88,7 @@ def test_terminal_speed_balances_thrust_and_drag(axis, command):
     for _ in range(60):
         v.step(command * active, 0.5)
     thrust = np.polyval(ROV.thrust_coefficients, command**2) * command * 4 * (np.sqrt(0.5) if axis == "surge" else 1)
-    linear, quadratic = ROV.linear_damping[k], ROV.quadratic_damping[k]
+    linear, quadratic = ROV.linear_drag[k], ROV.quadratic_drag[k]
     expected = (-linear + np.sqrt(linear**2 + 4 * quadratic * thrust)) / (2 * quadratic)
     assert v.twist_body[3 + k] == pytest.approx(expected, rel=0.01)
 
@@ -99,7 +99,7 @@ def test_a_neutral_vehicle_stays_at_depth_and_a_buoyant_one_rises_at_terminal_sp
     np.testing.assert_allclose(v.world_from_body, np.eye(4), atol=1e-12)
     v = vehicle(buoyancy_n=2.0)
     v.step(IDLE, 30.0)
-    linear, quadratic = ROV.linear_damping[2], ROV.quadratic_damping[2]
+    linear, quadratic = ROV.linear_drag[2], ROV.quadratic_drag[2]
     expected = (-linear + np.sqrt(linear**2 + 8 * quadratic)) / (2 * quadratic)
     assert v.twist_body[5] == pytest.approx(expected, rel=1e-3)
 
@@ -158,8 +158,8 @@ def test_a_drifting_neutral_vehicle_reaches_the_velocity_of_a_steady_current():
 def test_added_mass_and_drag_factors_scale_added_mass_and_drag():
     hull = trimmed_hull(VehicleConfig(drag_factor=2.0, added_mass_factor=3.0))
     np.testing.assert_allclose(hull.added_inertia, 3 * angular_first(ROV.added_mass))
-    np.testing.assert_allclose(hull.linear_drag, 2 * angular_first(ROV.linear_damping))
-    np.testing.assert_allclose(hull.quadratic_drag, 2 * angular_first(ROV.quadratic_damping))
+    np.testing.assert_allclose(hull.linear_drag, 2 * angular_first(ROV.linear_drag))
+    np.testing.assert_allclose(hull.quadratic_drag, 2 * angular_first(ROV.quadratic_drag))
 
 
 def test_divergence_aborts_the_survey_and_reports_time_and_last_states():

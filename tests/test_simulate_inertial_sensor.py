@@ -8,7 +8,6 @@ from twin.core import geometry
 from twin.errors import ScenarioError, TwinError
 from twin.scenario.file import load_scenario
 from twin.scenario.model import ImuConfig, VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenes.gl import mujoco
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
@@ -74,7 +73,8 @@ def test_the_specific_force_and_the_rates_are_those_of_the_sensors_of_mujoco():
     spec.option.timestep = 1 / RATE_HZ
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint()
-    body.mass, body.inertia, body.explicitinertial = BLUEROV2_HEAVY.mass_kg, BLUEROV2_HEAVY.inertia_kgm2, True
+    body.mass, body.inertia = VehicleConfig().mass_kg, np.array(VehicleConfig().inertia_kgm2)
+    body.explicitinertial = True
     body.add_site(name="imu")
     for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("force", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")

@@ -9,11 +9,12 @@ from scipy import signal
 
 from twin.core import geometry
 from twin.core.records import SensorNoise, StereoRig
-from twin.scenario.model import NavigationConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY as ROV
+from twin.scenario.model import NavigationConfig, VehicleConfig
+from twin.simulate.parameters import parameters_of
 from twin.simulate.sensors import NavigationSensors
 from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, steady_thrust_n, step_thrusters
 
+ROV = parameters_of(VehicleConfig())
 NOISE = SensorNoise(pressure_m=0.02, attitude_rad=0.003, heading_rad=0.01)
 POSE = geometry.pose(geometry.rotation_from_rpy(0.05, -0.08, 3.1), np.array([1.0, 2.0, 3.0]))
 CAMERA = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.array([0.1, 0.075, -0.15]))
@@ -42,13 +43,15 @@ def test_a_command_step_gives_the_step_response_of_the_published_lag():
         history.append(thrusters.c @ thrusters.lag_state)
         step_thrusters(thrusters)
     _, expected = signal.step(ROV.thruster_lag, T=np.arange(120) * step_s)
-    steady = steady_thrust_n(command, ROV.thrust_coefficients)
+    steady = steady_thrust_n(command, ROV.thrust_coefficients, ROV.thrust_table)
     np.testing.assert_allclose(history, np.outer(expected, steady), atol=1e-9)
 
 
 @pytest.mark.parametrize(("command", "thrust"), [(0.25, 4.6), (0.5, 16.6), (0.75, 26.5), (1.0, 30.4), (-0.5, -16.6)])
 def test_steady_thrust_agrees_with_the_published_points(command, thrust):
-    assert steady_thrust_n(np.array([command]), ROV.thrust_coefficients) == pytest.approx(thrust, abs=0.06)
+    assert steady_thrust_n(np.array([command]), ROV.thrust_coefficients, ROV.thrust_table) == pytest.approx(
+        thrust, abs=0.06
+    )
 
 
 def test_errors_of_height_and_attitude_have_the_given_standard_deviations_and_no_bias():

@@ -52,7 +52,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         "velocity": (4,) forward, left and up velocity of the left camera, and yaw rate to the left. 1 is 1.5 times
             plan.speed_mps, or 0.5 rad/s. The controller of the scenario steers, by the believed pose, to the
             position and yaw that follow from integration of these velocities.
-        "thrust": (8,) thruster commands of a rigid vehicle.
+        "thrust": (n,) commands of the n thrusters of a rigid vehicle.
 
     Reward of a step:
         "coverage": part of the asked area that both cameras saw for the first time, in a keyframe [m2].
@@ -91,7 +91,9 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._world = SteppedWorld(given)
         self._velocity_action, self._reward, self.render_mode = action == "velocity", reward, render_mode
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
-        self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else 8,), np.float32)
+        self.action_space = spaces.Box(
+            -1.0, 1.0, (4 if self._velocity_action else len(given.vehicle.thrusters),), np.float32
+        )
         shape = (self._world.rig.height_px, self._world.rig.width_px, 3)
         images = {name: spaces.Box(0, 255, shape, np.uint8) for name in ("left", "right")}
         numbers = {

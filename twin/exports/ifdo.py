@@ -30,7 +30,6 @@ _SIMULATED = {
     "image-abstract": "Images of a simulated stereo survey. Times count from 1970-01-01.",
     "image-license": {"name": "CC-BY-4.0", "uri": "https://creativecommons.org/licenses/by/4.0/"},
     "image-copyright": "simulated images, no copyright holder",
-    "image-platform": {"name": "BlueROV2 Heavy, simulated"},
     "image-sensor": {"name": "stereo camera, simulated"},
     "image-quality": "raw",
 }

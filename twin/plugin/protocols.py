@@ -19,10 +19,10 @@ class ControllerSetup(NamedTuple):
     Args:
         rig: believed calibration; `rig.body_from_camera` is the pose of the left camera in the body.
         period_s: time between commands, which is that between frames [s].
-        hull: inertia, added mass and drag of the BlueROV2 Heavy.
-        allocation: thrust allocation of the vehicle; `allocation.commands(wrench)[0]` are the thruster commands (8,)
+        hull: inertia, added mass and drag of the vehicle.
+        allocation: thrust allocation of the vehicle; `allocation.commands(wrench)[0]` are the thruster commands (n,)
             for a wrench (6,) [moment, force] in the body [N m, N].
-        n_commands: length of a command: 8, one per thruster; 3 for vehicle.dynamics = "kinematic".
+        n_commands: length of a command: n, one per thruster; 3 for vehicle.dynamics = "kinematic".
     """
 
     rig: StereoRig
@@ -45,7 +45,7 @@ class Controller(Protocol):
             reference: planned position, velocity, yaw and acceleration of the left camera in the world, for this frame.
 
         Returns:
-            Thruster commands (8,), which the thrusters limit to [-1, 1]. For vehicle.dynamics = "kinematic" the
+            Thruster commands (n,), which the thrusters limit to [-1, 1]. For vehicle.dynamics = "kinematic" the
             velocity (3,) in the world [m/s].
         """
         ...

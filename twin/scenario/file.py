@@ -17,11 +17,12 @@ from pydantic import BaseModel, ValidationError
 from twin.core.user_files import is_file, read_text, resolved
 from twin.errors import ScenarioError, TwinError, did_you_mean
 from twin.scenario.model import Scenario, Source
-from twin.scenario.rigs import REPLACED, RigFile, find_rig, sections_of
+from twin.scenario.model_files import KINDS, ModelKind
 from twin.scenario.toml_lines import key_lines
 from twin.scenario.toml_text import MAX_CHARACTERS, MAX_KEY_CHARACTERS, MAX_LEVELS, parse_toml, value_errors
 
 Model = TypeVar("Model", bound=BaseModel)
+Describe = Callable[[TwinError], str]
 #: Keys whose value is the path of a file, without the numbers of list items.
 _PATH_KEYS = (
     "imaging.error_model", "objects.mesh_file", "plan.polygon", "terrain.height_file", "terrain.mesh_file",
@@ -36,7 +37,7 @@ _RENAMED_KEYS = {
 #: Sections with a key `plugin`, and the group of its entry points.
 _PLUGIN_SECTIONS = {"control": "controllers", "estimate": "estimators", "terrain": "terrains"}
 _IN_PYTHON = "in Python: allow_plugins=True"
-_RIG = "rig.model"
+_MODELS = tuple(kind.key for kind in KINDS)
 #: Keys of [terrain] that say which floor it is.
 _FLOOR_KEYS = ("kind", "plugin", "height_file", "mesh_file")
 #: Largest number of errors that are listed.
@@ -52,7 +53,7 @@ def load_scenario(path: str | Path, overrides: Sequence[str] = (), allow_plugins
     tree, source, errors = _read_with_base(find_scene(path))
     base = copy.deepcopy(tree)
     source = source.model_copy(update={"overrides": tuple(overrides), "allow_plugins": allow_plugins})
-    for override in sorted(overrides, key=lambda one: not one.startswith(f"{_RIG}=")):
+    for override in sorted(overrides, key=lambda one: one.partition("=")[0].strip() not in _MODELS):
         try:
             _apply_override(tree, override)
         except ScenarioError as error:
@@ -86,14 +87,14 @@ def with_values(tree: Mapping[str, Any], values: Mapping[str, Any], source: Sour
     ScenarioError if a key is renamed or cannot be set, or the scenario is invalid.
     """
     changed = copy.deepcopy(dict(tree))
-    for key, value in sorted(values.items(), key=lambda item: item[0] != _RIG):
+    for key, value in sorted(values.items(), key=lambda item: item[0] not in _MODELS):
         if new_key := _renamed(key):
             raise ScenarioError([source.describe(TwinError(key, f"renamed to {new_key}"))])
         if value == "" and _is_path_key(key):
             continue
         try:
             _assign(changed, key, _absolute(key, value, source.path.parent), key)
-            _take_rig(changed, changed, source.path.parent, str)
+            _take_models(changed, changed, source.path.parent, str)
         except ScenarioError as error:
             problem = error.lines[0].removeprefix(f"{key}: ")
             raise ScenarioError([source.describe(TwinError(key, problem))]) from None
@@ -217,29 +218,32 @@ def _read_with_base(file: Path, including: tuple[Path, ...] = ()) -> tuple[dict[
 
 
 def _merged(tree: dict[str, Any], base: dict[str, Any], source: Source) -> dict[str, Any]:
-    """Returns the keys of a file merged over those of its base file, or over those of the rig that it names."""
-    _take_rig(tree, base, source.path.parent, source.describe)
+    """Returns the keys of a file merged over those of its base file, and of the rig and vehicle that it names."""
+    _take_models(tree, base, source.path.parent, source.describe)
     return _merge(base, tree)
 
 
-def _take_rig(tree: dict[str, Any], base: dict[str, Any], folder: Path, describe: Callable[[TwinError], str]) -> None:
-    """Removes rig.model from a tree; replaces the cameras and lamps of `base` by those of the rig of that name.
+def _take_models(tree: dict[str, Any], base: dict[str, Any], folder: Path, describe: Describe) -> None:
+    """Removes rig.model and vehicle.model from a tree; replaces the sections of `base` by those of the files they name.
 
-    Raises ScenarioError if there is no such rig, as `describe` words it, or if its file is invalid.
+    Raises ScenarioError if there is no such rig or vehicle, as `describe` words it, or if its file is invalid.
     """
-    rig = tree.get("rig")
-    if not isinstance(rig, dict) or not isinstance(rig.get("model"), str):
-        return  # a model of another type is refused by the validation
-    model = rig.pop("model")
+    for kind in KINDS:
+        section = tree.get(kind.name)
+        if isinstance(section, dict) and isinstance(section.get("model"), str):  # else refused by the validation
+            _take_model(kind, section.pop("model"), base, folder, describe)
+
+
+def _take_model(kind: ModelKind, model: str, base: dict[str, Any], folder: Path, describe: Describe) -> None:
     try:
-        file = find_rig(model, folder)
+        file = kind.find(model, folder)
     except TwinError as error:
         raise ScenarioError([describe(error)]) from None
     sections, lines = read_toml(file)
-    validated(sections, RigFile, Source(path=file, lines=lines))
-    for key in REPLACED:
+    validated(sections, kind.contents, Source(path=file, lines=lines))
+    for key in kind.replaced:
         base.pop(key, None)
-    base |= sections_of(sections)
+    base |= kind.sections_of(sections)
 
 
 def _leave_objects_on_their_floor(tree: dict[str, Any], base: Mapping[str, Any]) -> None:
@@ -297,7 +301,7 @@ def _apply_override(tree: dict[str, Any], override: str) -> None:
     value = _override_value(key, text)
     value = str(value) if _is_path_key(key) and not isinstance(value, list) else value
     _assign(tree, key, _absolute(key, value, Path.cwd()), f"--set {shown(override)}")
-    _take_rig(tree, tree, Path.cwd(), lambda error: f"--set: {error}")
+    _take_models(tree, tree, Path.cwd(), lambda error: f"--set: {error}")
 
 
 def _override_value(key: str, text: str) -> Any:

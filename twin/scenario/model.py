@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_type_hints
 
@@ -47,6 +48,9 @@ Vector2 = tuple[Coordinate, Coordinate]
 Vector3 = tuple[Coordinate, Coordinate, Coordinate]
 Metres = Annotated[Number, Field(gt=0, le=1e5)]
 Efficiency = Annotated[Number, Field(gt=0, le=1)]
+Positive = Annotated[Number, Field(gt=0, le=1e6)]
+Coefficient = Annotated[Number, Field(ge=0, le=1e6)]
+SixCoefficients = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
 PerMetre = Annotated[Number, Field(ge=0, le=100)]
 OffAxisDeg = Annotated[Number, Field(ge=0, le=90)]
 WhiteGain = Annotated[Number, Field(ge=1, le=16)]
@@ -166,18 +170,106 @@ class TerrainConfig(Section):
     """width of the highlights: slope of the mirroring facets (GGX) [deg]"""
 
 
-class VehicleConfig(Section):
-    """BlueROV2 Heavy (von Benzon et al. 2022, Table A1); factors scale its drag and its added mass."""
+class ThrusterConfig(Section):
+    """Thruster of a vehicle, in the axes of the body: forward, left, up from the centre of gravity."""
 
+    position_m: Vector3
+    """position in the body [m]"""
+    direction: Vector3
+    """direction of positive thrust in the body; its length is irrelevant"""
+
+    @field_validator("direction")
+    @classmethod
+    def _require_length(cls, value: Vector3) -> Vector3:
+        if not any(value):
+            raise PydanticCustomError("direction", "a vector that is not zero")
+        return value
+
+
+def _heavy_thrusters() -> tuple[ThrusterConfig, ...]:
+    fore_aft, side = ((0.156, -0.111), (0.156, 0.111), (-0.156, -0.111), (-0.156, 0.111)), (1.0, -1.0, -1.0, 1.0)
+    vectored = [((x, y, -0.085), (1.0, left, 0.0)) for (x, y), left in zip(fore_aft, side, strict=True)]
+    vertical = [((x, y, 0.0), (0.0, 0.0, 1.0)) for x in (0.12, -0.12) for y in (-0.218, 0.218)]
+    return tuple(ThrusterConfig(position_m=at, direction=along) for at, along in (*vectored, *vertical))
+
+
+class VehicleConfig(Section):
+    """Vehicle; the defaults are those of scenes/vehicles/bluerov2_heavy.toml (von Benzon et al. 2022, Table A1).
+
+    Axes of the body: forward, left, up, from the centre of gravity; they are principal axes of inertia. Six values are
+    those of surge, sway, heave, roll, pitch and yaw.
+    """
+
+    model: str | None = Field(default=None, min_length=1, max_length=500)
+    """name of a vehicle in scenes/vehicles, or its file. It replaces the vehicle of the files that this file extends;
+    further keys of this file change single values"""
+    title: str = Field(default="BlueROV2 Heavy", max_length=80)
+    """name of the vehicle for reports"""
     dynamics: Literal["rigid", "kinematic"] = "rigid"
     """rigid: a rigid body under thrust, drag and current; kinematic: stays level at constant height, keeps its heading
     and moves exactly at the commanded horizontal velocity, without forces"""
     buoyancy_n: float = Field(default=1.0, ge=-20, le=20)
     """buoyancy minus weight after trimming, positive upwards [N]"""
     drag_factor: float = Field(default=1.0, ge=0.05, le=20)
-    """multiplies linear and quadratic drag"""
+    """multiplies linear and quadratic drag; the controller does not know it"""
     added_mass_factor: float = Field(default=1.0, ge=0, le=5)
-    """multiplies the added mass"""
+    """multiplies the added mass; the controller does not know it"""
+    mass_kg: float = Field(default=13.5, gt=0.1, le=1e5)
+    """mass in air [kg]"""
+    inertia_kgm2: tuple[Positive, Positive, Positive] = (0.26, 0.23, 0.37)
+    """moments of inertia about the axes of the body [kg m2]"""
+    centre_of_buoyancy_m: Vector3 = (0.0, 0.0, 0.01)
+    """centre of buoyancy in the body [m]"""
+    added_mass: SixCoefficients = (6.36, 7.12, 18.68, 0.189, 0.135, 0.222)
+    """diagonal of the added mass matrix [kg, kg m2]"""
+    linear_drag: SixCoefficients = (13.7, 0.0, 33.0, 0.0, 0.8, 0.0)
+    """coefficients of drag proportional to the velocity [N s/m, N m s/rad]"""
+    quadratic_drag: SixCoefficients = (141.0, 217.0, 190.0, 1.19, 0.47, 1.5)
+    """coefficients of drag proportional to the square of the velocity [N s2/m2, N m s2/rad2]"""
+    thrusters: tuple[ThrusterConfig, ...] = Field(default_factory=_heavy_thrusters, min_length=1, max_length=32)
+    """thrusters, in the order of the commands"""
+    thrust_coefficients: tuple[Number, ...] = Field(default=(-140.3, 389.9, -404.1, 176.0, 8.9), max_length=12)
+    """thrust at rest [N] of a command u from -1 to 1: coefficients of an odd polynomial, that of the highest power
+    first; unused with thrust_table"""
+    thrust_table: tuple[tuple[Number, Number], ...] = Field(default=(), max_length=1000)
+    """thrust at rest: pairs of command and thrust [N], interpolated linearly; replaces thrust_coefficients"""
+    thruster_lag: tuple[tuple[Number, ...], tuple[Number, ...]] = ((6136.0, 108700.0), (1.0, 89.0, 9258.0, 108700.0))
+    """transfer function from steady to actual thrust: coefficients of numerator and denominator, that of the highest
+    power of s first"""
+    size_m: tuple[Metres, Metres, Metres] = (0.457, 0.575, 0.254)
+    """length, width and height of the box that stands for the hull in contacts [m]"""
+    hull_centre_m: Vector3 = (0.0, 0.0, -0.03)
+    """centre of this box in the body [m]"""
+
+    @field_validator("model")
+    @classmethod
+    def _is_read_by_the_loader(cls, value: str | None) -> str | None:
+        """Refuses a vehicle that has not been read from its file: in a vehicle file, or a model made in Python."""
+        if value is not None:
+            raise PydanticCustomError("vehicle", "none here: twin.load_scenario reads the file of a vehicle")
+        return value
+
+    @field_validator("thrust_table")
+    @classmethod
+    def _require_increasing(cls, value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
+        commands, thrusts = [u for u, _ in value], [n for _, n in value]
+        rising = all(a < b for a, b in pairwise(commands)) and all(a <= b for a, b in pairwise(thrusts))
+        if value and not (rising and commands[0] == -1 and commands[-1] == 1 and thrusts[0] < 0 < thrusts[-1]):
+            raise PydanticCustomError(
+                "thrust_table", "increasing pairs from command -1 (thrust below 0) to 1 (above 0)"
+            )
+        return value
+
+    @field_validator("thruster_lag")
+    @classmethod
+    def _require_unit_gain(cls, value: tuple[tuple[float, ...], tuple[float, ...]]) -> Any:
+        numerator, denominator = value
+        proper = 1 <= len(numerator) < len(denominator) and denominator[0] != 0 and denominator[-1] != 0
+        if not proper or not math.isclose(numerator[-1], denominator[-1]):
+            raise PydanticCustomError("lag", "a strictly proper transfer function with a gain of 1 at rest")
+        if (np.roots(denominator).real >= 0).any():
+            raise PydanticCustomError("lag", "a stable transfer function")
+        return value
 
 
 class RigConfig(Section):

@@ -83,8 +83,8 @@ class SteppedWorld:
         """Moves the vehicle for one frame interval under a constant command and returns the next frame.
 
         Args:
-            command: (8,) thruster commands in [-1, 1], in the order of the thrusters of the BlueROV2 Heavy; the
-                thrusters limit larger values. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
+            command: (n,) thruster commands in [-1, 1], in the order of `vehicle.thrusters`; the thrusters limit larger
+                values. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
             pace: pace along the planned path from this frame to the next, from `actions`.
             keyframe: whether the next frame is a keyframe, which has both images; None: as planned.
 

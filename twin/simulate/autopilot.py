@@ -1,6 +1,6 @@
-"""Pose controller, top speed and thruster loads of the BlueROV2.
+"""Pose controller, top speed and thruster loads of a vehicle.
 
-The controller is designed with the published vehicle parameters and ignores the drag and added-mass factors of the
+The controller is designed with the parameters of the vehicle and ignores the drag and added-mass factors of the
 scenario, which therefore act as model errors. The top speed includes the drag factor, the loads include both factors.
 """
 
@@ -12,17 +12,17 @@ from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocat
 from twin.controllers.tracking import ControllerState, HullModel, feedforward_wrench, pole_placement_gains
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import Hull, angular_first
+from twin.simulate.parameters import VehicleParameters, parameters_of
 from twin.simulate.thrusters import steady_thrust_n
 
 
-def nominal_controller(natural_frequency_radps: float, frame_rate_hz: float) -> ControllerState:
-    """Returns a controller for the published vehicle, with this frequency in position and a command per frame."""
-    model = _controller_model(trimmed_hull(VehicleConfig.model_validate({})))
+def nominal_controller(vehicle: VehicleConfig, natural_frequency_radps: float, frame_rate_hz: float) -> ControllerState:
+    """Returns a controller for a vehicle, with this frequency in position and a command per frame."""
+    model = _controller_model(trimmed_hull(vehicle.model_copy(update={"drag_factor": 1.0, "added_mass_factor": 1.0})))
     gains = pole_placement_gains(natural_frequency_radps)
-    return ControllerState(model, _allocation(), gains, 1 / frame_rate_hz, np.zeros(6))
+    return ControllerState(model, _allocation(parameters_of(vehicle)), gains, 1 / frame_rate_hz, np.zeros(6))
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
@@ -31,11 +31,11 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     Drag along each axis is a u + b u |u|, so that each thruster needs the thrust p v + q v^2 at the speed v; p and q
     follow from the thrust allocation. The Munk moment and the net buoyancy are neglected.
     """
-    hull = trimmed_hull(vehicle)
-    thrusts_from_force = _allocation().thrusts_from_wrench[:, 3:]
+    hull, rov = trimmed_hull(vehicle), parameters_of(vehicle)
+    thrusts_from_force, full_n = _allocation(rov).thrusts_from_wrench[:, 3:], _full_thrust_n(rov)
     linear, quadratic = hull.linear_drag[3:] * direction, hull.quadratic_drag[3:] * np.abs(direction) * direction
     coefficients = zip(thrusts_from_force @ quadratic, thrusts_from_force @ linear, strict=True)
-    roots = np.concatenate([np.roots([q, p, sign * _full_thrust_n()]) for q, p in coefficients for sign in (-1, 1)])
+    roots = np.concatenate([np.roots([q, p, sign * full_n]) for q, p in coefficients for sign in (-1, 1)])
     real = roots[np.isreal(roots)].real
     return float(real[real > 0].min())
 
@@ -46,26 +46,27 @@ def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
     Velocities [m/s] are through the water, in the body, which is level. The thrusters balance drag, the Munk moment in
     yaw, and the net buoyancy; the righting moment balances roll and pitch.
     """
-    hull = trimmed_hull(vehicle)
+    hull, rov = trimmed_hull(vehicle), parameters_of(vehicle)
     model = _controller_model(hull)
     wrenches = np.array([feedforward_wrench(model, np.asarray(v, np.float64)) for v in velocities]).reshape(-1, 6)
     wrenches[:, :2] = 0.0
     wrenches[:, 5] += hull.weight_n - hull.buoyancy_n
-    thrusts = wrenches @ _allocation().thrusts_from_wrench.T
-    return np.abs(thrusts).max(axis=1, initial=0.0) / _full_thrust_n()
+    thrusts = wrenches @ _allocation(rov).thrusts_from_wrench.T
+    return np.abs(thrusts).max(axis=1, initial=0.0) / _full_thrust_n(rov)
 
 
 def _controller_model(hull: Hull) -> HullModel:
     return HullModel(hull.inertia + hull.added_inertia, hull.added_inertia[3:], hull.linear_drag, hull.quadratic_drag)
 
 
-def _allocation() -> ThrustAllocation:
-    return pseudo_inverse_allocation(angular_first(BLUEROV2_HEAVY.thrust_configuration), _thrust_n)
+def _allocation(rov: VehicleParameters) -> ThrustAllocation:
+    return pseudo_inverse_allocation(angular_first(rov.thrust_configuration), lambda command: _thrust_n(rov, command))
 
 
-def _full_thrust_n() -> float:
-    return float(_thrust_n(np.ones(1))[0])
+def _full_thrust_n(rov: VehicleParameters) -> float:
+    """Returns the smaller of the greatest thrusts forwards and backwards."""
+    return float(np.abs(_thrust_n(rov, np.array([-1.0, 1.0]))).min())
 
 
-def _thrust_n(command: Array) -> Array:
-    return steady_thrust_n(command, BLUEROV2_HEAVY.thrust_coefficients)
+def _thrust_n(rov: VehicleParameters, command: Array) -> Array:
+    return steady_thrust_n(command, rov.thrust_coefficients, rov.thrust_table)

@@ -17,10 +17,10 @@ from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches_floor
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
+from twin.simulate.parameters import parameters_of
 from twin.simulate.thrusters import (
     ThrusterState,
     lagged_thrusters,
@@ -50,7 +50,7 @@ class RigidBodyState(NamedTuple):
 
 
 class CompiledVehicle:
-    """BlueROV2 Heavy under thrust, drag and current, integrated by compiled code.
+    """Vehicle under thrust, drag and current, integrated by compiled code.
 
     Args:
         current_mps: (3,) velocity of the steady current: east, north, up.
@@ -62,7 +62,7 @@ class CompiledVehicle:
         self, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array, timestep_s: float,
         floor: FloorField = OPEN_WATER,
     ):  # fmt: skip
-        thrusters = lagged_thrusters(BLUEROV2_HEAVY, timestep_s)
+        thrusters = lagged_thrusters(parameters_of(vehicle), timestep_s)
         self.state = RigidBodyState(
             np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
             trimmed_hull(vehicle), np.array(current_mps, float), timestep_s, floor, np.full(1, -1),
@@ -79,7 +79,7 @@ class CompiledVehicle:
         return body_twist(self.state)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates `duration_s`, whole timesteps (else ValueError), under thruster commands (8,) in [-1, 1].
+        """Simulates `duration_s`, whole timesteps (else ValueError), under thruster commands (n,) in [-1, 1].
 
         Raises SurveyAborted if the physics diverged, or the hull touches the floor.
         """
@@ -110,7 +110,7 @@ def has_ended(body):
 
 @kernel
 def advance(body, command, n_steps):
-    """Advances the state by `n_steps` timesteps under commands (8,); stops early if the hull touches the floor."""
+    """Advances the state by `n_steps` timesteps under commands (n,); stops early if the hull touches the floor."""
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
     set_thruster_command(thrusters, command)
     for n in range(n_steps):

@@ -11,10 +11,17 @@ from scipy.ndimage import maximum_filter
 from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.kernels import kernel
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 
-HALF_M, CENTRE_M = BLUEROV2_HEAVY.size_m / 2, BLUEROV2_HEAVY.hull_centre_m  # of the box, in the axes of the body
-_REACH_M = float(np.linalg.norm(HALF_M))
+
+class HullBox(NamedTuple):
+    """Box that stands for the hull, in the axes of the body."""
+
+    half_m: Array  #: (3,) half its sides
+    centre_m: Array  #: (3,)
+
+    @property
+    def reach_m(self) -> float:
+        return float(np.linalg.norm(self.half_m))
 
 
 class FloorField(NamedTuple):
@@ -26,18 +33,22 @@ class FloorField(NamedTuple):
     south_m: float
     highest_m: NDArray[np.float32]  #: greatest height within the reach of a hull whose centre lies in a block of cells
     block_m: float  #: side of a block
+    box: HullBox
 
 
-def floor_field(height_m: NDArray[np.float32], spacing_m: float, west_m: float, south_m: float) -> FloorField:
-    n = int(np.ceil(_REACH_M / spacing_m)) + 1
+def floor_field(
+    height_m: NDArray[np.float32], spacing_m: float, west_m: float, south_m: float, box: HullBox
+) -> FloorField:
+    n = int(np.ceil(box.reach_m / spacing_m)) + 1
     padding = [(0, -size % n) for size in height_m.shape]
     padded = np.pad(height_m, padding, constant_values=-np.inf)
     blocks = padded.reshape(padded.shape[0] // n, n, padded.shape[1] // n, n).max(axis=(1, 3))
     highest_m = np.asarray(maximum_filter(blocks, 3, mode="nearest"), np.float32)
-    return FloorField(np.ascontiguousarray(height_m, np.float32), spacing_m, west_m, south_m, highest_m, n * spacing_m)
+    heights = np.ascontiguousarray(height_m, np.float32)
+    return FloorField(heights, spacing_m, west_m, south_m, highest_m, n * spacing_m, box)
 
 
-OPEN_WATER = floor_field(np.full((2, 2), -np.inf, np.float32), 1.0, 0.0, 0.0)
+OPEN_WATER = floor_field(np.full((2, 2), -np.inf, np.float32), 1.0, 0.0, 0.0, HullBox(np.ones(3), np.zeros(3)))
 
 
 def contact_error(obstacle: str, time_s: float, world_from_body: Array) -> SurveyAborted:
@@ -51,14 +62,14 @@ def touches_floor(floor, pose):
     centre, reach = pose[:3, 3].copy(), np.zeros(3)
     for i in range(3):
         for k in range(3):
-            centre[i] += pose[i, k] * CENTRE_M[k]
-            reach[i] += abs(pose[i, k]) * HALF_M[k]
+            centre[i] += pose[i, k] * floor.box.centre_m[k]
+            reach[i] += abs(pose[i, k]) * floor.box.half_m[k]
     low, x, y = centre[2] - reach[2], centre[0] - floor.west_m, centre[1] - floor.south_m
     block_row, block_col = int(np.floor(y / floor.block_m)), int(np.floor(x / floor.block_m))
     rows, cols = floor.highest_m.shape
     if not (0 <= block_row < rows and 0 <= block_col < cols) or low > floor.highest_m[block_row, block_col]:
         return False
-    corners, z = np.empty((4, 3)), floor.height_m
+    corners, z, half = np.empty((4, 3)), floor.height_m, floor.box.half_m
     ny, nx = z.shape
     south, north = int((y - reach[1]) / floor.spacing_m), int((y + reach[1]) / floor.spacing_m)
     west, east = int((x - reach[0]) / floor.spacing_m), int((x + reach[0]) / floor.spacing_m)
@@ -72,42 +83,46 @@ def touches_floor(floor, pose):
                 p, q = (c + j) * floor.spacing_m - x, (r + i) * floor.spacing_m - y
                 for k in range(3):
                     corners[n, k] = pose[0, k] * p + pose[1, k] * q + pose[2, k] * (z[r + i, c + j] - centre[2])
-            if _meets(corners[0], corners[1], corners[2]) or _meets(corners[0], corners[2], corners[3]):
+            if _meets(half, corners[0], corners[1], corners[2]) or _meets(half, corners[0], corners[2], corners[3]):
                 return True
     return False
 
 
 @kernel
-def touches_mesh(vertices, faces):
-    """Returns whether the hull meets a triangle of `faces` (m, 3) with `vertices` (n, 3) in axes of the box [m]."""
+def touches_mesh(half, vertices, faces):
+    """Returns whether a box meets a triangle of `faces` (m, 3).
+
+    `half` (3,) are half the sides of the box, `vertices` (n, 3) are in its axes [m].
+    """
     for f in range(len(faces)):
-        if _meets(vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]):
+        if _meets(half, vertices[faces[f, 0]], vertices[faces[f, 1]], vertices[faces[f, 2]]):
             return True
     return False
 
 
 @kernel
-def _meets(a, b, c):
+def _meets(half, a, b, c):
     """Returns whether the box meets a triangle (separating axes: Akenine-Moller 2001, Fast 3D triangle-box overlap)."""
     for k in range(3):
-        if min(a[k], b[k], c[k]) > HALF_M[k] or max(a[k], b[k], c[k]) < -HALF_M[k]:
+        low, high = min(a[k], b[k], c[k]), max(a[k], b[k], c[k])
+        if low > half[k] or high < -half[k]:
             return False
     u, v = b - a, c - b
-    if _apart(np.cross(u, v), a, b, c):
+    if _apart(half, np.cross(u, v), a, b, c):
         return False
     for edge in (u, v, a - c):
         for k in range(3):
             axis = np.zeros(3)
             axis[(k + 1) % 3], axis[(k + 2) % 3] = -edge[(k + 2) % 3], edge[(k + 1) % 3]
-            if _apart(axis, a, b, c):
+            if _apart(half, axis, a, b, c):
                 return False
     return True
 
 
 @kernel
-def _apart(axis, a, b, c):
+def _apart(half, axis, a, b, c):
     p, q, r, reach = 0.0, 0.0, 0.0, 0.0
     for k in range(3):
         p, q, r = p + axis[k] * a[k], q + axis[k] * b[k], r + axis[k] * c[k]
-        reach += abs(axis[k]) * HALF_M[k]
+        reach += abs(axis[k]) * half[k]
     return min(p, q, r) > reach or max(p, q, r) < -reach

@@ -1,4 +1,4 @@
-"""Hull parameters of the BlueROV2 with the vehicle settings of a scenario; timestep and speed limits of the physics."""
+"""Hull of the vehicle of a scenario; timestep and speed limits of the physics."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.simulate.hydrodynamics import Hull, angular_first
+from twin.simulate.parameters import parameters_of
 
 MAX_TIMESTEP_S = 1 / 120
 GRAVITY_MPS2 = 9.81
@@ -29,15 +29,15 @@ def whole_timesteps(duration_s: float, timestep_s: float) -> int:
 
 
 def trimmed_hull(vehicle: VehicleConfig) -> Hull:
-    """Returns the BlueROV2 with the drag, added mass and buoyancy of a scenario."""
-    rov = BLUEROV2_HEAVY
+    """Returns the hull of a vehicle with the factors and the buoyancy of a scenario."""
+    rov = parameters_of(vehicle)
     weight_n = rov.mass_kg * GRAVITY_MPS2
     return Hull(
-        inertia=np.array([*rov.inertia_kgm2, rov.mass_kg, rov.mass_kg, rov.mass_kg]),
+        inertia=np.array([*rov.inertia_kgm2, *[rov.mass_kg] * 3]),
         added_inertia=vehicle.added_mass_factor * angular_first(rov.added_mass),
-        linear_drag=vehicle.drag_factor * angular_first(rov.linear_damping),
-        quadratic_drag=vehicle.drag_factor * angular_first(rov.quadratic_damping),
-        centre_of_buoyancy_m=np.array(rov.centre_of_buoyancy_m),
+        linear_drag=vehicle.drag_factor * angular_first(rov.linear_drag),
+        quadratic_drag=vehicle.drag_factor * angular_first(rov.quadratic_drag),
+        centre_of_buoyancy_m=rov.centre_of_buoyancy_m,
         weight_n=weight_n,
         buoyancy_n=weight_n + vehicle.buoyancy_n,
     )

@@ -11,17 +11,17 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
-from twin.scenes.bluerov2 import BLUEROV2_HEAVY
 from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.contact import contact_error
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
+from twin.simulate.parameters import parameters_of
 from twin.simulate.sensors import inertial_quantities
 from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, step_thrusters, thruster_wrench
 
 
 class MujocoVehicle:
-    """BlueROV2 Heavy under thrust, drag and current, simulated by MuJoCo with an MjData of its own.
+    """Vehicle under thrust, drag and current, simulated by MuJoCo with an MjData of its own.
 
     MuJoCo's step (velocity first, then position with the new velocity) is interpreted as leapfrog integration: the
     velocity of the free joint refers to half a timestep before the pose. Without drag and thrust, energy is then
@@ -47,7 +47,7 @@ class MujocoVehicle:
         self._velocity = self._data.qvel[self._dofs]  # a view into MjData
         self._acceleration = np.zeros(6)
         self._kick = 0.5  # the first step advances the velocity by half a timestep, see the class docstring
-        self._thrusters = lagged_thrusters(BLUEROV2_HEAVY, model.opt.timestep)
+        self._thrusters = lagged_thrusters(parameters_of(vehicle), model.opt.timestep)
         self._history: deque[str] = deque(maxlen=3)
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])

@@ -10,13 +10,18 @@ from scipy.linalg import expm
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.kernels import kernel
-from twin.scenes.bluerov2 import VehicleParameters
 from twin.simulate.hydrodynamics import angular_first
+from twin.simulate.parameters import VehicleParameters
 
 
 @kernel
-def steady_thrust_n(command: Array, coefficients: Array) -> Array:
-    """Returns the thrust (n,) [N] at rest, an odd polynomial (highest power first) of commands u (n,) in [-1, 1]."""
+def steady_thrust_n(command: Array, coefficients: Array, table: Array) -> Array:
+    """Returns the thrust (n,) [N] at rest for commands u (n,) in [-1, 1].
+
+    It is interpolated in `table` (2, m), commands and thrusts, or, if m = 0, an odd polynomial (highest power first).
+    """
+    if table.shape[1]:
+        return np.interp(command, table[0], table[1])
     thrust = np.zeros_like(command)
     for coefficient in coefficients:  # Horner's scheme in u^2
         thrust = thrust * command * command + coefficient
@@ -32,6 +37,7 @@ class ThrusterState(NamedTuple):
     c: Array
     configuration: Array  #: (6, n) wrench [moment, force] in body axes per newton of thrust of each thruster
     coefficients: Array  #: coefficients of the thrust curve, as in `steady_thrust_n`
+    table: Array  #: (2, m) table of the thrust curve, as in `steady_thrust_n`
     lag_state: Array  #: (m, n) state of the lag, modified in place
     steady_n: Array  #: (n,) steady thrust of the last command, modified in place
 
@@ -46,15 +52,15 @@ def lagged_thrusters(vehicle: VehicleParameters, timestep_s: float) -> ThrusterS
     c = np.zeros(len(a))
     c[-len(numerator) :] = numerator
     configuration = angular_first(vehicle.thrust_configuration)
-    n, coefficients = configuration.shape[1], np.array(vehicle.thrust_coefficients, float)
-    return ThrusterState(a, b, c, configuration, coefficients, np.zeros((len(a), n)), np.zeros(n))
+    n, curve = configuration.shape[1], (vehicle.thrust_coefficients, vehicle.thrust_table)
+    return ThrusterState(a, b, c, configuration, *curve, np.zeros((len(a), n)), np.zeros(n))
 
 
 @kernel
 def set_thruster_command(thrusters, command):
     """Sets the commands (n,), clipped to [-1, 1], for the following steps."""
     clipped = np.minimum(np.maximum(command, -1.0), 1.0)
-    geometry.copy_into(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients))
+    geometry.copy_into(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients, thrusters.table))
 
 
 @kernel

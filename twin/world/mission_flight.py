@@ -49,7 +49,7 @@ class Flight:
         """Moves the vehicle for one frame interval and returns the next frame; None after the last frame of the plan.
 
         Args:
-            command: (8,) thruster commands in [-1, 1], or velocity (3,) in the world [m/s] of a kinematic vehicle.
+            command: (n,) thruster commands in [-1, 1], or velocity (3,) in the world [m/s] of a kinematic vehicle.
             pace: pace along the planned path from this frame to the next; no effect during station keeping.
             keyframe: whether the next frame is a keyframe, with both images; None: as planned.
 

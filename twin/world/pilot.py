@@ -53,8 +53,8 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
 def _plugin_pilot(mission: Mission, name: str) -> PilotOfEstimates:
     """Returns the pilot that gives the commands of the plug-in; a call raises PluginFailed if they are unusable."""
     scenario, rig = mission.scenario, mission.rig
-    nominal = nominal_controller(scenario.control.natural_frequency_radps, rig.frame_rate_hz)
-    n = 8 if scenario.vehicle.dynamics == "rigid" else 3
+    nominal = nominal_controller(scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz)
+    n = len(scenario.vehicle.thrusters) if scenario.vehicle.dynamics == "rigid" else 3
     setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
     plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
 
@@ -85,17 +85,19 @@ class PilotState(NamedTuple):
 
 
 class RovPilot:
-    """Pilot of the ROV; a command (8,) has one value in [-1, 1] per thruster."""
+    """Pilot of the ROV; a command (n,) has one value in [-1, 1] per thruster."""
 
     def __init__(self, mission: Mission):
-        rig = mission.rig
+        rig, scenario = mission.rig, mission.scenario
         self.state = PilotState(
             camera_from_body=geometry.inverse(rig.body_from_camera),
             body_from_camera_twist=geometry.adjoint(rig.body_from_camera),
             lever_arm_m=rig.body_from_camera[:3, 3].copy(),
             smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz),
             twist=np.zeros(6),
-            controller=nominal_controller(mission.scenario.control.natural_frequency_radps, rig.frame_rate_hz),
+            controller=nominal_controller(
+                scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz
+            ),
         )
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
@@ -107,7 +109,7 @@ class RovPilot:
 
 @kernel
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
-    """Returns the thruster commands (8,) and updates `state` in place; compiled kernel of `RovPilot`."""
+    """Returns the thruster commands (n,) and updates `state` in place; compiled kernel of `RovPilot`."""
     change = state.body_from_camera_twist @ camera_velocity - state.twist
     geometry.copy_into(state.twist, state.twist + state.smoothing * change)
     body = geometry.compose(world_from_camera, state.camera_from_body)

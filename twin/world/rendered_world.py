@@ -32,7 +32,8 @@ class RenderedWorld(World):
         scenario, cameras = mission.scenario, mission.true_cameras
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
         vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
-        scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz))
+        body = scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2
+        scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz), *body)
         vehicle = (
             MujocoVehicle(scene.model, scenario.vehicle, np.array(scenario.current.velocity_mps), mission.start_of_body)
             if scenario.vehicle.dynamics == "rigid"

@@ -1,0 +1,84 @@
+"""Rigs and vehicles as files: the numbers of a published or own camera rig or vehicle, and their sources."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import Field
+
+from twin.core.user_files import is_file, resolved
+from twin.errors import TwinError, did_you_mean
+from twin.scenario.model import (
+    CalibrationErrorConfig,
+    LampConfig,
+    LensConfig,
+    PortConfig,
+    RigConfig,
+    Section,
+    SensorConfig,
+    VehicleConfig,
+)
+
+
+class RigFile(Section):
+    """Contents of a rig file: sections of a scenario, and where their numbers come from."""
+
+    title: str = Field(min_length=1, max_length=80)
+    sources: dict[str, str]
+    """source of each section or key, e.g. "sensor.read_noise_e"; "not published" for an assumption"""
+    rig: RigConfig
+    sensor: SensorConfig | None = None
+    lens: LensConfig = LensConfig()
+    port: PortConfig = PortConfig()
+    calibration_error: CalibrationErrorConfig = CalibrationErrorConfig()
+    lamps: tuple[LampConfig, ...] | None = None
+
+
+class VehicleFile(Section):
+    """Contents of a vehicle file: the section of a scenario, and where its numbers come from."""
+
+    title: str = Field(min_length=1, max_length=80)
+    sources: dict[str, str]
+    """source of each key, e.g. "added_mass"; "not published" for an assumption"""
+    vehicle: VehicleConfig
+
+
+class ModelKind(NamedTuple):
+    """What a file of scenes/ can describe: `name`.model is the key that names it."""
+
+    name: str
+    contents: type[Section]
+    replaced: tuple[str, ...]  #: sections of a scenario that it replaces as a whole
+    optional: tuple[str, ...] = ()  #: sections that it replaces if it has them
+
+    @property
+    def key(self) -> str:
+        return f"{self.name}.model"
+
+    def built_in(self) -> dict[str, Path]:
+        """Returns the files of this kind in scenes/ by name, in alphabetical order."""
+        from twin import scenes
+
+        folder = Path(scenes.__file__).parent / f"{self.name}s"
+        return {file.stem: file for file in sorted(folder.glob("*.toml"))}
+
+    def find(self, model: str, folder: Path) -> Path:
+        """Returns the file of a built-in name, or of a path relative to a folder; raises TwinError if there is none."""
+        if model in (files := self.built_in()):
+            return files[model]
+        if is_file(file := resolved(folder / model)):
+            return file
+        hint = did_you_mean(model, list(files))
+        raise TwinError(self.key, f"{model!r}: no such {self.name}{hint}", f"a file, or one of {', '.join(files)}")
+
+    def sections_of(self, tree: Mapping[str, Any]) -> dict[str, Any]:
+        """Returns the sections that a file, with these keys and values, sets in a scenario."""
+        sections = {key: tree[key] for key in (*self.replaced, *self.optional) if key in tree}
+        return sections | {self.name: {**tree[self.name], "title": tree["title"]}}
+
+
+RIG = ModelKind("rig", RigFile, ("rig", "sensor", "lens", "port", "calibration_error"), ("lamps",))
+VEHICLE = ModelKind("vehicle", VehicleFile, ("vehicle",))
+KINDS = (RIG, VEHICLE)

@@ -1,0 +1,51 @@
+"""Parameters of a vehicle as arrays, from the section [vehicle] of a scenario."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.scenario.model import VehicleConfig
+
+
+class VehicleParameters(NamedTuple):
+    """Rigid body, hydrodynamics and thrusters of a vehicle, see `VehicleConfig`; linear parts are first."""
+
+    mass_kg: float
+    inertia_kgm2: Array  #: (3,)
+    centre_of_buoyancy_m: Array  #: (3,)
+    added_mass: Array  #: (6,)
+    linear_drag: Array  #: (6,)
+    quadratic_drag: Array  #: (6,)
+    #: (6, n) wrench [force, moment] about the centre of gravity per newton of thrust of each thruster
+    thrust_configuration: Array
+    thrust_coefficients: Array  #: (k,) of the odd polynomial, see `thrusters.steady_thrust_n`
+    thrust_table: Array  #: (2, m) commands and thrusts [N]; (2, 0): the polynomial holds
+    thruster_lag: tuple[
+        Array, Array
+    ]  #: numerator and denominator of the transfer function from steady to actual thrust
+    half_size_m: Array  #: (3,) half the sides of the hull's box
+    hull_centre_m: Array  #: (3,)
+
+
+def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
+    positions = np.array([thruster.position_m for thruster in vehicle.thrusters], float)
+    along = np.array([thruster.direction for thruster in vehicle.thrusters], float)
+    directions = along * np.sqrt(1 / (along**2).sum(axis=1, keepdims=True))
+    numerator, denominator = (np.array(part, float) for part in vehicle.thruster_lag)
+    return VehicleParameters(
+        mass_kg=vehicle.mass_kg,
+        inertia_kgm2=np.array(vehicle.inertia_kgm2),
+        centre_of_buoyancy_m=np.array(vehicle.centre_of_buoyancy_m, float),
+        added_mass=np.array(vehicle.added_mass),
+        linear_drag=np.array(vehicle.linear_drag),
+        quadratic_drag=np.array(vehicle.quadratic_drag),
+        thrust_configuration=np.vstack([directions.T, np.cross(positions, directions).T]),
+        thrust_coefficients=np.array(vehicle.thrust_coefficients, float),
+        thrust_table=np.array(vehicle.thrust_table, float).reshape(-1, 2).T.copy(),
+        thruster_lag=(numerator / denominator[0], denominator / denominator[0]),
+        half_size_m=np.array(vehicle.size_m) / 2,
+        hull_centre_m=np.array(vehicle.hull_centre_m, float),
+    )
