@@ -260,11 +260,13 @@ def test_an_ifdo_file_in_local_coordinates_has_no_place_on_the_earth_and_says_so
 @pytest.mark.parametrize("replayed", [False, True])
 def test_an_ifdo_file_calls_the_images_of_a_replay_recorded(contents, tmp_path, replayed):
     scenario = {"replay": {"dataset": "reef", "reader": "euroc"}} if replayed else {"lamps": [{"flux_lm": 1500.0}]}
+    scenario |= {"vehicle": {"title": "BlueROV2"}}
     (file, _) = ifdo.export(replace(contents, scenario=scenario), tmp_path)
     header = json.loads(file.read_text())["image-set-header"]
     origin = {key: json.dumps(value) for key, value in header.items() if "simulated" in json.dumps(value)}
     keys = {"image-context", "image-abstract", "image-copyright", "image-platform", "image-sensor"}
     assert set(origin) == (set() if replayed else keys) and keys <= set(header)
+    assert ("BlueROV2" in header["image-platform"]["name"]) is not replayed
     assert header["image-license"]["name"] == ("unknown" if replayed else "CC-BY-4.0")
     assert header.get("image-illumination") == (None if replayed else "artificial light")
 

@@ -93,7 +93,9 @@ def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
     if "replay" in contents.scenario:
         header |= _RECORDED
     else:
+        vehicle = contents.scenario.get("vehicle", {}).get("title", "vehicle")
         header |= _SIMULATED | {"image-illumination": _illumination(contents.scenario)}
+        header |= {"image-platform": {"name": f"{vehicle}, simulated"}}
     if place is None:
         return header | {"image-abstract": header["image-abstract"] + _LOCAL}
     return header | {"image-coordinate-reference-system": _WGS84}
