@@ -31,7 +31,8 @@ class Rectification(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        return "rectified as recorded" if self.maps == (None, None) else "rectified by `twin replay`"
+        as_recorded = all(positions is None for positions in self.maps)
+        return "rectified as recorded" if as_recorded else "rectified by `twin replay`"
 
     def rectified(self, image: Image, side: Literal["left", "right"]) -> Image:
         """Returns a recorded image of a camera, resampled by cubic splines; black outside of it."""
