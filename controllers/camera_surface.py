@@ -44,12 +44,12 @@ class CameraSurface:
         w, a = (self.area.vectors_to_legs(part[:, :2]) for part in (level.velocity, level.acceleration))
         bend = uu * w[:, 0] ** 2 + 2 * uv * w[:, 0] * w[:, 1] + vv * w[:, 1] ** 2
         climb, lift = (slope * w).sum(axis=1), (slope * a).sum(axis=1) + bend
-        vertical = np.stack([self.spline.ev(u, v) - self.altitude_m, climb, lift])
-        lifted = (part + np.outer(added, [0, 0, 1]) for part, added in zip(
-            (level.position, level.velocity, level.acceleration), vertical, strict=True
-        ))  # fmt: skip
-        position, velocity, acceleration = lifted
-        return level._replace(position=position, velocity=velocity, acceleration=acceleration)
+        up = np.array([0.0, 0.0, 1.0])
+        return level._replace(
+            position=level.position + np.outer(self.spline.ev(u, v) - self.altitude_m, up),
+            velocity=level.velocity + np.outer(climb, up),
+            acceleration=level.acceleration + np.outer(lift, up),
+        )
 
     def pace(self, start: Point, end: Point) -> float:
         """Returns the share of the cruise speed, at most 1, at which a line climbs no faster than with `max_climb`."""

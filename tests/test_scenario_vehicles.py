@@ -10,6 +10,7 @@ from twin.scenario.model import VehicleConfig
 from twin.scenario.model_files import VEHICLE
 from twin.simulate.autopilot import top_speed_mps
 from twin.simulate.parameters import parameters_of
+from twin.world.mission import prepare
 
 SMALL = [
     "terrain.size_m=[5.0, 4.0]", "plan.area_m=[1.0, 0.5]", "plan.tracks=1", "control.hold_s=1", "rig.model=ideal",
@@ -61,9 +62,18 @@ def test_keys_of_a_scenario_change_single_values_of_a_vehicle(tmp_path):
     assert mine.mass_kg == 12.0 and mine.model_copy(update={"mass_kg": 10.0}) == vehicle("bluerov2")
 
 
+def test_a_vehicle_that_cannot_move_along_all_axes_is_refused():
+    horizontal = [{"position_m": (0, y, 0), "direction": (1, 0, 0)} for y in (-0.1, 0.1)]
+    scenario = load_scenario("reef")
+    lame = scenario.model_copy(update={"vehicle": VehicleConfig.model_validate({"thrusters": horizontal})})
+    with pytest.raises(ScenarioError, match=r"vehicle.thrusters: 2 thrusters cannot push along all axes"):
+        prepare(lame)
+
+
 ERRORS = [
     ('model = "bluerov"', r"scene.toml:3: vehicle.model: 'bluerov': no such vehicle .*bluerov2_heavy"),
     ("mass_kg = -1.0", r"scene.toml:3: vehicle.mass_kg: -1.0: not allowed \(allowed: greater than 0.1\)"),
+    ("thrust_coefficients = []", r"scene.toml:3: vehicle.thrust_coefficients: .*thrust above 0"),
     ("thrusters = []", r"scene.toml:3: vehicle.thrusters: "),
     ("thrust_table = [[-1.0, -20.0], [0.5, 10.0]]", r"scene.toml:3: vehicle.thrust_table: .*from command -1"),
     ("thruster_lag = [[1.0], [0.1, -1.0]]", r"scene.toml:3: vehicle.thruster_lag: .*gain of 1"),

@@ -74,6 +74,16 @@ _NUMBER_KINDS: dict[Any, Literal["int_type", "float_type"]] = {
 }  # fmt: skip
 
 
+def _refuse_model(value: str | None) -> str | None:
+    """Refuses a model that has not been read from its file: in a file of its kind, or in Python."""
+    if value is not None:
+        raise PydanticCustomError("model", "none here: twin.load_scenario reads the file of a model")
+    return value
+
+
+ModelFile = Annotated[str | None, AfterValidator(_refuse_model)]
+
+
 class Section(BaseModel):
     """Base class of the sections, which are immutable and reject unknown keys, NaN and infinity.
 
@@ -186,11 +196,17 @@ class ThrusterConfig(Section):
         return value
 
 
-def _heavy_thrusters() -> tuple[ThrusterConfig, ...]:
-    fore_aft, side = ((0.156, -0.111), (0.156, 0.111), (-0.156, -0.111), (-0.156, 0.111)), (1.0, -1.0, -1.0, 1.0)
-    vectored = [((x, y, -0.085), (1.0, left, 0.0)) for (x, y), left in zip(fore_aft, side, strict=True)]
-    vertical = [((x, y, 0.0), (0.0, 0.0, 1.0)) for x in (0.12, -0.12) for y in (-0.218, 0.218)]
-    return tuple(ThrusterConfig(position_m=at, direction=along) for at, along in (*vectored, *vertical))
+#: Position and direction of the thrusters of the BlueROV2 Heavy: four vectored at 45 deg, then four vertical ones.
+_HEAVY_THRUSTERS = (
+    ((0.156, -0.111, -0.085), (1.0, 1.0, 0.0)),
+    ((0.156, 0.111, -0.085), (1.0, -1.0, 0.0)),
+    ((-0.156, -0.111, -0.085), (1.0, -1.0, 0.0)),
+    ((-0.156, 0.111, -0.085), (1.0, 1.0, 0.0)),
+    ((0.12, -0.218, 0.0), (0.0, 0.0, 1.0)),
+    ((0.12, 0.218, 0.0), (0.0, 0.0, 1.0)),
+    ((-0.12, -0.218, 0.0), (0.0, 0.0, 1.0)),
+    ((-0.12, 0.218, 0.0), (0.0, 0.0, 1.0)),
+)
 
 
 class VehicleConfig(Section):
@@ -200,7 +216,7 @@ class VehicleConfig(Section):
     those of surge, sway, heave, roll, pitch and yaw.
     """
 
-    model: str | None = Field(default=None, min_length=1, max_length=500)
+    model: ModelFile = Field(default=None, min_length=1, max_length=500)
     """name of a vehicle in scenes/vehicles, or its file. It replaces the vehicle of the files that this file extends;
     further keys of this file change single values"""
     title: str = Field(default="BlueROV2 Heavy", max_length=80)
@@ -226,7 +242,11 @@ class VehicleConfig(Section):
     """coefficients of drag proportional to the velocity [N s/m, N m s/rad]"""
     quadratic_drag: SixCoefficients = (141.0, 217.0, 190.0, 1.19, 0.47, 1.5)
     """coefficients of drag proportional to the square of the velocity [N s2/m2, N m s2/rad2]"""
-    thrusters: tuple[ThrusterConfig, ...] = Field(default_factory=_heavy_thrusters, min_length=1, max_length=32)
+    thrusters: tuple[ThrusterConfig, ...] = Field(
+        default=tuple(ThrusterConfig(position_m=at, direction=along) for at, along in _HEAVY_THRUSTERS),
+        min_length=1,
+        max_length=32,
+    )
     """thrusters, in the order of the commands"""
     thrust_coefficients: tuple[Number, ...] = Field(default=(-140.3, 389.9, -404.1, 176.0, 8.9), max_length=12)
     """thrust at rest [N] of a command u from -1 to 1: coefficients of an odd polynomial, that of the highest power
@@ -241,12 +261,13 @@ class VehicleConfig(Section):
     hull_centre_m: Vector3 = (0.0, 0.0, -0.03)
     """centre of this box in the body [m]"""
 
-    @field_validator("model")
+    @field_validator("thrust_coefficients")
     @classmethod
-    def _is_read_by_the_loader(cls, value: str | None) -> str | None:
-        """Refuses a vehicle that has not been read from its file: in a vehicle file, or a model made in Python."""
-        if value is not None:
-            raise PydanticCustomError("vehicle", "none here: twin.load_scenario reads the file of a vehicle")
+    def _require_thrust(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        if not sum(value) > 0:
+            raise PydanticCustomError(
+                "thrust", "coefficients of a thrust above 0 at full command: their sum is above 0"
+            )
         return value
 
     @field_validator("thrust_table")
@@ -275,7 +296,7 @@ class VehicleConfig(Section):
 class RigConfig(Section):
     """Calibrated stereo pair that looks down, with the top of the image towards the bow."""
 
-    model: str | None = Field(default=None, min_length=1, max_length=500)
+    model: ModelFile = Field(default=None, min_length=1, max_length=500)
     """name of a rig in scenes/rigs, or its file: cameras, sensor, lens, port, calibration error and lamps. They replace
     those of the files that this file extends; further keys of this file change single values"""
     title: str = Field(default="", max_length=80)
@@ -292,14 +313,6 @@ class RigConfig(Section):
     """rate of frames and commands; at low rates the control oscillates [Hz]"""
     mount_m: Vector3 = (0.0, 0.0, -0.15)
     """midpoint of the cameras in the body frame: forward, left, up [m]"""
-
-    @field_validator("model")
-    @classmethod
-    def _is_read_by_the_loader(cls, value: str | None) -> str | None:
-        """Refuses a rig that has not been read from its file: in a rig file, or a model made in Python."""
-        if value is not None:
-            raise PydanticCustomError("rig", "none here: twin.load_scenario reads the file of a rig")
-        return value
 
 
 #: How light is scattered: see `imaging.scattering`.

@@ -23,9 +23,8 @@ class VehicleParameters(NamedTuple):
     thrust_configuration: Array
     thrust_coefficients: Array  #: (k,) of the odd polynomial, see `thrusters.steady_thrust_n`
     thrust_table: Array  #: (2, m) commands and thrusts [N]; (2, 0): the polynomial holds
-    thruster_lag: tuple[
-        Array, Array
-    ]  #: numerator and denominator of the transfer function from steady to actual thrust
+    #: numerator and denominator of the transfer function from steady to actual thrust
+    thruster_lag: tuple[Array, Array]
     half_size_m: Array  #: (3,) half the sides of the hull's box
     hull_centre_m: Array  #: (3,)
 
@@ -49,3 +48,9 @@ def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
         half_size_m=np.array(vehicle.size_m) / 2,
         hull_centre_m=np.array(vehicle.hull_centre_m, float),
     )
+
+
+def moves_along_all_axes(vehicle: VehicleConfig) -> bool:
+    """Returns whether the thrusters can push along each axis and turn about the vertical, independently."""
+    surge, sway, heave, _, _, yaw = range(6)
+    return np.linalg.matrix_rank(parameters_of(vehicle).thrust_configuration[[surge, sway, heave, yaw]]) == 4

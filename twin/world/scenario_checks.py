@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
 from twin.scenario.model import Scenario, SensorConfig, SnowConfig, TerrainConfig
+from twin.simulate.parameters import moves_along_all_axes
 
 _MESH_KEYS = ("mesh_file", "mesh_up", "mesh_scale")
 _FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z")
@@ -22,13 +23,14 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
         problem, allowed = "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
         yield TwinError("current.velocity_mps", problem, allowed)
-    if scenario.plan.cross_rise_m:
-        problem = "has no effect without cross lines" if not scenario.plan.cross_lines else ""
-        problem = (
-            "a kinematic vehicle moves in a horizontal plane" if scenario.vehicle.dynamics == "kinematic" else problem
-        )
-        if problem:
-            yield TwinError("plan.cross_rise_m", problem, "0, or plan.cross_lines above 0 with a rigid vehicle")
+    if scenario.plan.cross_rise_m and not scenario.plan.cross_lines:
+        yield TwinError("plan.cross_rise_m", "has no effect without cross lines", "0, or plan.cross_lines above 0")
+    if scenario.plan.cross_rise_m and scenario.vehicle.dynamics == "kinematic":
+        problem, allowed = "a kinematic vehicle moves in a horizontal plane", '0, or vehicle.dynamics = "rigid"'
+        yield TwinError("plan.cross_rise_m", problem, allowed)
+    if scenario.vehicle.dynamics == "rigid" and not moves_along_all_axes(scenario.vehicle):
+        problem = f"{len(scenario.vehicle.thrusters)} thrusters cannot push along all axes and turn about the vertical"
+        yield TwinError("vehicle.thrusters", problem, 'thrusters that can, or vehicle.dynamics = "kinematic"')
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
         yield TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
     if scenario.sensor is not None:
