@@ -23,6 +23,7 @@ class HullModel(NamedTuple):
     added_mass: Array  # (3,) added masses along the axes [kg]
     linear_drag: Array  # (6,) coefficients of linear drag [N m s/rad, then N s/m], positive
     quadratic_drag: Array  # (6,) coefficients of quadratic drag [N m s2/rad2, then N s2/m2], positive
+    drag_centre_m: Array  # (3,) point at which the drag acts
 
 
 @kernel
@@ -34,7 +35,10 @@ def feedforward_wrench(hull: HullModel, velocity: Array) -> Array:
     u, v, w = velocity
     x, y, z = hull.added_mass
     drag = (hull.linear_drag[3:] + hull.quadratic_drag[3:] * np.abs(velocity)) * velocity
-    return np.array([(z - y) * v * w, (x - z) * w * u, (y - x) * u * v, drag[0], drag[1], drag[2]])
+    a, b, c = hull.drag_centre_m
+    moment = b * drag[2] - c * drag[1], c * drag[0] - a * drag[2], a * drag[1] - b * drag[0]
+    munk = (z - y) * v * w, (x - z) * w * u, (y - x) * u * v
+    return np.array([moment[0] + munk[0], moment[1] + munk[1], moment[2] + munk[2], drag[0], drag[1], drag[2]])
 
 
 class Gains(NamedTuple):

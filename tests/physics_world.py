@@ -5,6 +5,7 @@ import numpy as np
 from twin.scenario.model import VehicleConfig
 from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.sea import steady_current
 
 STILL = np.zeros(3)
 IDLE = np.zeros(8)
@@ -24,4 +25,5 @@ def bare_model(timestep_s: float = 1 / 120) -> MjModel:
 def vehicle(pose=None, current_mps=STILL, timestep_s=1 / 120, buoyancy_n=0.0, **factors) -> MujocoVehicle:
     """Returns a MuJoCo vehicle, neutrally buoyant in still water by default."""
     section = VehicleConfig(buoyancy_n=buoyancy_n, **factors)
-    return MujocoVehicle(bare_model(timestep_s), section, current_mps, np.eye(4) if pose is None else pose)
+    sea = steady_current(np.array(current_mps))
+    return MujocoVehicle(bare_model(timestep_s), section, sea, np.eye(4) if pose is None else pose)

@@ -18,6 +18,7 @@ from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import angular_first
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.parameters import parameters_of
+from twin.simulate.sea import steady_current
 from twin.simulate.thrusters import steady_thrust_n
 
 RATE_HZ = 30.0
@@ -51,7 +52,7 @@ def survey(speed_mps, current_mps=(0.0, 0.0, 0.0), seed=0, hold_s=5.0, **factors
     p = plan(SurveyRequest((5.0, 0.9), 2.2, speed_mps, 0.9, 0.8, 0, 320, 240, 277.0, RATE_HZ))
     start = body_reference(p.reference(1, 0.0)).position
     section = VehicleConfig(**factors)
-    rov = MujocoVehicle(bare_model(), section, np.array(current_mps), geometry.pose(np.eye(3), start))
+    rov = MujocoVehicle(bare_model(), section, steady_current(np.array(current_mps)), geometry.pose(np.eye(3), start))
     controller = nominal_controller(VehicleConfig(), 1.2, RATE_HZ)
     rows = []
     for track in range(1, p.n_tracks + 1):
@@ -157,7 +158,7 @@ def test_at_top_speed_in_any_direction_one_thruster_is_at_full_thrust(bearing_de
     direction = np.array([np.cos(bearing), np.sin(bearing), 0.0])
     hull = trimmed_hull(VehicleConfig())
     velocity = top_speed_mps(VehicleConfig(), direction) * direction
-    drag = (hull.linear_drag[3:] + hull.quadratic_drag[3:] * np.abs(velocity)) * velocity
+    drag = (np.diag(hull.linear_drag) + np.diag(hull.quadratic_drag) * np.abs([0, 0, 0, *velocity]))[3:] * velocity
     thrusts = np.linalg.pinv(CONFIGURATION) @ [0, 0, 0, *drag]
     assert np.abs(thrusts).max() == pytest.approx(thrust_of(np.ones(1))[0])
 
@@ -180,7 +181,7 @@ def test_the_integral_does_not_wind_up_while_thrusters_saturate():
 def test_station_keeping_in_a_current_works_at_any_heading(yaw):
     reference = Reference(np.zeros(3), np.zeros(3), yaw, np.zeros(3))
     start = geometry.pose(geometry.rotation_from_rpy(0.1, 0.1, yaw + 0.4), np.array([0.2, 0.0, 0.0]))
-    rov = MujocoVehicle(bare_model(), VehicleConfig(), np.array([0.1, 0.05, 0.0]), start)
+    rov = MujocoVehicle(bare_model(), VehicleConfig(), steady_current(np.array([0.1, 0.05, 0.0])), start)
     controller = nominal_controller(VehicleConfig(), 1.2, RATE_HZ)
     for _ in range(20 * 30):
         rov.step(command(controller, rov.world_from_body, rov.twist_body, reference), 1 / RATE_HZ)

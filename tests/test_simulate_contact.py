@@ -14,6 +14,7 @@ from twin.scenario.model import VehicleConfig
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.contact import HullBox, floor_field, touches_floor
 from twin.simulate.parameters import parameters_of
+from twin.simulate.sea import steady_current
 from twin.surrogate import surrogate_world
 from twin.terrains import Terrain
 from twin.terrains.objects.coloured_mesh import mesh_of
@@ -88,8 +89,8 @@ def test_a_hull_beside_an_object_is_free_and_one_at_its_side_touches_it():
 
 def test_the_compiled_vehicle_stops_at_the_timestep_of_the_contact():
     floor = floor_field(np.zeros((41, 41), np.float32), 0.1, -2.0, -2.0, BOX)
-    body = CompiledVehicle(VehicleConfig(), np.zeros(3), at(0, 0, 1.0), 1 / 120, floor)
-    free = CompiledVehicle(VehicleConfig(), np.zeros(3), at(0, 0, 1.0), 1 / 120)
+    body = CompiledVehicle(VehicleConfig(), steady_current(np.zeros(3)), at(0, 0, 1.0), 1 / 120, floor)
+    free = CompiledVehicle(VehicleConfig(), steady_current(np.zeros(3)), at(0, 0, 1.0), 1 / 120)
     with pytest.raises(SurveyAborted, match=r"contact of the hull with the floor at .* s, x 0.00, y 0.00, z 0.1\d m"):
         for _ in range(100):
             body.step(DOWN, 0.1)

@@ -26,7 +26,7 @@ Describe = Callable[[TwinError], str]
 #: Keys whose value is the path of a file, without the numbers of list items.
 _PATH_KEYS = (
     "imaging.error_model", "objects.mesh_file", "plan.polygon", "terrain.height_file", "terrain.mesh_file",
-    "terrain.orthophoto_file", "terrain.texture_file", "water.spectrum_file",
+    "terrain.orthophoto_file", "terrain.texture_file", "water.spectrum_file", "current.file",
 )  # fmt: skip
 #: Old keys of the scenario and their new names.
 _RENAMED_KEYS = {

@@ -45,5 +45,7 @@ def _absent_in_water(scenario: Scenario) -> dict[str, bool]:
         "no scattering": clear or given_zero[1] or water.turbidity == 0 or scenario.imaging.scattering == "none",
         "no multiple scattering": not clear and scenario.imaging.scattering == "single",
         "no marine snow": scenario.snow.density_per_m3 == 0,
-        "no current": not any(scenario.current.velocity_mps),
+        "no current": scenario.current.is_still,
+        "no gusts": not scenario.current.is_still and scenario.current.gust_mps == 0,
+        "no waves": scenario.waves.is_calm,
     }

@@ -51,6 +51,8 @@ Efficiency = Annotated[Number, Field(gt=0, le=1)]
 Positive = Annotated[Number, Field(gt=0, le=1e6)]
 Coefficient = Annotated[Number, Field(ge=0, le=1e6)]
 SixCoefficients = tuple[Coefficient, Coefficient, Coefficient, Coefficient, Coefficient, Coefficient]
+SixNumbers = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, Coordinate]
+Matrix6 = tuple[SixNumbers, SixNumbers, SixNumbers, SixNumbers, SixNumbers, SixNumbers]
 PerMetre = Annotated[Number, Field(ge=0, le=100)]
 OffAxisDeg = Annotated[Number, Field(ge=0, le=90)]
 WhiteGain = Annotated[Number, Field(ge=1, le=16)]
@@ -238,10 +240,18 @@ class VehicleConfig(Section):
     """centre of buoyancy in the body [m]"""
     added_mass: SixCoefficients = (6.36, 7.12, 18.68, 0.189, 0.135, 0.222)
     """diagonal of the added mass matrix [kg, kg m2]"""
+    added_mass_matrix: Matrix6 | None = None
+    """full added mass matrix, symmetric; replaces added_mass [kg, kg m, kg m2]"""
     linear_drag: SixCoefficients = (13.7, 0.0, 33.0, 0.0, 0.8, 0.0)
     """coefficients of drag proportional to the velocity [N s/m, N m s/rad]"""
+    linear_drag_matrix: Matrix6 | None = None
+    """full matrix of linear drag, positive on its diagonal; replaces linear_drag"""
     quadratic_drag: SixCoefficients = (141.0, 217.0, 190.0, 1.19, 0.47, 1.5)
     """coefficients of drag proportional to the square of the velocity [N s2/m2, N m s2/rad2]"""
+    quadratic_drag_matrix: Matrix6 | None = None
+    """full matrix of quadratic drag: column j multiplies v_j |v_j|; replaces quadratic_drag"""
+    drag_centre_m: Vector3 = (0.0, 0.0, 0.0)
+    """centre of drag in the body: drag acts there, by the velocity of the water relative to this point [m]"""
     thrusters: tuple[ThrusterConfig, ...] = Field(
         default=tuple(ThrusterConfig(position_m=at, direction=along) for at, along in _HEAVY_THRUSTERS),
         min_length=1,
@@ -260,6 +270,21 @@ class VehicleConfig(Section):
     """length, width and height of the box that stands for the hull in contacts [m]"""
     hull_centre_m: Vector3 = (0.0, 0.0, -0.03)
     """centre of this box in the body [m]"""
+
+    @field_validator("added_mass_matrix")
+    @classmethod
+    def _require_inertia(cls, value: Matrix6 | None) -> Matrix6 | None:
+        matrix = np.array(np.eye(6) if value is None else value)
+        if not np.allclose(matrix, matrix.T) or np.linalg.eigvalsh(matrix).min() < -1e-9:
+            raise PydanticCustomError("added_mass_matrix", "a symmetric matrix without negative eigenvalues")
+        return value
+
+    @field_validator("linear_drag_matrix", "quadratic_drag_matrix")
+    @classmethod
+    def _require_resistance(cls, value: Matrix6 | None) -> Matrix6 | None:
+        if value is not None and min(np.diag(np.array(value))) < 0:
+            raise PydanticCustomError("drag_matrix", "a matrix with a diagonal of 0 or more: drag resists motion")
+        return value
 
     @field_validator("thrust_coefficients")
     @classmethod
@@ -596,10 +621,68 @@ class SnowConfig(Section):
 
 
 class CurrentConfig(Section):
-    """Steady, irrotational current."""
+    """Current: its mean over height, gusts and a tide; heights are above the reference plane z = 0.
+
+    Marine snow drifts, and plants lean, with velocity_mps alone.
+    """
 
     velocity_mps: Vector3 = (0.0, 0.0, 0.0)
-    """velocity: east, north, up [m/s]"""
+    """mean velocity at reference_height_m: east, north, up [m/s]"""
+    profile: Literal["uniform", "power", "log"] = "uniform"
+    """mean velocity over the height z. power: as (z / reference_height_m)^exponent; log: as ln(z / roughness_m), zero
+    below roughness_m"""
+    reference_height_m: Metres = 2.0
+    """height at which the velocity is velocity_mps [m]"""
+    exponent: float = Field(default=1 / 7, gt=0, le=1)
+    """power: exponent of the profile"""
+    roughness_m: float = Field(default=0.05, gt=0, le=10)
+    """log: roughness length of the sea floor; 0.05 over reefs (Lentz et al. 2017) [m]"""
+    file: FilePath | None = None
+    """measured or modelled current, which replaces velocity_mps and profile: CSV with the columns time_s, height_m,
+    east_mps, north_mps and, if known, up_mps; interpolated linearly, constant above and below its heights"""
+    gust_mps: float = Field(default=0.0, ge=0, le=2)
+    """gusts: standard deviation of the velocity to the east, and to the north [m/s]"""
+    gust_vertical_mps: float | None = Field(default=None, ge=0, le=2)
+    """standard deviation of the vertical velocity of gusts; default: half of gust_mps [m/s]"""
+    gust_time_s: float = Field(default=10.0, ge=1, le=3600)
+    """correlation time of the gusts (Gauss-Markov process); about height over mean speed [s]"""
+    tide_mps: Vector2 = (0.0, 0.0)
+    """amplitude of the tidal current: east, north [m/s]"""
+    tide_period_h: float = Field(default=12.42, gt=0.1, le=1000)
+    """period of the tide; 12.42: semi-diurnal lunar [h]"""
+    tide_phase_deg: float = Field(default=0.0, ge=-360, le=360)
+    """phase of the tide at the start; 0: greatest current along tide_mps [deg]"""
+
+    @property
+    def is_still(self) -> bool:
+        """Returns whether the water does not move, apart from waves."""
+        return self.file is None and not (any(self.velocity_mps) or self.gust_mps or any(self.tide_mps))
+
+
+class WavesConfig(Section):
+    """Surface waves: their orbital motion, by linear theory, of long-crested waves with a JONSWAP spectrum.
+
+    They move vehicle and water, not the light.
+    """
+
+    height_m: float = Field(default=0.0, ge=0, le=20)
+    """significant height; 0: no waves, unless wind_mps is given [m]"""
+    period_s: float = Field(default=8.0, ge=1, le=30)
+    """period of the peak of the spectrum [s]"""
+    wind_mps: float | None = Field(default=None, gt=0, le=60)
+    """wind 10 m above the sea over fetch_m, from which height and period follow (Hasselmann et al. 1973) [m/s]"""
+    fetch_m: float | None = Field(default=None, ge=100, le=1e6)
+    """distance over which the wind blows, with wind_mps [m]"""
+    peak_enhancement: float = Field(default=3.3, ge=1, le=7)
+    """peak of the spectrum relative to a fully developed sea; 3.3: mean of JONSWAP, 1: Pierson-Moskowitz"""
+    direction_deg: float = Field(default=0.0, ge=-360, le=360)
+    """direction in which the waves travel, counter-clockwise from x (east) [deg]"""
+    depth_m: float | None = Field(default=None, gt=0, le=500)
+    """depth of the reference plane z = 0 below the mean water surface; default: sun.depth_m [m]"""
+
+    @property
+    def is_calm(self) -> bool:
+        return self.height_m == 0 and self.wind_mps is None
 
 
 class NavigationConfig(Section):
@@ -853,6 +936,7 @@ class Scenario(Section):
     sun: SunConfig = SunConfig()
     snow: SnowConfig = SnowConfig()
     current: CurrentConfig = CurrentConfig()
+    waves: WavesConfig = WavesConfig()
     navigation: NavigationConfig = NavigationConfig()
     imu: ImuConfig | None = None
     """inertial measurement unit; default: none"""

@@ -21,6 +21,7 @@ from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
+from twin.simulate.sea import Sea, flow_at
 from twin.simulate.thrusters import (
     ThrusterState,
     lagged_thrusters,
@@ -42,8 +43,9 @@ class RigidBodyState(NamedTuple):
     kick: Array  #: (1,) number of timesteps over which the next step integrates: 0.5 in the first (leapfrog), then 1
     thrusters: ThrusterState
     hull: Hull
-    current: Array  #: (3,) velocity of the steady current in the world [m/s]
+    sea: Sea
     timestep_s: float
+    n_steps: NDArray[np.int64]  #: (1,) number of timesteps since 0 s
     floor: FloorField  #: floor that the hull must not touch
     #: (1,) number of timesteps that were not simulated since the hull touched the floor; -1 if it did not.
     left: NDArray[np.int64]
@@ -53,19 +55,19 @@ class CompiledVehicle:
     """Vehicle under thrust, drag and current, integrated by compiled code.
 
     Args:
-        current_mps: (3,) velocity of the steady current: east, north, up.
+        sea: motion of the water.
         world_from_body: (4, 4) initial pose, at rest.
         floor: floor that the hull must not touch.
     """
 
     def __init__(
-        self, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array, timestep_s: float,
+        self, vehicle: VehicleConfig, sea: Sea, world_from_body: Array, timestep_s: float,
         floor: FloorField = OPEN_WATER,
     ):  # fmt: skip
         thrusters = lagged_thrusters(parameters_of(vehicle), timestep_s)
         self.state = RigidBodyState(
             np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
-            trimmed_hull(vehicle), np.array(current_mps, float), timestep_s, floor, np.full(1, -1),
+            trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, np.full(1, -1),
         )  # fmt: skip
         self._time_s = 0.0
 
@@ -115,10 +117,12 @@ def advance(body, command, n_steps):
     set_thruster_command(thrusters, command)
     for n in range(n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
+        flow = flow_at(body.sea, body.n_steps[0] * body.timestep_s, pose[:3, 3])
         wrench = thruster_wrench(thrusters)
-        geometry.copy_into(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, body.current, wrench))
+        geometry.copy_into(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, flow, wrench))
         velocity += body.kick[0] * body.timestep_s * acceleration
         body.kick[0] = 1.0
+        body.n_steps[0] += 1
         rotation = geometry.so3_exp(body.timestep_s * velocity[3:])
         next_pose = geometry.compose(pose, geometry.pose(rotation, np.zeros(3)))
         for i in range(3):

@@ -6,12 +6,12 @@ import math
 
 import numpy as np
 
+from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
-from twin.simulate.hydrodynamics import Hull, angular_first
+from twin.simulate.hydrodynamics import GRAVITY_MPS2, Hull, angular_first
 from twin.simulate.parameters import parameters_of
 
 MAX_TIMESTEP_S = 1 / 120
-GRAVITY_MPS2 = 9.81
 SPEED_LIMIT_MPS, RATE_LIMIT_RADPS = 20.0, 50.0  # far above any speed of the vehicle; reached only by divergence
 
 
@@ -34,10 +34,15 @@ def trimmed_hull(vehicle: VehicleConfig) -> Hull:
     weight_n = rov.mass_kg * GRAVITY_MPS2
     return Hull(
         inertia=np.array([*rov.inertia_kgm2, *[rov.mass_kg] * 3]),
-        added_inertia=vehicle.added_mass_factor * angular_first(rov.added_mass),
-        linear_drag=vehicle.drag_factor * angular_first(rov.linear_drag),
-        quadratic_drag=vehicle.drag_factor * angular_first(rov.quadratic_drag),
+        added_inertia=vehicle.added_mass_factor * _both_angular_first(rov.added_mass),
+        linear_drag=vehicle.drag_factor * _both_angular_first(rov.linear_drag),
+        quadratic_drag=vehicle.drag_factor * _both_angular_first(rov.quadratic_drag),
+        drag_centre_m=rov.drag_centre_m,
         centre_of_buoyancy_m=rov.centre_of_buoyancy_m,
         weight_n=weight_n,
         buoyancy_n=weight_n + vehicle.buoyancy_n,
     )
+
+
+def _both_angular_first(matrix: Array) -> Array:
+    return np.ascontiguousarray(angular_first(angular_first(matrix).T).T)

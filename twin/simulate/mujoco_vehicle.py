@@ -16,6 +16,7 @@ from twin.simulate.contact import contact_error
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
+from twin.simulate.sea import Sea, flow_at
 from twin.simulate.sensors import inertial_quantities
 from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, step_thrusters, thruster_wrench
 
@@ -29,7 +30,7 @@ class MujocoVehicle:
 
     Args:
         model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
-        current_mps: (3,) velocity of the steady current: east, north, up.
+        sea: motion of the water.
         world_from_body: (4, 4) initial pose, at rest.
 
     Attributes:
@@ -37,9 +38,9 @@ class MujocoVehicle:
         touched: returns which obstacle the hull touches at a pose world_from_body, "" for none.
     """
 
-    def __init__(self, model: MjModel, vehicle: VehicleConfig, current_mps: Array, world_from_body: Array):
+    def __init__(self, model: MjModel, vehicle: VehicleConfig, sea: Sea, world_from_body: Array):
         self._model, self._data = model, mujoco.MjData(model)
-        self._hull, self._current = trimmed_hull(vehicle), np.array(current_mps, dtype=float)
+        self._hull, self._sea = trimmed_hull(vehicle), sea
         self._body = model.body("vehicle").id
         joint = int(model.body_jntadr[self._body])
         first_q, first_v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
@@ -70,8 +71,8 @@ class MujocoVehicle:
     @property
     def inertial(self) -> Array:
         """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2], at the time of the pose."""
-        velocity, wrench = self._velocity_now(), thruster_wrench(self._thrusters)
-        acceleration = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
+        velocity = self._velocity_now()
+        acceleration = self._acceleration_at(velocity, thruster_wrench(self._thrusters))
         return inertial_quantities(self._rotation, velocity[3:], acceleration[:3])
 
     @property
@@ -81,6 +82,10 @@ class MujocoVehicle:
     def _velocity_now(self) -> Array:
         """Returns the velocity of the free joint (6,), ordered as `qvel`, at the same time as the current pose."""
         return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
+
+    def _acceleration_at(self, velocity: Array, wrench: Array) -> Array:
+        flow = flow_at(self._sea, self.time_s, self._data.xpos[self._body])
+        return free_joint_acceleration(self._hull, self._rotation, velocity, flow, wrench)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
         """Simulates as `CompiledVehicle.step` does, with all obstacles."""
@@ -98,7 +103,7 @@ class MujocoVehicle:
     def _advance(self, wrench: Array) -> None:
         model, data = self._model, self._data
         velocity = self._velocity_now()
-        target = free_joint_acceleration(self._hull, self._rotation, velocity, self._current, wrench)
+        target = self._acceleration_at(velocity, wrench)
         self._check_divergence(target, velocity)
         acceleration, force = np.zeros(model.nv), np.zeros(model.nv)
         acceleration[self._dofs] = self._kick * target

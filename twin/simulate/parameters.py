@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,9 +17,10 @@ class VehicleParameters(NamedTuple):
     mass_kg: float
     inertia_kgm2: Array  #: (3,)
     centre_of_buoyancy_m: Array  #: (3,)
-    added_mass: Array  #: (6,)
-    linear_drag: Array  #: (6,)
-    quadratic_drag: Array  #: (6,)
+    added_mass: Array  #: (6, 6)
+    linear_drag: Array  #: (6, 6)
+    quadratic_drag: Array  #: (6, 6)
+    drag_centre_m: Array  #: (3,)
     #: (6, n) wrench [force, moment] about the centre of gravity per newton of thrust of each thruster
     thrust_configuration: Array
     thrust_coefficients: Array  #: (k,) of the odd polynomial, see `thrusters.steady_thrust_n`
@@ -38,9 +40,10 @@ def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
         mass_kg=vehicle.mass_kg,
         inertia_kgm2=np.array(vehicle.inertia_kgm2),
         centre_of_buoyancy_m=np.array(vehicle.centre_of_buoyancy_m, float),
-        added_mass=np.array(vehicle.added_mass),
-        linear_drag=np.array(vehicle.linear_drag),
-        quadratic_drag=np.array(vehicle.quadratic_drag),
+        added_mass=_matrix(vehicle.added_mass, vehicle.added_mass_matrix),
+        linear_drag=_matrix(vehicle.linear_drag, vehicle.linear_drag_matrix),
+        quadratic_drag=_matrix(vehicle.quadratic_drag, vehicle.quadratic_drag_matrix),
+        drag_centre_m=np.array(vehicle.drag_centre_m, float),
         thrust_configuration=np.vstack([directions.T, np.cross(positions, directions).T]),
         thrust_coefficients=np.array(vehicle.thrust_coefficients, float),
         thrust_table=np.array(vehicle.thrust_table, float).reshape(-1, 2).T.copy(),
@@ -48,6 +51,10 @@ def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
         half_size_m=np.array(vehicle.size_m) / 2,
         hull_centre_m=np.array(vehicle.hull_centre_m, float),
     )
+
+
+def _matrix(diagonal: Sequence[float], full: Sequence[Sequence[float]] | None) -> Array:
+    return np.diag(diagonal) if full is None else np.array(full, float)
 
 
 def moves_along_all_axes(vehicle: VehicleConfig) -> bool:

@@ -14,7 +14,7 @@ from twin.core.records import BeaconDetection, Depth, ImuReadings, Readings, Sen
 from twin.errors import TwinError
 from twin.kernels import kernel
 from twin.scenario.model import ImuConfig, NavigationConfig
-from twin.simulate.hull import GRAVITY_MPS2
+from twin.simulate.hydrodynamics import GRAVITY_MPS2
 
 _BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded
 

@@ -16,6 +16,7 @@ from twin.estimate.pipeline import Navigator
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.kinematic_vehicle import KinematicVehicle
+from twin.simulate.sea import make_sea
 from twin.simulate.sensors import NavigationSensors
 from twin.surrogate.compiled_loop import compiled_loop
 from twin.surrogate.coverage import RENDERED, survey_conditions, unmodelled
@@ -41,7 +42,7 @@ class SurrogateWorld(World):
         scenario, rig, rng = mission.scenario, mission.rig, streams(mission.scenario.seed)
         if scenario.vehicle.dynamics == "rigid":
             vehicle = CompiledVehicle(
-                scenario.vehicle, np.array(scenario.current.velocity_mps), mission.start_of_body,
+                scenario.vehicle, make_sea(scenario, rng["sea"]), mission.start_of_body,
                 physics_timestep_s(rig.frame_rate_hz), floor_of(mission),
             )  # fmt: skip
         else:

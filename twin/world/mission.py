@@ -26,6 +26,7 @@ from twin.plugin.guard import check_loadable
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, Source
 from twin.simulate.hull import physics_timestep_s
+from twin.simulate.sea import make_sea
 from twin.simulate.sensors import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.height_floor import load_terrain
@@ -240,7 +241,8 @@ def _check_path(
 ) -> None:
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
-    errors.attempt(check_thrust, scenario.vehicle, scenario.current.velocity_mps, plan)
+    if (sea := errors.attempt(make_sea, scenario)) is not None:
+        errors.attempt(check_thrust, scenario.vehicle, sea, plan)
     camera_m = scenario.believed_rig().body_from_camera[:3, 3]
     for k, lamp in enumerate(scenario.lamps):
         errors.attempt(check_lamp, k, np.array(lamp.position_m), camera_m, terrain, plan)

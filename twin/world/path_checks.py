@@ -17,6 +17,7 @@ from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig, VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
+from twin.simulate.sea import Sea, strongest_currents_mps
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.objects.scattering import disc_of
@@ -196,18 +197,37 @@ def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> 
         raise TwinError("plan.speed_mps", f"{asked.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}")
 
 
-def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float], plan: SurveyPlan) -> None:
+def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan) -> None:
     """Raises TwinError if a thruster saturates: to hold station in the current, or at the planned velocities in it.
 
-    A kinematic vehicle, and a path at constant height without current, are not checked.
+    The current is its mean with the strongest tide, at the heights of the path; gusts and waves are shorter. Also
+    raises TwinError if a file of the current does not cover times and heights of the path. A kinematic vehicle, and a
+    path at constant height without current, are not checked.
     """
-    current = np.array(current_mps)
-    if vehicle.dynamics == "kinematic" or not (current.any() or plan.follows_floor or plan.request.cross_rise_m):
+    if vehicle.dynamics == "kinematic":
         return
     planned = plan.all_references()
+    lowest_m, highest_m = float(planned.position[:, 2].min()), float(planned.position[:, 2].max())
+    _check_coverage(sea, lowest_m, highest_m, len(planned.position) / plan.request.frame_rate_hz)
     rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity]), 3)
     distinct = np.unique(rounded, axis=0)
     yaw, velocity = distinct[:, 0], distinct[:, 1:]
+    for current in strongest_currents_mps(sea, lowest_m, highest_m):
+        if current.any() or plan.follows_floor or plan.request.cross_rise_m:
+            _check_thrust_in(vehicle, current, plan.speed_mps, yaw, velocity)
+
+
+def _check_coverage(sea: Sea, lowest_m: float, highest_m: float, duration_s: float) -> None:
+    for what, table, low, high, unit in (
+        ("the path", sea.heights_m, lowest_m, highest_m, "m above z = 0"),
+        ("the survey", sea.times_s, 0.0, duration_s, "s"),
+    ):
+        if len(table) > 1 and not (table[0] <= low and high <= table[-1]):
+            problem = f"covers {table[0]:g} to {table[-1]:g} {unit}; {what} extends from {low:.1f} to {high:.1f}"
+            raise TwinError("current.file", problem, "a file that covers it")
+
+
+def _check_thrust_in(vehicle: VehicleConfig, current: Array, cruise_mps: float, yaw: Array, velocity: Array) -> None:
     hold, speed_mps = _body_velocities(yaw, -np.tile(current, (len(yaw), 1))), float(np.linalg.norm(current))
     if (factor := _saturating_factor(vehicle, lambda k: k * hold)) is not None:
         raise TwinError(
@@ -218,8 +238,8 @@ def check_thrust(vehicle: VehicleConfig, current_mps: tuple[float, float, float]
     if factor is not None:
         against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " where it rises"
         raise TwinError(
-            "plan.speed_mps", f"{plan.speed_mps:g}: too fast for the thrusters{against}",
-            f"up to {np.floor(1000 * factor * plan.speed_mps) / 1000:.3f}",
+            "plan.speed_mps", f"{cruise_mps:g}: too fast for the thrusters{against}",
+            f"up to {np.floor(1000 * factor * cruise_mps) / 1000:.3f}",
         )  # fmt: skip
 
 

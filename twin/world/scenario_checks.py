@@ -20,9 +20,7 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     """Yields an error for each contradiction in a scenario, apart from its floor and objects."""
     if scenario.estimate.plugin is not None and scenario.imaging.fidelity != "rendered":
         yield TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
-    if scenario.vehicle.dynamics == "kinematic" and any(scenario.current.velocity_mps):
-        problem, allowed = "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
-        yield TwinError("current.velocity_mps", problem, allowed)
+    yield from _of_sea(scenario)
     if scenario.plan.cross_rise_m and not scenario.plan.cross_lines:
         yield TwinError("plan.cross_rise_m", "has no effect without cross lines", "0, or plan.cross_lines above 0")
     if scenario.plan.cross_rise_m and scenario.vehicle.dynamics == "kinematic":
@@ -98,6 +96,21 @@ def _of_lens(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"lens.{key}", "needs the f-number and the pixel size of the sensor", "with [sensor]")
     if 0 < lens.focus_m < NEAREST_FOCUS_M:
         yield TwinError("lens.focus_m", f"{lens.focus_m:g}: too near", f"0, or {NEAREST_FOCUS_M:g} or more")
+
+
+def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
+    current, waves = scenario.current, scenario.waves
+    if scenario.vehicle.dynamics == "kinematic":
+        problem, allowed = "has no effect on a kinematic vehicle", 'the default, or vehicle.dynamics = "rigid"'
+        sea = ("velocity_mps", "gust_mps", "tide_mps", "file")
+        yield from keys_without_effect("current", current, sea, problem, allowed)
+        yield from keys_without_effect("waves", waves, ("height_m", "wind_mps"), problem, allowed)
+    if current.file is not None:
+        problem = "is unused: current.file has the mean current"
+        yield from keys_without_effect("current", current, ("velocity_mps", "profile"), problem, "one of the two")
+    if current.profile == "log" and current.roughness_m >= current.reference_height_m:
+        problem = f"{current.roughness_m:g}: the current vanishes at current.reference_height_m"
+        yield TwinError("current.roughness_m", problem, f"below {current.reference_height_m:g}")
 
 
 def _of_snow(snow: SnowConfig) -> Iterator[TwinError]:
