@@ -9,7 +9,13 @@ from __future__ import annotations
 import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
-from twin.controllers.tracking import ControllerState, HullModel, feedforward_wrench, pole_placement_gains
+from twin.controllers.tracking import (
+    ControllerState,
+    HullModel,
+    feedforward_wrench,
+    pole_placement_gains,
+    unknown_current,
+)
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
 from twin.simulate.hull import trimmed_hull
@@ -18,11 +24,20 @@ from twin.simulate.parameters import VehicleParameters, parameters_of
 from twin.simulate.thrusters import steady_thrust_n
 
 
-def nominal_controller(vehicle: VehicleConfig, natural_frequency_radps: float, frame_rate_hz: float) -> ControllerState:
-    """Returns a controller for a vehicle, with this frequency in position and a command per frame."""
+def nominal_controller(
+    vehicle: VehicleConfig, natural_frequency_radps: float, frame_rate_hz: float, velocity_lag_s: float = 0.0
+) -> ControllerState:
+    """Returns a controller for a vehicle, with this frequency in position and a command per frame.
+
+    `velocity_lag_s` is the time by which the velocity that it is given lags behind the true one.
+    """
+    rov = parameters_of(vehicle)
+    numerator, denominator = rov.thruster_lag
+    lead_s = numerator[-2] / numerator[-1] if len(numerator) > 1 else 0.0
+    lag_s = velocity_lag_s + denominator[-2] / denominator[-1] - lead_s
     model = _controller_model(trimmed_hull(vehicle.model_copy(update={"drag_factor": 1.0, "added_mass_factor": 1.0})))
     gains = pole_placement_gains(natural_frequency_radps)
-    return ControllerState(model, _allocation(parameters_of(vehicle)), gains, 1 / frame_rate_hz, np.zeros(6))
+    return ControllerState(model, _allocation(rov), gains, 1 / frame_rate_hz, lag_s, np.zeros(6), unknown_current())
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:

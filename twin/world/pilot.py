@@ -96,7 +96,7 @@ class RovPilot:
             smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz),
             twist=np.zeros(6),
             controller=nominal_controller(
-                scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz
+                scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz, _VELOCITY_SMOOTHING_S
             ),
         )
 
