@@ -104,7 +104,7 @@ class ControllerState(NamedTuple):
 
 
 @kernel
-def control_thrusters(controller, pose, twist, position, velocity, acceleration, yaw):
+def control_thrusters(controller, pose, twist, position, velocity, acceleration, yaw, is_measured=True):
     """Returns the thruster commands (n,) in [-1, 1] for one period, and updates the integral action in place.
 
     PID control of position and level attitude, with feed-forward of acceleration and of the drag in the estimated
@@ -113,8 +113,12 @@ def control_thrusters(controller, pose, twist, position, velocity, acceleration,
     Args:
         pose, twist: estimated pose world_from_body (4, 4), and [angular, linear] velocity (6,) in the body.
         position, velocity, acceleration, yaw: `Reference` of the body in the world.
+        is_measured: whether the motion was measured; else the estimate of the current is kept.
     """
-    update_current(controller.flow, controller.hull, pose, twist, controller.period_s)
+    if is_measured:
+        update_current(controller.flow, controller.hull, pose, twist, controller.period_s)
+    else:
+        controller.flow.velocity[:] = twist[3:]
     wrench, error = _wrench(
         pose, twist, position, velocity, acceleration, yaw, controller.hull, controller.gains, controller.integral,
         controller.flow.current,

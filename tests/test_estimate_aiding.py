@@ -10,7 +10,8 @@ from twin.core.records import BeaconDetection, Displacement, Readings, SensorNoi
 from twin.estimate.alignment import align
 from twin.estimate.navigation import aiding
 from twin.estimate.navigation.dvl import DvlIntegrator, body_displacement, fuse_displacement, fuse_dvl
-from twin.estimate.navigation.pose_filter import SENSORS, PoseFilter, fuse_pressure_ahrs, readings_as_arrays
+from twin.estimate.navigation.kalman import SENSORS
+from twin.estimate.navigation.pose_filter import PoseFilter, fuse_pressure_ahrs, readings_as_arrays
 from twin.estimate.vision.stereo import Keyframe
 from twin.estimate.vision.two_view_motion import Motion
 
@@ -323,23 +324,36 @@ def test_a_reading_beyond_its_gate_changes_nothing_and_is_no_factor(sensor):
 
 
 @pytest.mark.parametrize("sensor", ["pressure", "ahrs", "usbl"])
-def test_a_sensor_that_contradicts_the_pose_for_long_is_believed(sensor):
+def test_a_sensor_that_contradicts_the_pose_for_long_is_believed_if_motions_were_predicted(sensor):
     """It agrees with itself, so the pose is taken to be wrong: the pose moves to the readings, which then pass."""
     pose_filter, k = PoseFilter(POSE, RIG, NOISE), SENSORS.index(sensor)
     pose_filter.cov = np.eye(6) * 1e-6
+    for _ in range(20):
+        pose_filter.gates.add_prediction()
     readings, residual = outliers()[sensor], {"pressure": 0.3, "ahrs": 0.3, "usbl": 3.0}[sensor]
     for _ in range(400):
         fused_with(pose_filter, readings)
-    assert 0 < pose_filter.rejected[k] < 400 and pose_filter.gates.counts[k].tolist()[::2] == [0, 1]
+    assert 0 < pose_filter.rejected[k] < 400 and pose_filter.gates.counts[k, [0, 2, 3]].tolist() == [0, 1, 1]
     moved = geometry.log(geometry.inverse(POSE) @ pose_filter.world_from_camera)
     assert max(np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])) == pytest.approx(residual, rel=0.02)
+
+
+@pytest.mark.parametrize("sensor", ["pressure", "ahrs", "usbl"])
+def test_a_sensor_that_contradicts_measured_motions_is_disputed_but_never_believed(sensor):
+    pose_filter, k = PoseFilter(POSE, RIG, NOISE), SENSORS.index(sensor)
+    pose_filter.cov = np.eye(6) * 1e-6
+    for _ in range(400):
+        fused_with(pose_filter, outliers()[sensor])
+    assert pose_filter.rejected[k] == 400 and pose_filter.gates.counts[k, 3] == 0
+    assert pose_filter.gates.counts[k, 2] > 0
+    np.testing.assert_array_equal(pose_filter.world_from_camera, POSE)
 
 
 def test_a_sensor_that_contradicts_itself_is_never_believed():
     pose_filter, rng = PoseFilter(POSE, RIG, NOISE), np.random.default_rng(0)
     for offset in rng.choice([-1, 1], 1000) * rng.uniform(0.3, 3.0, 1000):
         fused_with(pose_filter, Readings(pressure_z_m=POSE[2, 3] + offset))
-    assert pose_filter.gates.counts[0, 1:].tolist() == [1000, 0]
+    assert pose_filter.gates.counts[0, 1:4].tolist() == [1000, 0, 0]
     np.testing.assert_array_equal(pose_filter.world_from_camera, POSE)
 
 
@@ -358,10 +372,11 @@ def test_a_velocity_that_contradicts_vision_is_no_part_of_a_displacement_until_i
     assert dvl.displacement_at_node(1) is None
     for _ in range(14):
         fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
-    assert gates.counts[2].tolist()[1:] == [8, 0]
+    assert gates.counts[2].tolist()[1:4] == [8, 0, 0]
     for _ in range(60):
+        gates.add_prediction()
         fused, _ = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
-    assert gates.counts[2, 2] > 0
+    assert gates.counts[2, 3] > 0
     np.testing.assert_allclose(body_displacement(fused, MOUNT)[0], wrong / RIG.frame_rate_hz, rtol=0.05, atol=1e-4)
 
 

@@ -74,7 +74,10 @@ def _run(
                     fly(mission, world, navigator, observe, monitor.actions)
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
                 guard.cause = str(error) or "interrupted"
-            flown = FlownSurvey(mission, world.truth(), world.warnings, monitor.actions.times)
+            for event in world.faults.events:
+                folder.log("fault", time_s=event.time_s, part=event.fault.name, type=event.fault.type, starts=event.starts)
+            warnings = (*world.warnings, *world.faults.sentences)
+            flown = FlownSurvey(mission, world.truth(), warnings, monitor.actions.times)
             estimation = Estimation(navigator, stopwatch, guard, folder, monitor.report_stage, monitor.start_s)
             result, _ = conclude(estimation, flown)
     if scenario.record == "none" and images:

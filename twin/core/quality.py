@@ -91,9 +91,11 @@ class EstimationQuality(NamedTuple):
     repeats: Mapping[str, Sequence[int]] = MappingProxyType({})
     #: number of readings of each navigation sensor that were not used, because they contradicted the estimates.
     readings_rejected: Mapping[str, int] = MappingProxyType({})
-    #: number of readings of each navigation sensor that contradicted the estimates but were used, because many before
-    #: them had done so in the same way.
+    #: numbers of readings of each navigation sensor that contradicted the estimates as many before them, and of those
+    #: that were believed because motions had been predicted since the sensor last agreed; the others were not used.
     readings_disputed: Mapping[str, int] = MappingProxyType({})
+    readings_believed: Mapping[str, int] = MappingProxyType({})
+    reading_notes: Sequence[str] = ()  #: sentences on sensors that were frozen, or gave no readings for long
 
     @property
     def repeat_notes(self) -> list[str]:

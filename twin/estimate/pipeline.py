@@ -40,6 +40,7 @@ from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_t
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
 from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance
+from twin.estimate.navigation.reading_watch import ReadingWatch
 from twin.estimate.network import KeyframeNetwork, LinkAttempt
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.trajectory import PoseLog, interpolate_between_keyframes
@@ -88,6 +89,7 @@ class Navigator:
         self.network = KeyframeNetwork(self.vision, rig, noise, self.settings, self.stopwatch)
         self._resources.callback(self.network.close)
         self.log = PoseLog()
+        self._watch = ReadingWatch()
 
     def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
         if folder is None:
@@ -130,11 +132,12 @@ class Navigator:
             OSError: images could not be read or written.
         """
         interval_s = self.interval_s(frame.time_s)
+        frame = replace(frame, readings=self._watch.fresh(frame.readings, frame.time_s))
         motion, status = self.vision.track_frame(frame)
         is_measured = status in ("ok", RIGHT_REPEATS)
         self.log.n_lost += not is_measured
         last, rejected = self.filter.world_from_camera, self.filter.rejected
-        moved = self.filter.advance(motion, frame.readings, interval_s)
+        moved = self.filter.advance(motion, frame.readings, interval_s, is_measured)
         self.filter.fuse_vertical(frame.readings)
         frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
         step = motion.a_from_b if is_measured else geometry.inverse(last) @ self.filter.world_from_camera
@@ -324,6 +327,8 @@ class Navigator:
             depth_scale=along,
             readings_rejected=dict(zip(SENSORS, counts[:, 1].tolist(), strict=True)),
             readings_disputed=dict(zip(SENSORS, counts[:, 2].tolist(), strict=True)),
+            reading_notes=self._watch.notes,
+            readings_believed=dict(zip(SENSORS, counts[:, 3].tolist(), strict=True)),
         )
 
     def build_map(

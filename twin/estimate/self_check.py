@@ -94,7 +94,9 @@ def _tracking(result: SurveyResult) -> Iterator[Finding]:
     text = f"{quality.links_failed} of {quality.links_tried} links between keyframes failed"
     yield from _above("links_failed", quality.links_failed / max(quality.links_tried, 1), MAX_LINKS_FAILED, text)
     for sensor, count in quality.readings_disputed.items():
-        text = f"{sensor} readings contradicted the estimates for long, and {count} were believed in the end"
+        believed = quality.readings_believed.get(sensor, 0)
+        end = f"{believed} were believed in the end" if believed else f"{count} more were not used"
+        text = f"{sensor} readings contradicted the estimates for long, and {end}"
         yield from _above(f"readings_{sensor}", count, 0, text)
 
 

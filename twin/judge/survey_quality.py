@@ -46,8 +46,8 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
     they do not explain, disparity_offset the common error of all disparities (fractions of the focal length).
     sigma_max_m is the largest 3-D standard deviation of a keyframe position; frame_sigma_m that of a keyframe relative
     to the previous one by frame-to-frame motion alone, 90th percentile. length_scale and depth_scale are lengths from
-    the images across and along the optical axis / those of DVL, USBL and pressure. readings_rejected and _disputed are
-    numbers by navigation sensor.
+    the images across and along the optical axis / those of DVL, USBL and pressure. readings_rejected, _disputed and
+    _believed are numbers by navigation sensor.
     """
     quality, epipolar = result.quality, result.quality.epipolar
     pitch, yaw, roll = (None,) * 3 if epipolar is None else np.rad2deg(epipolar.estimate[:3]).tolist()
@@ -83,4 +83,5 @@ def self_check_metrics(result: SurveyResult) -> dict[str, Any]:
         "depth_scale_sigma": along and along.sigma,
         "readings_rejected": dict(quality.readings_rejected),
         "readings_disputed": dict(quality.readings_disputed),
+        "readings_believed": dict(quality.readings_believed),
     }

@@ -855,6 +855,46 @@ class ControlConfig(Section):
     the shorter side of the footprint [m]"""
 
 
+#: Parts that can fail, with the ways in which they can, in the words of PX4.
+FAULTS: dict[str, tuple[str, ...]] = {
+    "thruster": ("off", "stuck", "wrong", "intermittent"),
+    "cameras": ("off", "stuck", "garbage", "intermittent"),
+    "left_camera": ("off", "stuck", "garbage", "intermittent"),
+    "right_camera": ("off", "stuck", "garbage", "intermittent"),
+    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent"),
+}
+
+
+class FaultConfig(Section):
+    """Fault of a part, at a time or at a rate; the estimators and the controller are not told of it."""
+
+    part: Literal["thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl"]
+    """part that fails; a sensor must be in navigation.aiding"""
+    number: int | None = Field(default=None, ge=1, le=32)
+    """number of the thruster, from 1"""
+    type: Literal["off", "stuck", "wrong", "garbage", "intermittent"] = "off"
+    """off: no thrust, black images, no readings; stuck: the command, the images or the reading of its start are
+    repeated; wrong: thrust times `size`, readings plus `size`; garbage: images of noise, readings with added noise of
+    standard deviation `size`; intermittent: as off, at random frames"""
+    start_s: float | None = Field(default=None, ge=0, le=1e6)
+    """time at which it starts; default: with per_hour [s]"""
+    per_hour: float | None = Field(default=None, gt=0, le=3600)
+    """mean number of faults per hour, at random times"""
+    duration_s: float | None = Field(default=None, gt=0, le=1e6)
+    """duration of a fault; default: to the end of the survey [s]"""
+    size: float = Field(default=0.5, ge=-100, le=100)
+    """wrong, garbage: factor on the thrust; bias or noise of readings in their unit [m, deg, m/s]; intermittent: share
+    of the frames that are lost, 0 to 1"""
+
+    @property
+    def name(self) -> str:
+        part = self.part.replace("_", " ")
+        return f"{part} {self.number}" if self.number is not None else part
+
+
 class _EstimatePlugin(Section):
     plugin: str | None = Field(default=None, max_length=200, pattern=PLUGIN_NAME)
     """estimator of another package, which replaces motion estimation, network and alignment: module:Class, or the name
@@ -948,6 +988,8 @@ class Scenario(Section):
     """small lights at surveyed positions"""
     objects: tuple[ObjectConfig, ...] = Field(default=(), max_length=1000)
     """objects on the sea floor"""
+    faults: tuple[FaultConfig, ...] = Field(default=(), max_length=100)
+    """faults of thrusters, cameras and navigation sensors"""
     require: dict[str, Number] = {}
     """limits on metrics, e.g. "map.le90_m" = 0.05"""
 

@@ -61,7 +61,8 @@ class FlownSurvey:
         plan |= {"both_ways": mission.plan.follows_floor} | mission.plan.swath_notes
         warnings = [
             *plugin_notes(scenario), *mission.hole_notes, *self.world_warnings,
-            *calibration_notes(result, mission.rig), *result.quality.repeat_notes, *filter(None, [actions.sentence]),
+            *calibration_notes(result, mission.rig), *result.quality.repeat_notes, *result.quality.reading_notes,
+            *filter(None, [actions.sentence]),
         ]  # fmt: skip
         return EvaluationInput(
             result,

@@ -96,7 +96,8 @@ class SteppedWorld:
             RuntimeError: `reset` was not called, or was not called again after `step` returned None.
             SurveyAborted: the physics diverged, for example because a command is not finite.
         """
-        values, n = np.array(command, dtype=np.float64), 8 if self.mission.scenario.vehicle.dynamics == "rigid" else 3
+        values, vehicle = np.array(command, dtype=np.float64), self.mission.scenario.vehicle
+        n = len(vehicle.thrusters) if vehicle.dynamics == "rigid" else 3
         if values.shape != (n,):
             raise ValueError(f"the command has the shape {values.shape} (expected: ({n},))")
         return self.flight.step(values, pace, keyframe)

@@ -76,6 +76,11 @@ class CompiledVehicle:
         return self.state.pose.copy()
 
     @property
+    def thrust_factors(self) -> Array:
+        """Returns the factors (n,) on the thrusts, which can be modified in place; 1 without faults."""
+        return self.state.thrusters.factors
+
+    @property
     def twist_body(self) -> Array:
         """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
         return body_twist(self.state)

@@ -69,6 +69,11 @@ class MujocoVehicle:
         return twist_from_free_joint(self._rotation, self._velocity_now())
 
     @property
+    def thrust_factors(self) -> Array:
+        """Returns the factors (n,) on the thrusts, which can be modified in place; 1 without faults."""
+        return self._thrusters.factors
+
+    @property
     def inertial(self) -> Array:
         """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2], at the time of the pose."""
         velocity = self._velocity_now()

@@ -40,6 +40,7 @@ class ThrusterState(NamedTuple):
     table: Array  #: (2, m) table of the thrust curve, as in `steady_thrust_n`
     lag_state: Array  #: (m, n) state of the lag, modified in place
     steady_n: Array  #: (n,) steady thrust of the last command, modified in place
+    factors: Array  #: (n,) on the steady thrusts, modified in place; 1 without faults
 
 
 def lagged_thrusters(vehicle: VehicleParameters, timestep_s: float) -> ThrusterState:
@@ -53,14 +54,15 @@ def lagged_thrusters(vehicle: VehicleParameters, timestep_s: float) -> ThrusterS
     c[-len(numerator) :] = numerator
     configuration = angular_first(vehicle.thrust_configuration)
     n, curve = configuration.shape[1], (vehicle.thrust_coefficients, vehicle.thrust_table)
-    return ThrusterState(a, b, c, configuration, *curve, np.zeros((len(a), n)), np.zeros(n))
+    return ThrusterState(a, b, c, configuration, *curve, np.zeros((len(a), n)), np.zeros(n), np.ones(n))
 
 
 @kernel
 def set_thruster_command(thrusters, command):
     """Sets the commands (n,), clipped to [-1, 1], for the following steps."""
     clipped = np.minimum(np.maximum(command, -1.0), 1.0)
-    geometry.copy_into(thrusters.steady_n, steady_thrust_n(clipped, thrusters.coefficients, thrusters.table))
+    steady_n = thrusters.factors * steady_thrust_n(clipped, thrusters.coefficients, thrusters.table)
+    geometry.copy_into(thrusters.steady_n, steady_n)
 
 
 @kernel

@@ -71,7 +71,7 @@ class SurrogateWorld(World):
 
     def fast_forward(self, navigator: Navigator, pilot: PilotOfEstimates) -> FastForward:
         own = navigator.vision is self.vision
-        if own and isinstance(self.vehicle, CompiledVehicle) and isinstance(pilot, RovPilot):
+        if own and not self.faults.exist and isinstance(self.vehicle, CompiledVehicle) and isinstance(pilot, RovPilot):
             return compiled_loop(self, self.vehicle, self.vision, navigator, pilot)
         return super().fast_forward(navigator, pilot)
 

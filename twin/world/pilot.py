@@ -103,15 +103,15 @@ class RovPilot:
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
         return steer(
             self.state, estimate.world_from_camera, estimate.camera_velocity, reference.position, reference.velocity,
-            reference.acceleration, float(reference.yaw),
+            reference.acceleration, float(reference.yaw), estimate.status == "ok",
         )  # fmt: skip
 
 
 @kernel
-def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw):
+def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw, is_measured=True):
     """Returns the thruster commands (n,) and updates `state` in place; compiled kernel of `RovPilot`."""
     change = state.body_from_camera_twist @ camera_velocity - state.twist
     geometry.copy_into(state.twist, state.twist + state.smoothing * change)
     body = geometry.compose(world_from_camera, state.camera_from_body)
     target = position - rotate_lever_arm(yaw, state.lever_arm_m)
-    return control_thrusters(state.controller, body, state.twist, target, velocity, acceleration, yaw)
+    return control_thrusters(state.controller, body, state.twist, target, velocity, acceleration, yaw, is_measured)

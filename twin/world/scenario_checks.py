@@ -9,9 +9,10 @@ from pydantic import BaseModel
 
 from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
-from twin.scenario.model import Scenario, SensorConfig, SnowConfig, TerrainConfig
+from twin.scenario.model import FAULTS, Scenario, SensorConfig, SnowConfig, TerrainConfig
 from twin.simulate.parameters import moves_along_all_axes
 
+_CAMERAS = ("cameras", "left_camera", "right_camera")  # parts whose faults change images
 _MESH_KEYS = ("mesh_file", "mesh_up", "mesh_scale")
 _FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z")
 
@@ -21,6 +22,7 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     if scenario.estimate.plugin is not None and scenario.imaging.fidelity != "rendered":
         yield TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
     yield from _of_sea(scenario)
+    yield from _of_faults(scenario)
     if scenario.plan.cross_rise_m and not scenario.plan.cross_lines:
         yield TwinError("plan.cross_rise_m", "has no effect without cross lines", "0, or plan.cross_lines above 0")
     if scenario.plan.cross_rise_m and scenario.vehicle.dynamics == "kinematic":
@@ -111,6 +113,31 @@ def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
     if current.profile == "log" and current.roughness_m >= current.reference_height_m:
         problem = f"{current.roughness_m:g}: the current vanishes at current.reference_height_m"
         yield TwinError("current.roughness_m", problem, f"below {current.reference_height_m:g}")
+
+
+def _of_faults(scenario: Scenario) -> Iterator[TwinError]:
+    n, kinematic = len(scenario.vehicle.thrusters), scenario.vehicle.dynamics == "kinematic"
+    for k, fault in enumerate(scenario.faults):
+        key = f"faults.{k}"
+        if fault.type not in FAULTS[fault.part]:
+            yield TwinError(f"{key}.type", f"{fault.type}: not simulated for {fault.part}", ", ".join(FAULTS[fault.part]))
+        if fault.part == "thruster":
+            if kinematic:
+                yield TwinError(f"{key}.part", "a kinematic vehicle has no thrusters", 'vehicle.dynamics = "rigid"')
+            elif fault.number is None or fault.number > n:
+                yield TwinError(f"{key}.number", "missing" if fault.number is None else f"{fault.number}", f"1 to {n}")
+        elif fault.number is not None:
+            yield TwinError(f"{key}.number", f"has no effect on {fault.part}", "no value")
+        if fault.part not in (*_CAMERAS, "thruster") and fault.part not in scenario.navigation.aiding:
+            yield TwinError(f"{key}.part", f"{fault.part} is not used", "a sensor in navigation.aiding")
+        if (fault.start_s is None) == (fault.per_hour is None):
+            problem = "missing" if fault.start_s is None else "given together with per_hour"
+            yield TwinError(f"{key}.start_s", problem, "either start_s or per_hour")
+        if fault.type == "intermittent" and not 0 <= fault.size <= 1:
+            yield TwinError(f"{key}.size", f"{fault.size:g}: not a share of the frames", "0 to 1")
+        if scenario.imaging.fidelity == "surrogate" and fault.part in _CAMERAS:
+            allowed = 'imaging.fidelity = "rendered"'
+            yield TwinError(f"{key}.part", f"{fault.part}: the surrogate has no images", allowed)
 
 
 def _of_snow(snow: SnowConfig) -> Iterator[TwinError]:

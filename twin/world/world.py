@@ -16,6 +16,7 @@ from twin.core.series import GrowingArray
 from twin.core.timing import StageTimer
 from twin.errors import TwinError
 from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.faults import Faults
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sensors import NavigationSensors
 from twin.world.mission import FrameSequence, Mission, Step
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
 #: Random streams in the order of their seeds; a new one at the end leaves the numbers of the others unchanged.
-_STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu", "sea")
+_STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu", "sea", "faults")
 
 #: Simulates frames from index k, at most up to the next keyframe; returns the index of the first one not simulated.
 FastForward = Callable[[FrameSequence, int], int]
@@ -50,6 +51,9 @@ class World(ABC):
 
     def __init__(self, mission: Mission, stopwatch: StageTimer, vehicle: AnyVehicle, sensors: NavigationSensors):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
+        scenario = mission.scenario
+        duration_s = 2 * mission.n_frames / mission.rig.frame_rate_hz  # also of a survey that is slowed
+        self.faults = Faults(scenario.faults, duration_s, streams(scenario.seed)["faults"])
         self._true_poses = GrowingArray(4, 4)
         self._sequences: list[FrameSequence] = []
 
@@ -91,12 +95,18 @@ class World(ABC):
         index, images = len(self), self.capture(step)
         self.record(self.world_from_camera)
         time_s = index / self.mission.rig.frame_rate_hz
+        self.faults.at(time_s)
+        left, right = self.faults.images(images.left, images.right)
+        assert left is not None
         depth_m = images.depth_m if step.keyframe else None
         readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
-        return Frame(index, time_s, images.left, images.right, readings, step.keyframe, images.exposure)
+        readings = self.faults.readings(readings)
+        return Frame(index, time_s, left, right, readings, step.keyframe, images.exposure)
 
     def act(self, command: Array) -> None:
         with self.stopwatch("physics"):
+            if self.faults.exist and not isinstance(self.vehicle, KinematicVehicle):
+                command, self.vehicle.thrust_factors[:] = self.faults.thrusts(command)
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def __len__(self) -> int:

@@ -15,24 +15,36 @@ SENSORS = ("pressure", "ahrs", "dvl", "usbl", "beacons", "vertical")  # navigati
 PRESSURE, AHRS, DVL, USBL, BEACONS, VERTICAL = range(6)
 #: Largest chi2 of a reading with 1, 2 and 3 components; one in 1e9 exceeds it.
 _READING_GATES = (37.3, 41.4, 44.8)
-#: Number of consecutive readings of each sensor that are rejected before it is believed: 10 s at 30 frames per second,
-#: for the DVL, whose readings contradict each motion of vision anew, 2 s.
+#: Number of consecutive readings of each sensor that contradict the pose before they are disputed: 10 s at 30 frames
+#: per second, for the DVL, whose readings contradict each motion of vision anew, 2 s.
 _PATIENCE = (300, 300, 30, 5, 20, 300)
+#: A disputed sensor is believed if at least this many motions were predicted, not measured, since it last agreed. If
+#: all motions were measured, the pose cannot have jumped, so the sensor is wrong.
+_MANY_PREDICTED = 10
 
 
 class ReadingGates(NamedTuple):
     """States of the gates that reject readings, one row per sensor in `SENSORS`; arrays are modified in place."""
 
-    #: (6, 3) numbers of readings: contradicting in succession; rejected; disputed (used although they contradict).
+    #: (6, 5) numbers of readings: contradicting in succession; rejected; disputed, because many before them contradict
+    #: alike; believed of these; and number of motions that were predicted since the sensor last agreed.
     counts: NDArray[np.int64]
     residuals: Array  #: (6, 3) residual of the last reading that contradicted the pose
+
+    def add_prediction(self) -> None:
+        self.counts[:, 4] += 1
+
+
+def open_gates() -> ReadingGates:
+    return ReadingGates(np.zeros((len(SENSORS), 5), np.int64), np.zeros((len(SENSORS), 3)))
 
 
 @kernel
 def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, sensor):
     """Updates a pose (4, 4) and covariance (6, 6) with a reading unless its chi-square is too high; returns if used.
 
-    If many readings in succession contradict the pose alike, its covariance is increased by that of the implied error.
+    If many readings in succession contradict the pose alike, and it was predicted for a while since they agreed, its
+    covariance is increased by that of the implied error.
     """
     counts, last, n = gates.counts[sensor], gates.residuals[sensor], len(residual)
     innovation_cov = geometry.product(geometry.product(jacobian, prior), jacobian.T) + cov
@@ -40,14 +52,16 @@ def fuse_reading(world_from_camera, prior, residual, jacobian, cov, gates, senso
         as_before = _chi2(residual - last[:n], innovation_cov) <= _READING_GATES[n - 1]
         counts[0] = counts[0] + 1 if as_before else 1
         geometry.copy_into(last[:n], residual)
-        if counts[0] <= _PATIENCE[sensor]:
+        is_disputed = counts[0] > _PATIENCE[sensor]
+        counts[2] += is_disputed
+        if not is_disputed or counts[4] < _MANY_PREDICTED:
             counts[1] += 1
             return world_from_camera, prior, False
-        counts[2] += 1
+        counts[3] += 1
         error = jacobian.T @ np.linalg.solve(geometry.product(jacobian, jacobian.T), residual)
         prior = prior + np.outer(error, error)
     else:
-        counts[0] = 0
+        counts[0], counts[4] = 0, 0
     pose, cov = kalman_update(world_from_camera, prior, residual, jacobian, cov)
     return pose, cov, True
 

@@ -16,7 +16,16 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import BeaconDetection, Displacement, Readings, SensorNoise, StereoRig
 from twin.estimate.navigation.dvl import DvlIntegrator, DvlModel, DvlState, fuse_dvl
-from twin.estimate.navigation.kalman import AHRS, BEACONS, PRESSURE, SENSORS, USBL, VERTICAL, ReadingGates, fuse_reading
+from twin.estimate.navigation.kalman import (
+    AHRS,
+    BEACONS,
+    PRESSURE,
+    USBL,
+    VERTICAL,
+    ReadingGates,
+    fuse_reading,
+    open_gates,
+)
 from twin.estimate.vision.two_view_motion import Motion
 from twin.kernels import kernel
 
@@ -123,7 +132,7 @@ class PoseFilter:
         self.since_node, self.since_node_cov, self.cov_at_node = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
         self.rig, self.noise = rig, noise
         self._pressure_ahrs = geometry.inverse(rig.body_from_camera), noise.pressure_m**2, noise.attitude_sigmas_rad
-        self.gates = ReadingGates(np.zeros((len(SENSORS), 3), np.int64), np.zeros((len(SENSORS), 3)))
+        self.gates = open_gates()
         self.dvl = DvlIntegrator(rig, noise)
 
     @property
@@ -139,8 +148,10 @@ class PoseFilter:
     def aiding(self, interval_s: float) -> FrameAiding:
         return FrameAiding(*self._pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.gates)
 
-    def advance(self, motion: Motion, readings: Readings, interval_s: float) -> Array:
-        """Advances by a frame with a visual motion; returns the motion (4, 4) after fusion with the DVL."""
+    def advance(self, motion: Motion, readings: Readings, interval_s: float, is_measured: bool = True) -> Array:
+        """Advances by a frame with a visual motion, measured or predicted; returns it (4, 4) after fusion with the DVL."""
+        if not is_measured:
+            self.gates.add_prediction()
         arrays = readings_as_arrays(readings)
         self.state, moved = dead_reckon(self.state, self.aiding(interval_s), motion.a_from_b, motion.cov, *arrays)
         return moved

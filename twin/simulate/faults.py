@@ -1,0 +1,125 @@
+"""Faults of thrusters, cameras and navigation sensors: when each is active, and what it does to commands and data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.core.records import Image, Readings
+from twin.scenario.model import FaultConfig
+
+_READING_OF = {"pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "dvl": "dvl_mps", "usbl": "usbl_m"}
+_CAMERAS_OF = {"cameras": (0, 1), "left_camera": (0,), "right_camera": (1,)}
+
+
+class FaultEvent(NamedTuple):
+    """Start or end of a fault."""
+
+    time_s: float
+    fault: FaultConfig
+    starts: bool
+
+
+class Faults:
+    """Faults of a survey; a fault of a rate per hour starts at random times, exponentially distributed.
+
+    Calls are in the order of time: first `at`, then the functions that change commands, images and readings.
+
+    Args:
+        duration_s: time up to which faults of a rate start.
+    """
+
+    def __init__(self, faults: Sequence[FaultConfig], duration_s: float, rng: np.random.Generator):
+        self._rng = rng
+        self._spans = [(fault, span) for fault in faults for span in _spans(fault, duration_s, rng)]
+        self._active: list[FaultConfig] = []
+        self._kept: dict[tuple[int, object], Any] = {}  # by fault and kind of data: what a stuck part repeats
+        self.events: list[FaultEvent] = []
+        self.exist = bool(faults)
+
+    def at(self, time_s: float) -> None:
+        """Sets the time of the following calls, and adds `events` for the faults that have started or ended."""
+        active = [fault for fault, (start, end) in self._spans if start - 1e-9 <= time_s < end - 1e-9]
+        for starts, new, old in ((True, active, self._active), (False, self._active, active)):
+            for fault in new:
+                if not any(fault is other for other in old):
+                    self.events.append(FaultEvent(time_s, fault, starts))
+        ended = {id(fault) for fault in self._active} - {id(fault) for fault in active}
+        self._kept = {key: value for key, value in self._kept.items() if key[0] not in ended}
+        self._active = active
+
+    @property
+    def sentences(self) -> list[str]:
+        """Returns a sentence on the faults that have occurred."""
+        began = [f"{event.fault.name} {event.fault.type} at {event.time_s:.1f} s" for event in self.events if event.starts]
+        return [f"Simulated faults: {', '.join(began)}."] if began else []
+
+    def thrusts(self, command: Array) -> tuple[Array, Array]:
+        """Returns the commands (n,) that reach the thrusters, and the factors (n,) on their thrusts."""
+        command, factors = np.array(command, float), np.ones(len(command))
+        for fault in self._of("thruster"):
+            k = (fault.number or 1) - 1
+            if fault.type == "stuck":
+                command[k] = self._kept.setdefault((id(fault), "command"), command[k])
+            elif fault.type == "wrong":
+                factors[k] *= fault.size
+            elif self._is_lost(fault):
+                factors[k] = 0.0
+        return command, factors
+
+    def images(self, *images: Image | None) -> list[Image | None]:
+        """Returns the images (h, w, 3) of the left and the right camera as they are delivered."""
+        delivered = list(images)
+        for fault in self._of(*_CAMERAS_OF):
+            lost = fault.type == "garbage" or fault.type == "stuck" or self._is_lost(fault)
+            for k in _CAMERAS_OF[fault.part]:
+                image = delivered[k]
+                if image is not None and lost:
+                    delivered[k] = self._faulty_image(fault, k, image)
+        return delivered
+
+    def _faulty_image(self, fault: FaultConfig, camera: int, image: Image) -> Image:
+        if fault.type == "stuck":
+            kept: Image = self._kept.setdefault((id(fault), camera), image)
+            return kept
+        if fault.type == "garbage":
+            return self._rng.integers(0, 256, image.shape, np.uint8)
+        return np.zeros_like(image)
+
+    def readings(self, readings: Readings) -> Readings:
+        for fault in self._of(*_READING_OF):
+            name = _READING_OF[fault.part]
+            value = getattr(readings, name)
+            if value is not None:
+                readings = replace(readings, **{name: self._faulty_reading(fault, value)})
+        return readings
+
+    def _faulty_reading(self, fault: FaultConfig, value: Any) -> Any:
+        if fault.type == "stuck":
+            return self._kept.setdefault((id(fault), "reading"), value)
+        if fault.type in ("wrong", "garbage"):
+            size = np.deg2rad(fault.size) if fault.part == "ahrs" else fault.size
+            return value + size * (self._rng.standard_normal(np.shape(value)) if fault.type == "garbage" else 1.0)
+        return None if self._is_lost(fault) else value
+
+    def _is_lost(self, fault: FaultConfig) -> bool:
+        return fault.type == "off" or (fault.type == "intermittent" and self._rng.uniform() < fault.size)
+
+    def _of(self, *parts: str) -> list[FaultConfig]:
+        return [fault for fault in self._active if fault.part in parts]
+
+
+def _spans(fault: FaultConfig, duration_s: float, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
+    """Yields start and end of each occurrence of a fault [s]."""
+    lasting_s = np.inf if fault.duration_s is None else fault.duration_s
+    if fault.per_hour is None:
+        yield fault.start_s or 0.0, (fault.start_s or 0.0) + lasting_s
+        return
+    time_s = float(rng.exponential(3600 / fault.per_hour))
+    while time_s < duration_s:
+        yield time_s, time_s + lasting_s
+        time_s += lasting_s + float(rng.exponential(3600 / fault.per_hour))
