@@ -122,7 +122,7 @@ def control_thrusters(controller, pose, twist, position, velocity, acceleration,
     wrench, error = _wrench(
         pose, twist, position, velocity, acceleration, yaw, controller.hull, controller.gains, controller.integral,
         controller.flow.current,
-    )
+    )  # fmt: skip
     commands, scale = allocate_wrench(controller.allocation, wrench)
     share = controller.period_s / (controller.period_s + controller.lag_s)
     for k in range(3):

@@ -62,7 +62,7 @@ MUTANTS = [
         ("scenes/builder.py", "down = (ny - 1 - np.arange(rows.start, rows.stop)) * (h / (ny - 1))", "down = np.arange(rows.start, rows.stop) * (h / (ny - 1))", "scenes_builder imaging_renderer"),
         # simulate
         ("twin/simulate/hydrodynamics.py", "(hull.buoyancy_n - hull.weight_n) * up[k]", "(hull.weight_n - hull.buoyancy_n) * up[k]", "simulate_hydrodynamics"),
-        ("twin/simulate/hydrodynamics.py", "return force / (hull.inertia + hull.added_inertia)", "return force / hull.inertia", "simulate_hydrodynamics"),
+        ("twin/simulate/hydrodynamics.py", "total[k, k] += hull.inertia[k]", "total[k, k] = hull.inertia[k]", "simulate_hydrodynamics"),
         ("twin/simulate/sensors.py", "height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])", "height = (up[0] * arm[0] - up[2] * arm[2]) + (up[1] * arm[1] + up[3])", "simulate_sensors"),
         ("twin/simulate/sensors.py", "gain = 1 + noise.dvl_scale * float(rng[\"dvl\"].standard_normal())", "gain = 1.0", "simulate_sensors"),
         ("twin/simulate/sensors.py", "self._walk = np.repeat(walks, 3) / math.sqrt(self._rate_hz)", "self._walk = np.repeat(walks, 3) * math.sqrt(self._rate_hz)", "simulate_inertial_sensor"),

@@ -122,7 +122,8 @@ def test_the_current_is_estimated_within_a_few_seconds(bearing_deg):
     rng, bearing = np.random.default_rng(0), np.deg2rad(bearing_deg)
     current = 0.4 * np.array([np.cos(bearing), np.sin(bearing), 0.0])
     rov = MujocoVehicle(bare_model(), VehicleConfig(), steady_current(current), np.eye(4))
-    controller, hold = nominal_controller(VehicleConfig(), 1.2, RATE_HZ), Reference(np.zeros(3), np.zeros(3), 0.0, np.zeros(3))
+    controller = nominal_controller(VehicleConfig(), 1.2, RATE_HZ)
+    hold = Reference(np.zeros(3), np.zeros(3), 0.0, np.zeros(3))
     worst_m = 0.0
     for _ in range(5 * 30):
         twist = rov.twist_body + np.concatenate([np.zeros(3), rng.normal(0, 0.02, 3)])

@@ -255,14 +255,15 @@ def test_metrics_that_were_not_evaluated_have_the_same_keys_and_meet_no_requirem
 IDEAL = load_scenario("reef", ["rig.model=ideal", "imaging.shadows=false"])
 REAL = [
     "rig.model=ideal", "calibration_error.baseline_error=0.01", 'port.kind="flat"', "sensor.motion_blur=true",
-    "snow.density_per_m3=10", "current.velocity_mps=[0.1, 0.0, 0.0]",
+    "snow.density_per_m3=10", "current.gust_mps=0.05", "current.velocity_mps=[0.1, 0.0, 0.0]",
+    "waves.height_m=0.2", "waves.depth_m=10",
 ]  # fmt: skip
 
 
 def test_a_scenario_with_ideal_cameras_names_what_it_idealises():
     assert idealisations(IDEAL) == [
         "The cameras are ideal: no calibration error, no port, no motion blur.",
-        "The water is ideal: no marine snow, no current.",
+        "The water is ideal: no marine snow, no current, no waves.",
         "The light is ideal: no shadows of the lamps.",
     ]
 
@@ -278,7 +279,7 @@ def test_water_whose_given_coefficients_are_zero_is_ideal(key):
     assert idealisations(load_scenario("reef", [*REAL, *values])) == [f"The water is ideal: no {key}."]
 
 
-@pytest.mark.parametrize("override", REAL[1:])
+@pytest.mark.parametrize("override", [*REAL[1:6], "waves.height_m=0.2"])
 def test_each_effect_removes_its_own_phrase(override):
     without = idealisations(load_scenario("reef", [other for other in REAL if other != override]))
     assert len(without) == 1 and without[0].count("no ") == 1
@@ -309,9 +310,9 @@ def test_without_an_orthomosaic_of_images_no_colours_are_restored(override):
 
 
 def test_a_kinematic_vehicle_is_ideal():
-    calm = [override for override in REAL if not override.startswith("current")]
+    calm = [override for override in REAL if not override.startswith(("current", "waves"))]
     found = idealisations(load_scenario("reef", [*calm, 'vehicle.dynamics="kinematic"']))
-    assert found == ["The water is ideal: no current.", "The vehicle is ideal: no forces, no inertia."]
+    assert found == ["The water is ideal: no current, no waves.", "The vehicle is ideal: no forces, no inertia."]
 
 
 def test_an_area_without_the_centre_of_a_cell_is_named():

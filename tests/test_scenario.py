@@ -24,7 +24,7 @@ PLAN_KEYS = (
 )
 TOP_KEYS = (
     "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "
-    "snow, current, waves, navigation, imu, plan, control, estimate, map, beacons, objects, require"
+    "snow, current, waves, navigation, imu, plan, control, estimate, map, beacons, objects, faults, require"
 )
 SENSOR_KEYS = (
     "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "

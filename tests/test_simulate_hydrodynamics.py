@@ -38,7 +38,7 @@ def dense_acceleration(hull, rotation, twist, flow, wrench):
     relative = nu - flow
 
     def coriolis(m, v):
-        s1, s2 = geometry.skew(m[:3, :3] @ v[:3] + m[:3, 3:] @ v[3:]), geometry.skew(m[3:, :3] @ v[:3] + m[3:, 3:] @ v[3:])
+        s1, s2 = (geometry.skew(rows[:, :3] @ v[:3] + rows[:, 3:] @ v[3:]) for rows in (m[:3], m[3:]))
         return np.block([[np.zeros((3, 3)), -s1], [-s1, -s2]])
 
     shift = np.block([[np.eye(3), -geometry.skew(hull.drag_centre_m)], [np.zeros((3, 3)), np.eye(3)]])
@@ -93,7 +93,8 @@ def test_energy_does_not_increase_in_still_water_without_thrust():
 
 
 def test_energy_is_conserved_without_drag():
-    hull = trimmed_hull(VehicleConfig(buoyancy_n=0.0))._replace(linear_drag=np.zeros((6, 6)), quadratic_drag=np.zeros((6, 6)))
+    none = np.zeros((6, 6))
+    hull = trimmed_hull(VehicleConfig(buoyancy_n=0.0))._replace(linear_drag=none, quadratic_drag=none)
     v = vehicle(geometry.pose(geometry.rotation_from_rpy(0.6, -0.3, 0.0), np.zeros(3)))
     v._hull = hull
     start = energy(v, hull)

@@ -11,6 +11,7 @@ from twin.scenario.model import ImuConfig, VehicleConfig
 from twin.scenes.gl import mujoco
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.sea import steady_current
 from twin.simulate.sensors import InertialSensor
 from twin.world.mission import motion_rate_hz, prepare
 
@@ -78,7 +79,7 @@ def test_the_specific_force_and_the_rates_are_those_of_the_sensors_of_mujoco():
     body.add_site(name="imu")
     for name, kind in (("gyro", mujoco.mjtSensor.mjSENS_GYRO), ("force", mujoco.mjtSensor.mjSENS_ACCELEROMETER)):
         spec.add_sensor(name=name, type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
-    rov = MujocoVehicle(spec.compile(), VehicleConfig(), STILL, np.eye(4))
+    rov = MujocoVehicle(spec.compile(), VehicleConfig(), steady_current(STILL), np.eye(4))
     readings = []
 
     def compare(values):

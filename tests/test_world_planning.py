@@ -15,6 +15,7 @@ from twin.errors import ScenarioError, TwinError
 from twin.judge.swaths import image_pairs, overlap_metrics, swath_numbers
 from twin.scenario.file import load_scenario
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
+from twin.simulate.sea import make_sea
 from twin.terrains import Terrain, TextureSource
 from twin.world.floor_forecast import forecast_over_floor, planned_overlap, spread
 from twin.world.mission import prepare
@@ -278,9 +279,9 @@ def test_a_current_beyond_the_thrusters_is_rejected_with_the_greatest_allowed_va
 
 def test_without_a_current_a_level_plan_needs_no_check():
     mission = prepare(scenario())
-    check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, mission.plan)
+    check_thrust(mission.scenario.vehicle, make_sea(mission.scenario), mission.plan)
     hopeless = dataclasses.replace(mission.plan, speed_mps=9.0)
-    check_thrust(mission.scenario.vehicle, mission.scenario.current.velocity_mps, hopeless)  # that is `check_speed`'s
+    check_thrust(mission.scenario.vehicle, make_sea(mission.scenario), hopeless)  # that is `check_speed`'s
     assert survey_request(mission.scenario, mission.terrain).along_scale == 1
 
 

@@ -75,7 +75,7 @@ def _run(
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
                 guard.cause = str(error) or "interrupted"
             for event in world.faults.events:
-                folder.log("fault", time_s=event.time_s, part=event.fault.name, type=event.fault.type, starts=event.starts)
+                folder.log("fault", **event.described)
             warnings = (*world.warnings, *world.faults.sentences)
             flown = FlownSurvey(mission, world.truth(), warnings, monitor.actions.times)
             estimation = Estimation(navigator, stopwatch, guard, folder, monitor.report_stage, monitor.start_s)

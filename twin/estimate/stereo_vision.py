@@ -158,8 +158,9 @@ class StereoVision:
         right = self.calibration.rectify(right, self.full_rig)
         gray = matching.gray(right, self.binning)
         dense_px = disparity.search(self._image, matching.normalise(gray), self.search_range.max_disparity_px)
-        self.search_range.update(dense_px)
         points = stereo.match_stereo_points(self._gray, gray, dense_px, self.rig, self.settings)
+        # black images match at disparity 0, which says nothing about the next pair
+        self.search_range.update(dense_px if len(points.xyz) >= _MIN_POINTS else dense_px[:0])
         return right, gray, dense_px, points
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:

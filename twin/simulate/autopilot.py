@@ -48,7 +48,8 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     """
     hull, rov = trimmed_hull(vehicle), parameters_of(vehicle)
     thrusts_from_force, full_n = _allocation(rov).thrusts_from_wrench[:, 3:], _full_thrust_n(rov)
-    linear, quadratic = hull.linear_drag[3:, 3:] @ direction, hull.quadratic_drag[3:, 3:] @ (np.abs(direction) * direction)
+    linear = hull.linear_drag[3:, 3:] @ direction
+    quadratic = hull.quadratic_drag[3:, 3:] @ (np.abs(direction) * direction)
     coefficients = zip(thrusts_from_force @ quadratic, thrusts_from_force @ linear, strict=True)
     roots = np.concatenate([np.roots([q, p, sign * full_n]) for q, p in coefficients for sign in (-1, 1)])
     real = roots[np.isreal(roots)].real
@@ -71,8 +72,9 @@ def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
 
 
 def _controller_model(hull: Hull) -> HullModel:
-    added, *drag = (np.diagonal(m).copy() for m in (hull.added_inertia, hull.linear_drag, hull.quadratic_drag))
-    return HullModel(hull.inertia + added, added[3:], *drag, hull.drag_centre_m)
+    matrices = hull.added_inertia, hull.linear_drag, hull.quadratic_drag
+    added, linear, quadratic = (np.diagonal(matrix).copy() for matrix in matrices)
+    return HullModel(hull.inertia + added, added[3:], linear, quadratic, hull.drag_centre_m)
 
 
 def _allocation(rov: VehicleParameters) -> ThrustAllocation:

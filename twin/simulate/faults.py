@@ -23,6 +23,10 @@ class FaultEvent(NamedTuple):
     fault: FaultConfig
     starts: bool
 
+    @property
+    def described(self) -> dict[str, Any]:
+        return {"time_s": self.time_s, "part": self.fault.name, "type": self.fault.type, "starts": self.starts}
+
 
 class Faults:
     """Faults of a survey; a fault of a rate per hour starts at random times, exponentially distributed.
@@ -55,7 +59,8 @@ class Faults:
     @property
     def sentences(self) -> list[str]:
         """Returns a sentence on the faults that have occurred."""
-        began = [f"{event.fault.name} {event.fault.type} at {event.time_s:.1f} s" for event in self.events if event.starts]
+        starts = (event for event in self.events if event.starts)
+        began = [f"{fault.name} {fault.type} at {time_s:.1f} s" for time_s, fault, _ in starts]
         return [f"Simulated faults: {', '.join(began)}."] if began else []
 
     def thrusts(self, command: Array) -> tuple[Array, Array]:

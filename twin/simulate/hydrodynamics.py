@@ -124,7 +124,7 @@ def _solve_in_place(a: Array, b: Array) -> None:
 
 @kernel
 def _add_accelerating_flow(force: Array, hull: Hull, world_from_body: Array, twist: Array, flow: Array) -> None:
-    """Adds M_A R'a_v + m_w R'a_w, with the moment of the latter; a = dv_c/dt + (v . grad) v_c, v that of body, water."""
+    """Adds M_A R'a_v + m_w R'a_w, with its moment; a = dv_c/dt + (v . grad) v_c, v that of body or water."""
     along, water = np.zeros(3), np.zeros(3)
     for i in range(3):
         along[i], water[i] = flow[1, i], flow[1, i]

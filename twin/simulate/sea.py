@@ -117,7 +117,7 @@ def _add_mean(sea, time_s, height_m, flow):
 @kernel
 def _place(nodes, value):
     """Returns the node (index) before a value, its share of the interval, and the interval; 0 beyond the nodes."""
-    if value <= nodes[0]:
+    if not value > nodes[0]:  # also NaN, of a diverged pose
         return 0, 0.0, 0.0
     if value >= nodes[-1]:
         return len(nodes) - 1, 0.0, 0.0

@@ -87,7 +87,7 @@ def jonswap(waves: WavesConfig, omega: Array) -> Array:
 def significant_height_m(waves: WavesConfig) -> float:
     """Returns four standard deviations of the surface elevation; with wind U and fetch F, 0.0016 U sqrt(F / g).
 
-    This is the fit of Hasselmann et al. (1973) to measured variances; their fit of alpha gives waves 1.27 times as high.
+    This is the fit of Hasselmann et al. (1973) to measured variances; their fit of alpha gives 1.27 times this height.
     """
     if waves.wind_mps is None or waves.fetch_m is None:
         return waves.height_m

@@ -120,7 +120,8 @@ def _of_faults(scenario: Scenario) -> Iterator[TwinError]:
     for k, fault in enumerate(scenario.faults):
         key = f"faults.{k}"
         if fault.type not in FAULTS[fault.part]:
-            yield TwinError(f"{key}.type", f"{fault.type}: not simulated for {fault.part}", ", ".join(FAULTS[fault.part]))
+            problem = f"{fault.type}: not simulated for {fault.part}"
+            yield TwinError(f"{key}.type", problem, ", ".join(FAULTS[fault.part]))
         if fault.part == "thruster":
             if kinematic:
                 yield TwinError(f"{key}.part", "a kinematic vehicle has no thrusters", 'vehicle.dynamics = "rigid"')

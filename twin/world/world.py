@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     AnyVehicle = MujocoVehicle | CompiledVehicle | KinematicVehicle
 
 #: Random streams in the order of their seeds; a new one at the end leaves the numbers of the others unchanged.
-_STREAMS = ("left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu", "sea", "faults")
+_STREAMS = (
+    "left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu", "sea", "faults",
+)  # fmt: skip
 
 #: Simulates frames from index k, at most up to the next keyframe; returns the index of the first one not simulated.
 FastForward = Callable[[FrameSequence, int], int]

@@ -149,7 +149,7 @@ class PoseFilter:
         return FrameAiding(*self._pressure_ahrs, self.dvl.model(interval_s), self.dvl.state, self.gates)
 
     def advance(self, motion: Motion, readings: Readings, interval_s: float, is_measured: bool = True) -> Array:
-        """Advances by a frame with a visual motion, measured or predicted; returns it (4, 4) after fusion with the DVL."""
+        """Advances by a frame with a visual motion, measured or not; returns it (4, 4) after fusion with the DVL."""
         if not is_measured:
             self.gates.add_prediction()
         arrays = readings_as_arrays(readings)

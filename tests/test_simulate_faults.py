@@ -1,0 +1,135 @@
+"""Faults: when they are active, what they do to commands, images and readings, and what the survey makes of them."""
+
+import json
+
+import numpy as np
+import pytest
+
+from twin.core.records import Readings
+from twin.errors import ScenarioError
+from twin.scenario.file import load_scenario
+from twin.scenario.model import FaultConfig
+from twin.simulate.faults import Faults
+from twin.survey import run
+from twin.world.mission import prepare
+
+IMAGE = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+AIDED = 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
+
+
+def faults_of(*given, duration_s=100.0, seed=0):
+    return Faults([FaultConfig(**one) for one in given], duration_s, np.random.default_rng(seed))
+
+
+def test_a_fault_lasts_from_its_start_for_its_duration():
+    faults = faults_of({"part": "pressure", "start_s": 2.0, "duration_s": 3.0})
+    lost = []
+    for t in range(8):
+        faults.at(float(t))
+        lost.append(faults.readings(Readings(pressure_z_m=1.0)).pressure_z_m is None)
+    assert lost == [False, False, True, True, True, False, False, False]
+    assert [(event.time_s, event.starts) for event in faults.events] == [(2.0, True), (5.0, False)]
+    assert faults.sentences == ["Simulated faults: pressure off at 2.0 s."]
+
+
+def test_faults_of_a_rate_are_a_poisson_process_of_that_rate():
+    """Their number in an hour has the mean, here 60 / h with short faults, and about the variance of its law."""
+    counts = []
+    for seed in range(200):
+        faults = faults_of({"part": "dvl", "per_hour": 60, "duration_s": 0.01}, duration_s=3600.0, seed=seed)
+        counts.append(len(faults._spans))
+    assert np.mean(counts) == pytest.approx(60, abs=4 * np.sqrt(60 / 200))
+    assert np.var(counts) == pytest.approx(60, rel=0.4)
+
+
+@pytest.mark.parametrize(("type_", "command", "factor"), [
+    ("off", 0.2, 0.0), ("stuck", 0.1, 1.0), ("wrong", 0.2, 0.3), ("intermittent", 0.2, 0.0),
+])  # fmt: skip
+def test_a_thruster_fails_alone(type_, command, factor):
+    size = 1.0 if type_ == "intermittent" else 0.3
+    faults = faults_of({"part": "thruster", "number": 2, "type": type_, "start_s": 1.0, "size": size})
+    faults.at(1.0)
+    faults.thrusts(np.full(4, 0.1))
+    faults.at(2.0)
+    commands, factors = faults.thrusts(np.full(4, 0.2))
+    assert commands.tolist() == [0.2, command, 0.2, 0.2] and factors.tolist() == [1.0, factor, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("type_", ["off", "stuck", "garbage", "intermittent"])
+@pytest.mark.parametrize(("part", "failing"), [("cameras", (0, 1)), ("left_camera", (0,)), ("right_camera", (1,))])
+def test_the_images_of_a_camera_fail(type_, part, failing):
+    faults = faults_of({"part": part, "type": type_, "start_s": 0.0, "size": 1.0})
+    faults.at(0.0)
+    faults.images(IMAGE, IMAGE)
+    faults.at(1.0)
+    images = faults.images(IMAGE + 9, IMAGE + 9)
+    for k in (0, 1):
+        if k not in failing:
+            np.testing.assert_array_equal(images[k], IMAGE + 9)
+        elif type_ == "stuck":
+            np.testing.assert_array_equal(images[k], IMAGE)
+        elif type_ != "garbage":
+            assert not images[k].any()
+        assert images[k].shape == IMAGE.shape and images[k].dtype == np.uint8
+    assert faults.images(IMAGE, None)[1] is None
+
+
+def test_readings_fail_by_their_kind():
+    truth = Readings(1.0, np.array([0.0, 0.0, 1.0]), np.array([0.3, 0.0, 0.0]), np.array([1.0, 2.0, 3.0]))
+    faults = faults_of(
+        {"part": "pressure", "type": "wrong", "start_s": 0, "size": 0.5},
+        {"part": "ahrs", "type": "wrong", "start_s": 0, "size": 10.0},
+        {"part": "dvl", "type": "stuck", "start_s": 0},
+        {"part": "usbl", "type": "garbage", "start_s": 0, "size": 2.0},
+    )  # fmt: skip
+    faults.at(0.0)
+    first = faults.readings(truth)
+    faults.at(1.0)
+    second = faults.readings(Readings(2.0, truth.ahrs_rpy_rad, np.ones(3), truth.usbl_m))
+    assert (first.pressure_z_m, second.pressure_z_m) == (1.5, 2.5)
+    np.testing.assert_allclose(first.ahrs_rpy_rad - truth.ahrs_rpy_rad, np.deg2rad(10))
+    np.testing.assert_array_equal(second.dvl_mps, truth.dvl_mps)
+    assert 0.1 < np.abs(second.usbl_m - truth.usbl_m).max() < 10
+
+
+@pytest.mark.parametrize(("fault", "problem"), [
+    ('{part="thruster"}', "faults.0.number: missing (allowed: 1 to 8)"),
+    ('{part="thruster",number=9,start_s=1}', "faults.0.number: 9 (allowed: 1 to 8)"),
+    ('{part="dvl",start_s=1}', "faults.0.part: dvl is not used (allowed: a sensor in navigation.aiding)"),
+    ('{part="pressure"}', "faults.0.start_s: missing (allowed: either start_s or per_hour)"),
+    ('{part="pressure",start_s=1,per_hour=1}', "faults.0.start_s: given together with per_hour"),
+    ('{part="pressure",type="intermittent",start_s=1,size=2}', "faults.0.size: 2: not a share of the frames"),
+    ('{part="thruster",number=1,type="garbage",start_s=1}', "faults.0.type: garbage: not simulated for thruster"),
+    ('{part="cameras",start_s=1}', "faults.0.part: cameras: the surrogate has no images"),
+    ('{part="pump",start_s=1}', "faults.0.part"),
+])  # fmt: skip
+def test_a_fault_that_cannot_be_is_refused_before_the_flight(fault, problem):
+    with pytest.raises(ScenarioError) as raised:
+        prepare(load_scenario("reef", ["imaging.fidelity=surrogate", f"faults=[{fault}]"]))
+    assert any(problem in line for line in raised.value.lines), raised.value.lines
+
+
+def flown(tmp_path, *overrides):
+    short = ["imaging.fidelity=surrogate", "plan.area_m=[2.0,0.6]", "plan.tracks=1", "seed=1", *overrides]
+    return run(load_scenario("reef", short), tmp_path / "run", outputs=None).metrics
+
+
+@pytest.mark.parametrize(("part", "type_", "size"), [
+    ("pressure", "wrong", 0.3), ("ahrs", "garbage", 10.0), ("dvl", "wrong", 0.3), ("usbl", "wrong", 3.0),
+    ("usbl", "garbage", 3.0), ("dvl", "off", 1.0), ("pressure", "stuck", 1.0),
+])  # fmt: skip
+def test_a_sensor_that_fails_leaves_the_path_right(tmp_path, part, type_, size):
+    fault = f'faults=[{{part="{part}",type="{type_}",start_s=3,size={size}}}]'
+    metrics = flown(tmp_path, AIDED, fault)
+    assert metrics["trajectory"]["final"]["ate_max_m"] < 0.01
+    assert metrics["trajectory"]["online"]["ate_max_m"] < 0.02
+    warnings = [*metrics["warnings"], metrics["reason"]]
+    assert any(part in text for text in warnings if "Simulated" not in text), warnings
+
+
+@pytest.mark.parametrize("number", [1, 5])
+def test_a_survey_without_a_thruster_is_flown_to_its_end(tmp_path, number):
+    metrics = flown(tmp_path, f'faults=[{{part="thruster",number={number},start_s=3}}]')
+    assert metrics["status"] == "complete" and metrics["control"]["cross_track_rmse_m"] < 0.1
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [one["part"] for one in log if one["event"] == "fault"] == [f"thruster {number}"]
