@@ -9,8 +9,8 @@ import recorded_datasets as recorded
 
 from twin import survey
 from twin.core.quality import EstimationQuality
-from twin.core.records import Frame, Readings, SensorNoise
-from twin.estimate.vision.repeated_images import LEFT_REPEATS, RIGHT_REPEATS, RepeatedImages
+from twin.core.records import LEFT_REPEATS, RIGHT_REPEATS, Frame, Readings, SensorNoise
+from twin.estimate.vision.repeated_images import RepeatedImages
 from twin.recordings.replay import ReplayOptions, replay
 from twin.scenario.file import load_scenario
 from twin.world.rendered_world import RenderedWorld

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from twin.api import compare, export, load_run, load_scenario, look, plan, replay, run, study, tune
+from twin.api import compare, export, load_run, load_scenario, look, plan, replay, run, study, tune, vehicle
 
 if TYPE_CHECKING:
     from twin.session.stepped_world import SteppedWorld as World
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "World", "__version__", "compare", "export", "load_run", "load_scenario", "look", "plan", "replay", "run", "study",
-    "tune",
+    "tune", "vehicle",
 ]  # fmt: skip
 
 

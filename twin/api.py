@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from twin.app.look import ViewLayers
     from twin.core.geometry import Array
     from twin.planning.summary import PlanSummary
+    from twin.planning.vehicle_limits import VehicleLimits
     from twin.recordings.replay import ReplayOptions, ReplayResult
     from twin.report.run_result import RunResult
     from twin.scenario.model import Scenario
@@ -91,6 +92,34 @@ def plan(
         with writing(file):
             drawing.draw(plan, file)
     return plan
+
+
+def vehicle(
+    scene: str | Path | Scenario, picture: str | Path | None = None, overrides: Overrides = (), **sections: Any
+) -> VehicleLimits:
+    """Returns the limits of the vehicle of a scenario, and the energy of its survey, without a simulation.
+
+    Args:
+        picture: PNG file to draw speed, power and the greatest current into.
+        overrides, sections: values of keys, as in `load_scenario`.
+
+    Raises:
+        ScenarioError: the survey cannot be planned as described.
+        TwinError: the vehicle is kinematic, or the picture cannot be written.
+    """
+    from twin.app.outputs import output_file, writing
+    from twin.planning import vehicle_drawing, vehicle_limits
+    from twin.world.mission import prepare
+
+    scenario = _scenario(scene, overrides, sections)
+    if scenario.vehicle.dynamics == "kinematic":
+        raise TwinError("vehicle.dynamics", "a kinematic vehicle has no forces", '"rigid"')
+    file = None if picture is None else output_file(Path(picture))
+    limits = vehicle_limits.vehicle_limits(prepare(scenario))
+    if file is not None:
+        with writing(file):
+            vehicle_drawing.draw(scenario.vehicle, limits, file)
+    return limits
 
 
 def look(

@@ -138,6 +138,27 @@ def plan(
 
 
 @app.command()
+def vehicle(
+    scene: Scene,
+    overrides: Overrides = [],  # noqa: B006 (typer copies it)
+    out: Annotated[Path | None, option("PNG to write. Default: runs/NAME-vehicle.png.")] = None,
+    as_json: Annotated[bool, option("Print only the limits, as JSON.", flag="--json")] = False,
+    allow_plugins: AllowPlugins = False,
+) -> None:
+    """Print trim, speeds, stopping distance, endurance and limits of a vehicle, and draw them, without simulation."""
+    from twin.planning import vehicle_limits
+
+    scenario = api.load_scenario(scene, overrides, allow_plugins)
+    file = out or Path(f"runs/{outputs.file_stem(scenario.name)}-vehicle.png")
+    limits = api.vehicle(scenario, file)
+    if as_json:
+        print(json.dumps(vehicle_limits.as_json(limits, str(file)), indent=1))
+    else:
+        console.print_table(f"Vehicle of {scenario.name}: {limits.title}", vehicle_limits.rows(limits))
+        print(f"Picture: {file}")
+
+
+@app.command()
 def look(
     scene: Scene,
     overrides: Overrides = [],  # noqa: B006 (typer copies it)

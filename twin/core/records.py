@@ -199,6 +199,15 @@ class Frame:
     exposure: Exposure | None = None
 
 
+#: Statuses of a frame at which a camera is frozen; with the left camera alone, the motion is still measured.
+LEFT_REPEATS, RIGHT_REPEATS = "the left camera repeats its image", "the right camera repeats its image"
+REPEATS = LEFT_REPEATS, RIGHT_REPEATS
+
+
+def is_measured(status: str) -> bool:
+    return status in ("ok", RIGHT_REPEATS)
+
+
 class Estimate(NamedTuple):
     """Online estimate at one frame."""
 
@@ -208,6 +217,11 @@ class Estimate(NamedTuple):
     camera_velocity: Array  #: (6,) twist of the left camera [rad/s, m/s] in camera axes
     sigma_m: float  #: standard deviation of the online position: root of the sum of the variances of x, y and z [m]
     status: str  #: "ok", or the reason why vision failed at this frame
+
+    @property
+    def is_measured(self) -> bool:
+        """Returns whether vision measured the motion to this frame."""
+        return is_measured(self.status)
 
 
 @dataclass

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from twin.core.links import Link
 from twin.core.ortho_tiles import OrthoTile
 from twin.core.quality import EstimationQuality
 from twin.core.records import (
+    REPEATS,
     ElevationMap,
     Estimate,
     Frame,
@@ -31,6 +32,7 @@ from twin.core.records import (
     StereoRig,
     SurveyResult,
     Trajectory,
+    is_measured,
 )
 from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
@@ -39,14 +41,14 @@ from twin.estimate.calibration_errors import length_scales
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
-from twin.estimate.navigation.pose_filter import PoseFilter, clip_covariance
+from twin.estimate.navigation.pose_filter import DeadReckoningState, PoseFilter, clip_covariance
 from twin.estimate.navigation.reading_watch import ReadingWatch
 from twin.estimate.network import KeyframeNetwork, LinkAttempt
 from twin.estimate.stereo_vision import StereoVision
 from twin.estimate.trajectory import PoseLog, interpolate_between_keyframes
 from twin.estimate.vision.mosaic import viewing_plane
-from twin.estimate.vision.repeated_images import REPEATS, RIGHT_REPEATS
 from twin.estimate.vision.stereo import Keyframe
+from twin.estimate.vision.two_view_motion import Motion
 from twin.estimate.vision_interface import Vision
 
 #: Reference position where none is given: the camera at the origin, its optical axis along -z of the world.
@@ -54,6 +56,14 @@ _DEFAULT_START = geometry.pose(geometry.BODY_FROM_DOWN_CAMERA, np.zeros(3))
 _F2M_SIGMA = np.array([5e-4] * 3 + [1e-3] * 3)  # standard deviation due to resampling in the mosaic [rad, m]
 _TILE_MARGIN = 12  # cells around a tile that are built with it, as a cell depends on its neighbours
 _SAME_INTERVAL = 1e-6  # relative difference up to which intervals count as equal, because timestamps are rounded
+
+
+class _Blindness(NamedTuple):
+    """Frames in succession whose motion was predicted, not measured."""
+
+    state: DeadReckoningState  #: before them
+    rows: range  #: their rows in the log
+    motion: Array  #: (4, 4) product of the predicted visual motions
 
 
 class Navigator:
@@ -90,6 +100,7 @@ class Navigator:
         self._resources.callback(self.network.close)
         self.log = PoseLog()
         self._watch = ReadingWatch()
+        self._blind: _Blindness | None = None
 
     def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
         if folder is None:
@@ -134,23 +145,59 @@ class Navigator:
         interval_s = self.interval_s(frame.time_s)
         frame = replace(frame, readings=self._watch.fresh(frame.readings, frame.time_s))
         motion, status = self.vision.track_frame(frame)
-        is_measured = status in ("ok", RIGHT_REPEATS)
-        self.log.n_lost += not is_measured
+        measured = is_measured(status)
+        self.log.n_lost += not measured
         last, rejected = self.filter.world_from_camera, self.filter.rejected
-        moved = self.filter.advance(motion, frame.readings, interval_s, is_measured)
+        blind = self._blindness(motion, measured)
+        if measured and blind is not None:
+            motion, frame, interval_s = self._after_blindness(blind, motion, frame)
+        moved = self.filter.advance(motion, frame.readings, interval_s, measured)
         self.filter.fuse_vertical(frame.readings)
         frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
-        step = motion.a_from_b if is_measured else geometry.inverse(last) @ self.filter.world_from_camera
+        step = motion.a_from_b if measured else geometry.inverse(last) @ self.filter.world_from_camera
+        self._blind, n_keyframes = None if measured else blind, len(self.network.keyframes)
         if status in REPEATS:
             self.log.repeats.setdefault(status, []).append(len(self.log))
             self.filter.fuse_position_fixes(frame.readings)
         elif self.is_keyframe(frame, status):
             status = self._add_keyframe(frame, track, status)
         online, f2f = self.filter.world_from_camera.copy(), self.filter.f2f
-        self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
+        if measured and blind is not None:
+            self.log.append_after(blind.rows.start, frame.time_s, f2f, online, motion.a_from_b)
+        else:
+            self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
+        if not measured and len(self.network.keyframes) > n_keyframes:
+            self._blind = None  # tracking continues from the new keyframe
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
+
+    def _blindness(self, motion: Motion, measured: bool) -> _Blindness | None:
+        """Returns the blind frames up to this one, before the pose advances; None if there are none."""
+        row, blind = len(self.log), self._blind
+        if blind is not None and blind.rows.stop != row:
+            blind = None  # frames between were simulated by others
+        if measured:
+            return blind
+        if blind is None:
+            blind = _Blindness(self.filter.state, range(row, row), np.eye(4))
+        return _Blindness(blind.state, range(blind.rows.start, row + 1), blind.motion @ motion.a_from_b)
+
+    def _after_blindness(self, blind: _Blindness, motion: Motion, frame: Frame) -> tuple[Motion, Frame, float]:
+        """Returns to the state before the blind frames, as tracking measures the whole motion since then.
+
+        Returns this motion, the frame without the velocity of the DVL, which is that of the last interval, and the
+        interval [s]. What the sensors corrected meanwhile refers to predicted motions; with the measured one, it would
+        count twice.
+        """
+        self.filter.state = blind.state
+        start_s = float(self.log.times_s.array[max(blind.rows.start - 1, 0)])
+        readings = replace(frame.readings, dvl_mps=None)
+        return (
+            motion._replace(a_from_b=blind.motion @ motion.a_from_b),
+            replace(frame, readings=readings),
+            frame.time_s - start_s,
+        )
 
     def interval_s(self, time_s: float) -> float:
         """Returns the time since the last frame [s], nominal at first or within rounding; ValueError if <= 0."""
@@ -219,6 +266,8 @@ class Navigator:
     def _follow_chain(self, node: Keyframe, chain: Link) -> None:
         """Replaces the F2F motion since the last node by the more accurate link; corrections since then are kept."""
         last = self.network.nodes[-1]
+        if self._blind is not None:  # corrections since then refer to predicted motions
+            self.filter.state = self._blind.state._replace(f2f=self.filter.f2f)
         correction = geometry.inverse(last.world_from_camera @ self.filter.since_node) @ self.filter.world_from_camera
         cov = geometry.transport_covariance(self.filter.cov_at_node, chain.i_from_j) + chain.cov
         self.filter.reset(last.world_from_camera @ chain.i_from_j @ correction, cov)

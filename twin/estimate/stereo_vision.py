@@ -13,6 +13,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import EpipolarError
 from twin.core.records import (
+    LEFT_REPEATS,
     ElevationMap,
     Frame,
     Image,
@@ -34,7 +35,7 @@ from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration, viewing_plane
 from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
-from twin.estimate.vision.repeated_images import LEFT_REPEATS, RepeatedImages
+from twin.estimate.vision.repeated_images import RepeatedImages
 from twin.estimate.vision.stereo import Keyframe, StereoPoints
 from twin.estimate.vision.two_view_motion import Motion
 

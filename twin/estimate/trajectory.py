@@ -36,6 +36,22 @@ class PoseLog:
     def __len__(self) -> int:
         return len(self.times_s)
 
+    def append_after(self, first: int, time_s: float, f2f: Array, online: Array, motion: Array) -> None:
+        """Appends a frame whose motion (4, 4) was measured since the one before row `first`; closes the steps since.
+
+        The steps in between were predicted. The last one is taken to be like them.
+        """
+        self.append(time_s, f2f, online, self.steps.array[-1].copy(), self.variances.array[-1].copy())
+        motions = _motions(self.steps.array[first:])
+        _close(motion, motions, np.maximum(self.variances.array[first:], _LEAST_VARIANCE))
+        self.steps.array[first:] = np.array([geometry.log(one) for one in motions]).reshape(-1, 6)
+
+    def close_steps(self, first: int, motion: Array) -> None:
+        """Corrects the steps of the rows from `first` on so that their product is a motion (4, 4) measured later."""
+        motions = _motions(self.steps.array[first:])
+        _close(motion, motions, np.maximum(self.variances.array[first:], _LEAST_VARIANCE))
+        self.steps.array[first:] = [geometry.log(one) for one in motions]
+
     def append(self, times_s: float | Array, f2f: Array, online: Array, steps: Array, variances: Array) -> None:
         self.times_s.append(times_s)
         self.f2f.append(f2f)

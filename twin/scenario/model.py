@@ -266,6 +266,12 @@ class VehicleConfig(Section):
     thruster_lag: tuple[tuple[Number, ...], tuple[Number, ...]] = ((6136.0, 108700.0), (1.0, 89.0, 9258.0, 108700.0))
     """transfer function from steady to actual thrust: coefficients of numerator and denominator, that of the highest
     power of s first"""
+    power_coefficient: float = Field(default=0.96, gt=0, le=100)
+    """electrical power of a thruster / its thrust to the power 1.5 [W/N^1.5]; 0.96: T200 at 14 V"""
+    hotel_w: float = Field(default=40.0, ge=0, le=1e5)
+    """power of computer, cameras, sensors and lamps [W]"""
+    battery_wh: float = Field(default=266.0, gt=0, le=1e6)
+    """energy of the battery that can be used [W h]"""
     size_m: tuple[Metres, Metres, Metres] = (0.457, 0.575, 0.254)
     """length, width and height of the box that stands for the hull in contacts [m]"""
     hull_centre_m: Vector3 = (0.0, 0.0, -0.03)

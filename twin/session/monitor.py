@@ -7,9 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from twin.core.records import Estimate, Frame
+from twin.core.records import REPEATS, Estimate, Frame
 from twin.errors import SurveyAborted
-from twin.estimate.vision.repeated_images import REPEATS
 from twin.report.run_writer import RunFolder
 from twin.session.mission_actions import MissionActions
 from twin.world.mission import Mission

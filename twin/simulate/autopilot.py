@@ -31,13 +31,17 @@ def nominal_controller(
 
     `velocity_lag_s` is the time by which the velocity that it is given lags behind the true one.
     """
-    rov = parameters_of(vehicle)
-    numerator, denominator = rov.thruster_lag
-    lead_s = numerator[-2] / numerator[-1] if len(numerator) > 1 else 0.0
-    lag_s = velocity_lag_s + denominator[-2] / denominator[-1] - lead_s
+    rov, lag_s = parameters_of(vehicle), velocity_lag_s + thruster_lag_s(vehicle)
     model = _controller_model(trimmed_hull(vehicle.model_copy(update={"drag_factor": 1.0, "added_mass_factor": 1.0})))
     gains = pole_placement_gains(natural_frequency_radps)
     return ControllerState(model, _allocation(rov), gains, 1 / frame_rate_hz, lag_s, np.zeros(6), unknown_current())
+
+
+def thruster_lag_s(vehicle: VehicleConfig) -> float:
+    """Returns the mean time by which the thrust lags behind its steady value."""
+    numerator, denominator = parameters_of(vehicle).thruster_lag
+    lead_s = numerator[-2] / numerator[-1] if len(numerator) > 1 else 0.0
+    return float(denominator[-2] / denominator[-1] - lead_s)
 
 
 def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
@@ -59,16 +63,31 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
 def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
     """Returns the largest absolute thrust (n,) of a thruster / full thrust, at steady velocities (n, 3).
 
-    Velocities [m/s] are through the water, in the body, which is level. The thrusters balance drag, the Munk moment in
-    yaw, and the net buoyancy; the righting moment balances roll and pitch.
+    Velocities [m/s] are through the water, in the body, which is level, see `steady_thrusts_n`.
+    """
+    thrusts = steady_thrusts_n(vehicle, velocities)
+    return np.abs(thrusts).max(axis=1, initial=0.0) / _full_thrust_n(parameters_of(vehicle))
+
+
+def full_force_n(vehicle: VehicleConfig, direction: Array) -> float:
+    """Returns the force along a direction (3,) in the body at which the first thruster saturates [N]."""
+    rov = parameters_of(vehicle)
+    per_newton = _allocation(rov).thrusts_from_wrench[:, 3:] @ direction
+    return _full_thrust_n(rov) / float(np.abs(per_newton).max())
+
+
+def steady_thrusts_n(vehicle: VehicleConfig, velocities: Array) -> Array:
+    """Returns the thrusts (n, k) [N] of a level vehicle at steady velocities (n, 3) through the water, in the body.
+
+    The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the righting moment balances roll and
+    pitch.
     """
     hull, rov = trimmed_hull(vehicle), parameters_of(vehicle)
     model = _controller_model(hull)
     wrenches = np.array([feedforward_wrench(model, np.asarray(v, np.float64)) for v in velocities]).reshape(-1, 6)
     wrenches[:, :2] = 0.0
     wrenches[:, 5] += hull.weight_n - hull.buoyancy_n
-    thrusts = wrenches @ _allocation(rov).thrusts_from_wrench.T
-    return np.abs(thrusts).max(axis=1, initial=0.0) / _full_thrust_n(rov)
+    return np.asarray(wrenches @ _allocation(rov).thrusts_from_wrench.T, np.float64)
 
 
 def _controller_model(hull: Hull) -> HullModel:

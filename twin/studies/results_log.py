@@ -118,5 +118,20 @@ def _column_type(kinds: set[type]) -> pa.DataType:
 
 def _column(values: list[Any], kind: pa.DataType) -> pa.Array:
     if kind == pa.string():
-        values = [value if value is None or isinstance(value, str) else json.dumps(value) for value in values]
+        values = [value if value is None or isinstance(value, str) else _text(value) for value in values]
     return pa.array(values, kind)
+
+
+def _text(value: Any) -> str:
+    """Returns JSON or, for tables such as `[[faults]]`, their values as words, which tell them apart."""
+    if isinstance(value, list) and value and all(isinstance(one, dict) for one in value):
+        return "; ".join(" ".join(_word(key, item) for key, item in one.items()) for one in value)
+    return json.dumps(value)
+
+
+def _word(key: str, value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    name, _, unit = key.rpartition("_")
+    number = f"{value:g}" if isinstance(value, int | float) else json.dumps(value)
+    return f"{name} {number} {unit}" if name else f"{key} {number}"

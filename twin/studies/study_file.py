@@ -109,7 +109,7 @@ class Study(Section):
     """metrics, never negative, whose values in rendered and surrogate surveys are compared; needs
     vary.imaging.fidelity = { grid = ["rendered", "surrogate"] }"""
     sea_trial: bool | None = None
-    """also in the conditions of scenes/conditions/sea_trial.toml (calibration errors, current, marine snow)
+    """also in the conditions of scenes/conditions/sea_trial.toml (calibration errors, current, gusts, marine snow)
     that neither the study nor its scenario sets; default: in the rendered surveys of `twin tune` only"""
     set: dict[str, Any] = {}
     """keys of the scenario that have a fixed value in this study"""

@@ -40,7 +40,7 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     this motion. The attitude is kept, and with a reading of the pressure sensor height and vertical velocity. Unchanged
     if the motion was measured or a DVL reading is available.
     """
-    if estimate.status == "ok" or readings.dvl_mps is not None:
+    if estimate.is_measured or readings.dvl_mps is not None:
         return estimate
     pose, twist = estimate.world_from_camera.copy(), estimate.camera_velocity.copy()
     velocity = pose[:3, :3] @ twist[3:]
@@ -103,7 +103,7 @@ class RovPilot:
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
         return steer(
             self.state, estimate.world_from_camera, estimate.camera_velocity, reference.position, reference.velocity,
-            reference.acceleration, float(reference.yaw), estimate.status == "ok",
+            reference.acceleration, float(reference.yaw), estimate.is_measured,
         )  # fmt: skip
 
 

@@ -3,10 +3,8 @@ from __future__ import annotations
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.records import Frame, Image, Readings, SensorNoise
+from twin.core.records import LEFT_REPEATS, RIGHT_REPEATS, Frame, Image, Readings, SensorNoise
 
-LEFT_REPEATS, RIGHT_REPEATS = "the left camera repeats its image", "the right camera repeats its image"
-REPEATS = LEFT_REPEATS, RIGHT_REPEATS  # statuses of a frame
 _EVERY = 4  # every fourth row is compared
 _MOST_CHANGED = 1e-3  # largest fraction of changed values in a repeated image; noise of 0.01 grey levels changes more
 #: Largest deceleration with which a vehicle can come to rest between two frames [rad/s2, m/s2].

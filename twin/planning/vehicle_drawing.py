@@ -1,0 +1,43 @@
+"""Drawing of a vehicle's limits: speed by thrust, power and endurance by speed, and the current that it holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from twin.planning.vehicle_limits import VehicleLimits, electrical_power_w
+from twin.report.style import FIGURE_STYLE
+from twin.scenario.model import VehicleConfig
+from twin.simulate.autopilot import thrust_loads, top_speed_mps
+
+_AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
+
+
+def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
+    """Writes a PNG file and returns its path."""
+    with matplotlib.rc_context(FIGURE_STYLE):
+        figure = Figure(figsize=(14, 4.5))
+        speed, power = (figure.add_subplot(1, 3, k) for k in (1, 2))
+        current = figure.add_subplot(1, 3, 3, projection="polar")
+        for name, axis in _AXES.items():
+            speeds = np.linspace(0, limits.speeds_mps[name], 60)
+            velocities = speeds[:, None] * np.array(axis)
+            speed.plot(100 * thrust_loads(vehicle, velocities), speeds, label=name)
+            power.plot(speeds, electrical_power_w(vehicle, velocities), label=name)
+        speed.axhline(limits.speed_mps, ls=":", color="0.4", label="planned speed")
+        power.axvline(limits.speed_mps, ls=":", color="0.4")
+        speed.set(xlabel="thrust of the busiest thruster [%]", ylabel="speed [m/s]", title=f"Speed of {limits.title}")
+        power.set(xlabel="speed [m/s]", ylabel="electrical power [W]", title="Power", ylim=(0, None))
+        bearings = np.linspace(0, 2 * np.pi, 181)
+        directions = np.column_stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)])
+        current.plot(bearings, [top_speed_mps(vehicle, direction) for direction in directions])
+        current.set_theta_zero_location("N")  # type: ignore[attr-defined]
+        current.set_title("Current that it holds, by bearing from the bow [m/s]")
+        speed.legend()
+        file.parent.mkdir(parents=True, exist_ok=True)
+        FigureCanvasAgg(figure).print_png(str(file))
+    return file

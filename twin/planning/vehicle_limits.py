@@ -1,0 +1,136 @@
+"""Limits of a vehicle and what a survey asks of it: trim, speeds, forces, stopping distance, energy and dives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from twin.core.geometry import Array
+from twin.judge.summary_statistics import finite_tree
+from twin.report.number_formats import length, percent
+from twin.scenario.model import VehicleConfig
+from twin.simulate.autopilot import full_force_n, steady_thrusts_n, thrust_loads, thruster_lag_s, top_speed_mps
+from twin.simulate.hull import trimmed_hull
+from twin.simulate.sea import make_sea, mean_current_mps
+from twin.world.mission import Mission
+
+_AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
+_BEARINGS = np.linspace(0.0, 2 * np.pi, 72, endpoint=False)
+_RESERVE = 0.2  # share of the battery that stays unused
+
+
+@dataclass(frozen=True)
+class VehicleLimits:
+    """Limits of a rigid vehicle in still water, and energy of the planned survey in its mean current."""
+
+    title: str
+    buoyancy_n: float  #: net buoyancy, positive upwards
+    righting_nm_per_deg: float  #: moment that turns a tilted vehicle back
+    speeds_mps: dict[str, float]  #: top speed by direction: the first thruster saturates
+    forces_n: dict[str, float]  #: force by direction at which the first thruster saturates
+    current_mps: float  #: greatest horizontal current, from any side, in which it holds station
+    speed_mps: float  #: planned speed
+    load: float  #: thrust of the busiest thruster / full thrust, at the planned speed in the mean current
+    stopping_m: float  #: distance from the planned speed to rest at full thrust, with the lag of the thrusters
+    coasting_m: float  #: distance from the planned speed to a tenth of it without thrust
+    hover_h: float  #: endurance at rest with the whole usable battery
+    cruise_h: float  #: endurance at the planned speed
+    survey_s: float  #: duration of the survey, with station keeping
+    survey_wh: float  #: energy of the survey
+    dives: int  #: number of batteries that the survey takes, each with a reserve of a fifth
+
+
+def vehicle_limits(mission: Mission) -> VehicleLimits:
+    vehicle, plan = mission.scenario.vehicle, mission.plan
+    hull = trimmed_hull(vehicle)
+    speed_mps, ahead = plan.speed_mps, np.array(_AXES["forwards"])
+    flown = plan.all_references()
+    current = mean_current_mps(make_sea(mission.scenario), float(flown.position[:, 2].mean()))
+    along = _in_body(np.asarray(flown.yaw), flown.velocity - current)
+    frame_s, hold_s = 1 / mission.rig.frame_rate_hz, mission.scenario.control.hold_s * len(mission.tracks)
+    held = _in_body(np.asarray(flown.yaw)[-1:], -current[None])
+    power_w = np.concatenate([electrical_power_w(vehicle, along), electrical_power_w(vehicle, held)])
+    survey_wh = float(power_w[:-1].sum() * frame_s + power_w[-1] * hold_s) / 3600
+    usable_wh = (1 - _RESERVE) * vehicle.battery_wh
+    rest, cruise = electrical_power_w(vehicle, np.array([np.zeros(3), speed_mps * ahead]))
+    directions = np.column_stack([np.cos(_BEARINGS), np.sin(_BEARINGS), np.zeros_like(_BEARINGS)])
+    return VehicleLimits(
+        title=vehicle.title,
+        buoyancy_n=hull.buoyancy_n - hull.weight_n,
+        righting_nm_per_deg=math.radians(hull.buoyancy_n * float(hull.centre_of_buoyancy_m[2])),
+        speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in _AXES.items()},
+        forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in _AXES.items()},
+        current_mps=min(top_speed_mps(vehicle, direction) for direction in directions),
+        speed_mps=speed_mps,
+        load=float(thrust_loads(vehicle, along).max()),
+        stopping_m=speed_mps * thruster_lag_s(vehicle)
+        + stopping_distance_m(vehicle, speed_mps, full_force_n(vehicle, ahead), 0.0),
+        coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps),
+        hover_h=usable_wh / rest,
+        cruise_h=usable_wh / cruise,
+        survey_s=len(along) * frame_s + hold_s,
+        survey_wh=survey_wh,
+        dives=max(1, math.ceil(survey_wh / usable_wh)),
+    )
+
+
+def electrical_power_w(vehicle: VehicleConfig, velocities: Array) -> Array:
+    """Returns the power (n,) at steady velocities (n, 3) through the water, in the body: hotel load and thrusters.
+
+    The power of a propeller at rest grows with its thrust to the power 1.5 (momentum theory); the tables of the T200
+    from 10 to 20 V have exponents of 1.4 to 1.7.
+    """
+    thrusts = np.abs(steady_thrusts_n(vehicle, velocities))
+    return np.asarray(vehicle.hotel_w + vehicle.power_coefficient * (thrusts**1.5).sum(axis=1), np.float64)
+
+
+def stopping_distance_m(vehicle: VehicleConfig, speed_mps: float, force_n: float, end_mps: float) -> float:
+    """Returns the distance from a forward speed to `end_mps` under drag and a constant braking force."""
+    hull = trimmed_hull(vehicle)
+    mass_kg = hull.inertia[3] + hull.added_inertia[3, 3]
+    linear, quadratic = hull.linear_drag[3, 3], hull.quadratic_drag[3, 3]
+
+    def rates(_: float, state: Array) -> list[float]:
+        v = state[1]
+        return [v, -(force_n + linear * v + quadratic * v * abs(v)) / mass_kg]
+
+    def stopped(_: float, state: Array) -> float:
+        return float(state[1] - end_mps)
+
+    stopped.terminal = True  # type: ignore[attr-defined]
+    found = solve_ivp(rates, (0.0, 600.0), [0.0, speed_mps], events=stopped, rtol=1e-8)
+    return float(found.y[0, -1])
+
+
+def _in_body(yaw: Array, velocities: Array) -> Array:
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = velocities.T
+    return np.column_stack([c * x + s * y, c * y - s * x, z])
+
+
+def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
+    """Returns the limits as table rows."""
+
+    def of_axes(values: dict[str, float], unit: str, digits: int) -> str:
+        return ", ".join(f"{value:.{digits}f} {unit} {name}" for name, value in values.items())
+
+    survey_min = limits.survey_s / 60
+    return [
+        ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
+        ("righting moment", f"{limits.righting_nm_per_deg:.3f} N m per degree"),
+        ("top speed", of_axes(limits.speeds_mps, "m/s", 2)),
+        ("full force", of_axes(limits.forces_n, "N", 0)),
+        ("holds station in", f"{limits.current_mps:.2f} m/s of current from any side"),
+        ("busiest thruster", f"{percent(limits.load)} of its thrust at {limits.speed_mps:g} m/s in the mean current"),
+        ("stopping distance", f"{length(limits.stopping_m)} at full thrust, {length(limits.coasting_m)} without"),
+        ("endurance", f"{limits.hover_h:.1f} h at rest, {limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
+        ("this survey", f"{survey_min:.1f} min, {limits.survey_wh:.1f} W h, {limits.dives} dive(s)"),
+    ]
+
+
+def as_json(limits: VehicleLimits, picture: str) -> dict[str, Any]:
+    return finite_tree({"schema": "twin.vehicle/1", **asdict(limits), "picture": picture})
