@@ -1,6 +1,6 @@
 """Hostile and ordinary missions: none may end "complete" with a wrong path, and ordinary ones must not be degraded.
 
-usage: python tests/hostile_missions.py OUT.jsonl [MISSION...] [--seeds 3] [--jobs 2] [--ordinary]
+usage: python tests/hostile_missions.py OUT.jsonl [MISSION...|faults] [--seeds 3] [--jobs 2] [--ordinary]
 
 Flies each mission rendered over 2 m x 1 m (one track, two legs) with several seeds and appends one line per survey to
 OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each mission and the wrong ones:
@@ -39,7 +39,35 @@ def lamps(intensity_cd):
     return f"lamps=[{at % (0.35, -8, intensity_cd)},{at % (-0.35, 8, intensity_cd)}]"
 
 
+def fault(part, type_, duration_s=None, **keys):
+    """Returns the overrides for one fault from 4 s on, with all sensors."""
+    keys = {"part": f'"{part}"', "type": f'"{type_}"', "start_s": 4.0, **keys}
+    keys |= {} if duration_s is None else {"duration_s": duration_s}
+    text = ",".join(f"{key}={value}" for key, value in keys.items())
+    return f"faults=[{{{text}}}]", 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
+
+
+FAULTS = {
+    "cameras off for 3 s": fault("cameras", "off", 3),
+    "cameras frozen for 3 s": fault("cameras", "stuck", 3),
+    "images of noise for 3 s": fault("cameras", "garbage", 3),
+    "half of the images lost for 5 s": fault("cameras", "intermittent", 5, size=0.5),
+    "left camera off for 5 s": fault("left_camera", "off", 5),
+    "right camera off for 5 s": fault("right_camera", "off", 5),
+    "right camera frozen for 5 s": fault("right_camera", "stuck", 5),
+    "right images of noise for 5 s": fault("right_camera", "garbage", 5),
+    "thruster off": fault("thruster", "off", number=1),
+    "vertical thruster off": fault("thruster", "off", number=5),
+    "thruster stuck": fault("thruster", "stuck", number=1),
+    "pressure 0.3 m off": fault("pressure", "wrong", 5, size=0.3),
+    "AHRS 10 deg off": fault("ahrs", "wrong", 5, size=10),
+    "DVL 0.3 m/s off": fault("dvl", "wrong", 5, size=0.3),
+    "DVL without bottom lock": fault("dvl", "off", 10),
+    "USBL spikes of 3 m": fault("usbl", "garbage", size=3),
+    "USBL 3 m off": fault("usbl", "wrong", size=3),
+}
 HOSTILE = {
+    **FAULTS,
     **{
         f"{water} x{turbidity}": (f"water.jerlov={water}", f"water.turbidity={turbidity}")
         for water, levels in {"5C": (1, 2, 5, 10), "7C": (1, 2, 5), "9C": (1, 2, 10)}.items()
@@ -77,6 +105,8 @@ HOSTILE = {
     "current 0.7 m/s diagonal": ("current.velocity_mps=[0.5,0.5,0]",),
     "current 1.04 m/s": ("current.velocity_mps=[0.8,0.66,0]",),
     "current 0.3 m/s upward": ("current.velocity_mps=[0,0,0.3]",),
+    "gusts of 0.2 m/s": ("current.velocity_mps=[0.2,0.1,0]", "current.gust_mps=0.2"),
+    "waves of 1 m over 8 m": ("waves.height_m=1.0", "waves.period_s=6", "waves.depth_m=8"),
 }
 
 
@@ -167,6 +197,8 @@ def main():
     parser.add_argument("--ordinary", action="store_true", help="fly the ordinary missions, one seed each")
     given = parser.parse_args()
     missions = ordinary_missions() if given.ordinary else HOSTILE
+    if given.missions == ["faults"]:
+        given.missions = list(FAULTS)
     chosen = {name: missions[name] for name in given.missions or missions}
     rows = [json.loads(text) for text in given.out.read_text().splitlines()] if given.out.exists() else []
     flown = {(row["mission"], row["seed"]) for row in rows}

@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from twin.controllers.segments import Reference
+from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.records import Estimate
 from twin.judge.summary_statistics import finite_tree
 from twin.report.number_formats import length, percent
 from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import full_force_n, steady_thrusts_n, thrust_loads, thruster_lag_s, top_speed_mps
-from twin.simulate.hull import trimmed_hull
-from twin.simulate.sea import make_sea, mean_current_mps
+from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.hull import physics_timestep_s, trimmed_hull
+from twin.simulate.sea import make_sea, mean_current_mps, steady_current
 from twin.world.mission import Mission
+from twin.world.pilot import RovPilot
 
 _AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
 _BEARINGS = np.linspace(0.0, 2 * np.pi, 72, endpoint=False)
+_LEG_S, _SETTLED_S, _STABLE_M = 5.0, 20.0, 0.1  # the last _LEG_S of _SETTLED_S are judged
 _RESERVE = 0.2  # share of the battery that stays unused
 
 
@@ -37,6 +43,7 @@ class VehicleLimits:
     load: float  #: thrust of the busiest thruster / full thrust, at the planned speed in the mean current
     stopping_m: float  #: distance from the planned speed to rest at full thrust, with the lag of the thrusters
     coasting_m: float  #: distance from the planned speed to a tenth of it without thrust
+    latency_s: float  #: greatest latency of the computer with which leg and station keeping are stable
     hover_h: float  #: endurance at rest with the whole usable battery
     cruise_h: float  #: endurance at the planned speed
     survey_s: float  #: duration of the survey, with station keeping
@@ -70,12 +77,43 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
         stopping_m=speed_mps * thruster_lag_s(vehicle)
         + stopping_distance_m(vehicle, speed_mps, full_force_n(vehicle, ahead), 0.0),
         coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps),
+        latency_s=largest_latency_s(mission),
         hover_h=usable_wh / rest,
         cruise_h=usable_wh / cruise,
         survey_s=len(along) * frame_s + hold_s,
         survey_wh=survey_wh,
         dives=max(1, math.ceil(survey_wh / usable_wh)),
     )
+
+
+def largest_latency_s(mission: Mission) -> float:
+    """Returns the greatest latency in whole frames, up to a second, with which the vehicle flies a leg and stops [s].
+
+    It starts at the planned speed with its true motion known, and has to be within `_STABLE_M` of its reference after
+    `_SETTLED_S`.
+    """
+    interval_s = 1 / mission.rig.frame_rate_hz
+    latencies = interval_s * np.arange(1, round(1 / interval_s) + 1)
+    return next((float(late_s - interval_s) for late_s in latencies if not _settles(mission, late_s)), latencies[-1])
+
+
+def _settles(mission: Mission, latency_s: float) -> bool:
+    scenario, interval_s = mission.scenario, 1 / mission.rig.frame_rate_hz
+    late = scenario.model_copy(update={"control": scenario.control.model_copy(update={"latency": latency_s})})
+    pilot, start = RovPilot(replace(mission, scenario=late)), mission.start_of_body
+    still = steady_current(np.zeros(3))
+    vehicle = CompiledVehicle(scenario.vehicle, still, start, physics_timestep_s(mission.rig.frame_rate_hz))
+    camera, start_m, yaw = mission.rig.body_from_camera, mission.start[:3, 3], mission.plan.reference(1, 0.0).yaw
+    velocity = mission.plan.speed_mps * start[:3, 0]  # along the bow
+    to_camera, excursion_m = geometry.adjoint(geometry.inverse(camera)), 0.0
+    for time_s in np.arange(0.0, _SETTLED_S, interval_s):
+        position, moves = start_m + min(time_s, _LEG_S) * velocity, time_s < _LEG_S
+        pose, twist = vehicle.world_from_body @ camera, to_camera @ vehicle.twist_body
+        wanted = Reference(position, velocity if moves else np.zeros(3), yaw, np.zeros(3))
+        vehicle.step(pilot(Estimate(time_s, pose, pose, twist, 0.0, "ok"), wanted), interval_s)
+        if time_s > _SETTLED_S - _LEG_S:
+            excursion_m = max(excursion_m, float(np.linalg.norm(pose[:3, 3] - position)))
+    return excursion_m < _STABLE_M
 
 
 def electrical_power_w(vehicle: VehicleConfig, velocities: Array) -> Array:
@@ -127,6 +165,7 @@ def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
         ("holds station in", f"{limits.current_mps:.2f} m/s of current from any side"),
         ("busiest thruster", f"{percent(limits.load)} of its thrust at {limits.speed_mps:g} m/s in the mean current"),
         ("stopping distance", f"{length(limits.stopping_m)} at full thrust, {length(limits.coasting_m)} without"),
+        ("latency", f"stable up to {limits.latency_s:.2f} s from image to command"),
         ("endurance", f"{limits.hover_h:.1f} h at rest, {limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
         ("this survey", f"{survey_min:.1f} min, {limits.survey_wh:.1f} W h, {limits.dives} dive(s)"),
     ]

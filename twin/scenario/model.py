@@ -56,6 +56,7 @@ Matrix6 = tuple[SixNumbers, SixNumbers, SixNumbers, SixNumbers, SixNumbers, SixN
 PerMetre = Annotated[Number, Field(ge=0, le=100)]
 OffAxisDeg = Annotated[Number, Field(ge=0, le=90)]
 WhiteGain = Annotated[Number, Field(ge=1, le=16)]
+Latency = Annotated[Number, Field(ge=0, le=5)]
 BlurPx = Annotated[Number, Field(ge=0, le=2)]
 LateralColour = Annotated[Number, Field(ge=-0.02, le=0.02)]
 Albedo = Annotated[Number, Field(ge=0, le=1)]
@@ -856,9 +857,16 @@ class ControlConfig(Section):
     """station keeping at the end of a track, during global alignment [s]"""
     natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10)
     """natural frequency of the closed position loop [rad/s]"""
+    latency: Literal["none"] | Latency = "none"
+    """time from an image to the command that follows from it, of a computer of finite speed, in whole frames [s]; the
+    controller knows it and predicts the motion meanwhile"""
     off_course_m: float | None = Field(default=None, gt=0, le=1000)
     """largest distance from the planned path; beyond it for one second, the survey is degraded; default: a quarter of
     the shorter side of the footprint [m]"""
+
+    @property
+    def latency_s(self) -> float:
+        return 0.0 if self.latency == "none" else self.latency
 
 
 #: Parts that can fail, with the ways in which they can, in the words of PX4.

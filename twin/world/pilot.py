@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,9 +17,12 @@ from twin.kernels import kernel
 from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import CONTROLLERS
 from twin.plugin.protocols import ControllerSetup
-from twin.simulate.autopilot import nominal_controller
+from twin.simulate.autopilot import nominal_controller, thruster_lag_s
 from twin.world.mission import Mission
 
+#: Natural frequency of the position loop times the whole delay, at most; the attitude loop is twice as fast. At 0.3 rad
+#: the survey of `reef` oscillates with a latency of 0.2 s, at 0.15 rad gusts move the vehicle twice as far.
+_MOST_PHASE_RAD = 0.22
 _VELOCITY_SMOOTHING_S = 0.1  # time constant of the filter: velocity from F2F is noisy, the true velocity varies slowly
 
 #: Function from the estimate and the reference of the left camera to the vehicle command.
@@ -28,9 +32,25 @@ PilotOfEstimates = Callable[[Estimate, Reference], Array]
 def make_pilot(mission: Mission) -> PilotOfEstimates:
     """Returns the pilot of a mission; raises TwinError if its plug-in cannot be loaded."""
     scenario = mission.scenario
+    n_late = frames_of_latency(mission)
     if scenario.control.plugin is not None:
-        return _plugin_pilot(mission, scenario.control.plugin)
-    return RovPilot(mission) if scenario.vehicle.dynamics == "rigid" else _kinematic_pilot(mission)
+        return _late(_plugin_pilot(mission, scenario.control.plugin), n_late)
+    return RovPilot(mission) if scenario.vehicle.dynamics == "rigid" else _late(_kinematic_pilot(mission), n_late)
+
+
+def frames_of_latency(mission: Mission) -> int:
+    return round(mission.scenario.control.latency_s * mission.rig.frame_rate_hz)
+
+
+def _late(pilot: PilotOfEstimates, n: int) -> PilotOfEstimates:
+    """Returns a pilot whose commands are those of n frames ago, at first zero."""
+    waiting: deque[Array] = deque()
+
+    def command(estimate: Estimate, reference: Reference) -> Array:
+        waiting.append(pilot(estimate, reference))
+        return waiting.popleft() if len(waiting) > n else np.zeros_like(waiting[0])
+
+    return pilot if n == 0 else command
 
 
 def without_feedback(estimate: Estimate, reference: Reference, readings: Readings) -> Estimate:
@@ -74,7 +94,7 @@ def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
 
 
 class PilotState(NamedTuple):
-    """State and constants of the ROV's pilot; `twist` and `controller` are modified in place."""
+    """State and constants of the ROV's pilot; `twist`, `controller` and `waiting` are modified in place."""
 
     camera_from_body: Array  #: (4, 4) pose of the body in the left camera
     body_from_camera_twist: Array  #: (6, 6) adjoint that transforms a twist of the camera to the body
@@ -82,13 +102,19 @@ class PilotState(NamedTuple):
     smoothing: float  #: weight of a new twist in the exponential moving average
     twist: Array  #: (6,) smoothed twist of the body in body axes [rad/s, m/s]
     controller: ControllerState
+    latency_s: float  #: time until a command reaches the thrusters
+    waiting: Array  #: (k, n) commands that have not reached them, the oldest first
 
 
 class RovPilot:
     """Pilot of the ROV; a command (n,) has one value in [-1, 1] per thruster."""
 
     def __init__(self, mission: Mission):
-        rig, scenario = mission.rig, mission.scenario
+        rig, scenario, n_late = mission.rig, mission.scenario, frames_of_latency(mission)
+        frequency, latency_s = scenario.control.natural_frequency_radps, n_late / rig.frame_rate_hz
+        if n_late and scenario.vehicle.dynamics == "rigid":
+            delay_s = latency_s + _VELOCITY_SMOOTHING_S + thruster_lag_s(scenario.vehicle)
+            frequency = min(frequency, _MOST_PHASE_RAD / delay_s)
         self.state = PilotState(
             camera_from_body=geometry.inverse(rig.body_from_camera),
             body_from_camera_twist=geometry.adjoint(rig.body_from_camera),
@@ -96,8 +122,10 @@ class RovPilot:
             smoothing=1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz),
             twist=np.zeros(6),
             controller=nominal_controller(
-                scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz, _VELOCITY_SMOOTHING_S
+                scenario.vehicle, frequency, rig.frame_rate_hz, _VELOCITY_SMOOTHING_S + latency_s
             ),
+            latency_s=latency_s,
+            waiting=np.zeros((n_late, len(scenario.vehicle.thrusters))),
         )
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
@@ -109,9 +137,23 @@ class RovPilot:
 
 @kernel
 def steer(state, world_from_camera, camera_velocity, position, velocity, acceleration, yaw, is_measured=True):
-    """Returns the thruster commands (n,) and updates `state` in place; compiled kernel of `RovPilot`."""
+    """Returns the thruster commands (n,) and updates `state` in place; compiled kernel of `RovPilot`.
+
+    With a latency, pose and reference are predicted to the time at which the command reaches the thrusters.
+    """
     change = state.body_from_camera_twist @ camera_velocity - state.twist
     geometry.copy_into(state.twist, state.twist + state.smoothing * change)
     body = geometry.compose(world_from_camera, state.camera_from_body)
     target = position - rotate_lever_arm(yaw, state.lever_arm_m)
-    return control_thrusters(state.controller, body, state.twist, target, velocity, acceleration, yaw, is_measured)
+    if len(state.waiting) == 0:
+        return control_thrusters(state.controller, body, state.twist, target, velocity, acceleration, yaw, is_measured)
+    late_s = state.latency_s
+    body = geometry.compose(body, geometry.exp(late_s * state.twist))
+    target = target + late_s * velocity + 0.5 * late_s**2 * acceleration
+    velocity = velocity + late_s * acceleration
+    commands = control_thrusters(state.controller, body, state.twist, target, velocity, acceleration, yaw, is_measured)
+    first = state.waiting[0].copy()
+    for k in range(len(state.waiting) - 1):
+        state.waiting[k] = state.waiting[k + 1]
+    state.waiting[-1] = commands
+    return first
