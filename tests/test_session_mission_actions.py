@@ -9,7 +9,7 @@ from twin import survey
 from twin.controllers.segments import Reference
 from twin.core import geometry
 from twin.core.quality import ActionTimes
-from twin.core.records import Estimate, Readings
+from twin.core.records import NO_STEREO, Estimate, Readings
 from twin.core.settings import BLIND_S, BRAKING_S
 from twin.core.timing import Stopwatch
 from twin.estimate.vision.f2f import constant_velocity_motion
@@ -78,6 +78,17 @@ def test_frames_of_the_compiled_loop_count_as_measured():
         assert actions(estimate("lost")) == FULL
         actions.add_measured_frames(14)
         assert actions(estimate("ok")) == FULL
+
+
+def test_the_vehicle_stops_when_keyframes_have_no_stereo_until_one_has():
+    """Its motion is still measured, by the points of the last keyframe; between keyframes nothing changes."""
+    actions, seen = MissionActions(mission()), []
+    for failed in (True, False, True, True, True, False):
+        actions(estimate(NO_STEREO if failed else "ok"), is_keyframe=True)
+        seen.append(actions.action)
+        for _ in range(20):
+            actions(estimate("ok"), is_keyframe=False)
+    assert seen == ["fly", "fly", "fly", "hold", "hold", "slow"]
 
 
 def test_prediction_and_reference_brake_equally():

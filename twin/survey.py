@@ -122,6 +122,6 @@ def fly(
         estimate = navigator.update(frame, flight.track)
         observe(estimate, frame)
         command = pilot(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
-        frame = flight.step(command, FULL if actions is None else actions(estimate))
+        frame = flight.step(command, FULL if actions is None else actions(estimate, bool(frame.keyframe)))
         if actions is not None:
             actions.add_measured_frames(flight.n_skipped)

@@ -202,6 +202,7 @@ class Frame:
 #: Statuses of a frame at which a camera is frozen; with the left camera alone, the motion is still measured.
 LEFT_REPEATS, RIGHT_REPEATS = "the left camera repeats its image", "the right camera repeats its image"
 REPEATS = LEFT_REPEATS, RIGHT_REPEATS
+NO_STEREO = "too few points in stereo"  #: status of a frame that could not become a keyframe
 
 
 def is_measured(status: str) -> bool:

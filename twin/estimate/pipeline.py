@@ -22,6 +22,7 @@ from twin.core.links import Link
 from twin.core.ortho_tiles import OrthoTile
 from twin.core.quality import EstimationQuality
 from twin.core.records import (
+    NO_STEREO,
     REPEATS,
     ElevationMap,
     Estimate,
@@ -228,7 +229,7 @@ class Navigator:
         points = self.vision.observe_stereo(frame, len(self.log))
         if points is None:
             self.filter.fuse_position_fixes(frame.readings)
-            return "too few points in stereo"
+            return NO_STEREO
         if (tracking_cov := self.vision.tracking_cov()) is not None:
             self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(tracking_cov[3:, 3:]))))
         number, depth_m = len(self.network.keyframes), float(np.median(points.xyz[:, 2]))

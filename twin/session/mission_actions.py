@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Literal
 
 from twin.core.quality import ActionTimes
-from twin.core.records import Estimate
+from twin.core.records import NO_STEREO, Estimate
 from twin.core.settings import BLIND_S, BRAKING_S
 from twin.world.mission import Mission
 from twin.world.pace import FULL, Pace
@@ -19,6 +19,7 @@ RATES: dict[Action, float] = {"fly": 1.0, "slow": 0.5, "hold": 0.0}
 #: The vehicle slows down if more than the fraction MAX_LOST of the frames of the last WINDOW_S seconds was lost, and
 #: returns to the planned speed after RECOVERED_S seconds of measured frames at which the fraction was not exceeded.
 MAX_LOST, WINDOW_S, RECOVERED_S = 0.2, 1.0, 3.0
+MAX_FAILED = 2
 _SAME_RATE = 0.01  # a rate that differs by less is set to the rate of the action
 _STOPPED = 0.1  # below this rate, keyframes are added, because the plan has none at the same place
 
@@ -26,8 +27,9 @@ _STOPPED = 0.1  # below this rate, keyframes are added, because the plan has non
 class MissionActions:
     """Chooses the pace along the path from the status of the estimates, frame by frame.
 
-    The vehicle stops (`hold`) if no motion was measured for more than `BLIND_S` seconds. From then on, the speed that
-    the estimators predict decays with the time constant with which the vehicle brakes (`BRAKING_S`), so prediction and
+    The vehicle stops (`hold`) if no motion was measured for more than `BLIND_S` seconds, or `MAX_FAILED` keyframes in
+    succession have no stereo: it would leave the last points that it can track. While blind, the speed that the
+    estimators predict decays with the time constant with which the vehicle brakes (`BRAKING_S`), so prediction and
     reference agree. The vehicle slows down if many frames of the last second were lost; this is decided at measured
     frames only, because a predicted motion has the speed of the last measured one.
 
@@ -39,13 +41,18 @@ class MissionActions:
         self.rate_hz, self._n_per_keyframe = mission.plan.request.frame_rate_hz, mission.plan.n_frames_per_keyframe
         self.action: Action = "fly"
         self.n_frames: dict[Action, int] = dict.fromkeys(RATES, 0)
-        self._rate, self._n_blind, self._n_recovered, self._n_stopped = 1.0, 0, 0, 0
+        self._rate, self._n_blind, self._n_recovered, self._n_stopped, self._n_failed = 1.0, 0, 0, 0, 0
         n_window = max(1, round(WINDOW_S * self.rate_hz))
         self._lost: deque[bool] = deque([False] * n_window, n_window)
 
-    def __call__(self, estimate: Estimate) -> Pace:
-        """Returns the pace from the current frame to the next, given the estimate of the current frame."""
+    def __call__(self, estimate: Estimate, is_keyframe: bool = False) -> Pace:
+        """Returns the pace from the current frame to the next, given the estimate of the current frame.
+
+        `is_keyframe`: whether the frame was to become a keyframe.
+        """
         lost = estimate.status != "ok"
+        if is_keyframe:
+            self._n_failed = self._n_failed + 1 if estimate.status == NO_STEREO else 0
         self._n_blind = self._n_blind + 1 if lost else 0
         self._lost.append(lost)
         action = self._next_action(lost)
@@ -69,7 +76,7 @@ class MissionActions:
         return ActionTimes(self.n_frames["slow"] / self.rate_hz, self.n_frames["hold"] / self.rate_hz)
 
     def _next_action(self, lost: bool) -> Action:
-        if self._n_blind > BLIND_S * self.rate_hz:
+        if self._n_blind > BLIND_S * self.rate_hz or self._n_failed >= MAX_FAILED:
             return "hold"
         if lost:
             return self.action
