@@ -84,7 +84,7 @@ class MissionActions:
             self._n_recovered = 0
             return "slow"
         self._n_recovered += 1
-        return self.action if self.action != "fly" and self._n_recovered < RECOVERED_S * self.rate_hz else "fly"
+        return "slow" if self.action != "fly" and self._n_recovered < RECOVERED_S * self.rate_hz else "fly"
 
     def _pace_towards(self, target: float) -> Pace:
         change_per_s = (target - self._rate) / BRAKING_S
