@@ -55,6 +55,7 @@ def test_the_limits_of_a_survey_follow_its_plan_and_its_current():
     assert still.dives == 1 and twin.vehicle("reef", overrides=["vehicle.battery_wh=1"]).dives > 1
     rest, cruise = electrical_power_w(VehicleConfig(buoyancy_n=0.0), np.array([[0.0, 0, 0], [0.35, 0, 0]]))
     assert rest == pytest.approx(VehicleConfig().hotel_w) and cruise > rest
+    assert still.hover_h == pytest.approx(0.8 * 266.0 / electrical_power_w(VehicleConfig(), np.zeros((1, 3)))[0])
     assert still.current_mps == pytest.approx(still.speeds_mps["sideways"], rel=0.02)
 
 
