@@ -591,19 +591,23 @@ class Script:
 
 
 class Stumbling(Script):
-    """F2F fails at one frame: its motion is wrong by 30 degrees and 0.1 m."""
+    """F2F fails at one frame: its motion is wrong by 30 degrees and 0.1 m; then it finds the points of the keyframe."""
 
     def __init__(self, poses, lost):
         super().__init__(poses)
-        self.lost = lost
+        self.lost, self.believed = lost, poses[0]
 
     def track_frame(self, frame):
         motion, status = super().track_frame(frame)
-        measured = motion._replace(cov=np.diag([1e-4**2] * 3 + [3e-4**2] * 3))
-        wrong = geometry.exp(np.array([0.0, 0.0, np.deg2rad(30), 0.1, 0.0, 0.0]))
+        before, self.believed = self.believed, self.poses[self.row]
         if self.row != self.lost:
-            return measured, status
-        return constant_velocity_motion(motion.a_from_b @ wrong), "too few points matched"
+            step = geometry.inverse(before) @ self.believed
+            return motion._replace(a_from_b=step, cov=np.diag([1e-4**2] * 3 + [3e-4**2] * 3)), status
+        self.believed = self.believed @ geometry.exp(np.array([0.0, 0.0, np.deg2rad(30), 0.1, 0.0, 0.0]))
+        return constant_velocity_motion(geometry.inverse(before) @ self.believed), "too few points matched"
+
+    def restart_tracking(self):
+        self.believed = self.poses[self.row]
 
     def measure_motions(self, node, others):
         return [Motion(geometry.inverse(self.poses[k.row]) @ self.poses[node.row], LINK_COV, 200, 1.0) for k in others]
@@ -620,9 +624,10 @@ def test_a_failed_step_between_keyframes_takes_the_misclosure(lost):
     online, final = (
         np.linalg.norm(path.positions - np.array(poses)[:, :3, 3], axis=1) for path in (result.online, result.final)
     )
-    assert lost % 10 == 0 or online.max() > 0.09
-    assert final.max() < 1e-3  # evenly: 47 mm
-    assert (final < online + 1e-3).all()
+    assert lost % 10 == 0 or online[lost] > 0.09
+    assert np.delete(online, lost).max() < 1e-3
+    assert np.delete(final, lost).max() < 1e-3
+    assert final[lost] < 0.06  # half of the wrong step: the next one has the same variance
 
 
 def navigated(camera, tracks, readings=None, **settings):

@@ -21,7 +21,11 @@ class Vision(Protocol):
     stereo_observations: list[StereoObservation]  #: image quality and number of points of every stereo pair so far
 
     def track_frame(self, frame: Frame) -> tuple[Motion, str]:
-        """Returns the F2F motion since the last frame, and "ok" or why it failed; ValueError for a wrong image size."""
+        """Returns the F2F motion since the last frame, and "ok" or why it failed; ValueError for a wrong image size.
+
+        Where it failed, the motion is predicted; the next measured one is such that their product is the measured
+        motion since the last frame before, unless a keyframe restarted the tracking.
+        """
         ...
 
     def observe_stereo(self, frame: Frame, row: int) -> StereoPoints | None:

@@ -9,8 +9,9 @@ import numpy as np
 from twin.core.records import Readings
 
 _NAMES = {"pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "dvl": "dvl_mps", "usbl": "usbl_m"}
-#: Equal readings in succession after which a sensor counts as frozen; coarse resolution makes fewer equal.
-_EQUAL = {"pressure": 10, "ahrs": 3, "dvl": 3, "usbl": 2}
+#: A sensor counts as frozen if more than _MOST_EQUAL readings in succession are equal over _FROZEN_S: a slow sensor
+#: repeats its reading from frame to frame, and a coarse one at rest.
+_MOST_EQUAL, _FROZEN_S = 2, 2.0
 _LONG_S, _LONG = 5.0, 20.0  # a gap is reported if it is longer than this time, and than this multiple of the median gap
 
 
@@ -19,7 +20,7 @@ class ReadingWatch:
 
     def __init__(self) -> None:
         self._last: dict[str, np.ndarray] = {}
-        self._n_equal = dict.fromkeys(_NAMES, 0)
+        self._n_equal, self._since_s = dict.fromkeys(_NAMES, 0), dict.fromkeys(_NAMES, 0.0)
         self._n_removed = dict.fromkeys(_NAMES, 0)
         self._times_s: dict[str, list[float]] = {name: [] for name in _NAMES}
         self._now_s = 0.0
@@ -33,9 +34,10 @@ class ReadingWatch:
                 continue
             array, last = np.atleast_1d(np.asarray(value, float)), self._last.get(sensor)
             is_equal = last is not None and np.array_equal(array, last)
-            self._n_equal[sensor] = self._n_equal[sensor] + 1 if is_equal else 0
-            self._last[sensor] = array
-            if self._n_equal[sensor] >= _EQUAL[sensor]:
+            if not is_equal:
+                self._n_equal[sensor], self._since_s[sensor], self._last[sensor] = 0, time_s, array
+            self._n_equal[sensor] += 1
+            if self._n_equal[sensor] > _MOST_EQUAL and time_s - self._since_s[sensor] > _FROZEN_S:
                 self._n_removed[sensor] += 1
                 readings = replace(readings, **{name: None})
             else:
