@@ -7,16 +7,13 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, allocate_wrench
+from twin.controllers.current_estimate import CurrentEstimate, rotate_to_body, update_current
 from twin.controllers.segments import Reference
 from twin.core.geometry import Array
 from twin.kernels import kernel
 
 ATTITUDE_BANDWIDTH = 2.0  # ratio of attitude to position bandwidth: attitude, the inner loop, must be faster
 INTEGRAL_BANDWIDTH = np.array([0.3] * 3 + [1.5] * 3)  # pole of the integral action divided by the natural frequency
-#: Model of the current estimate: spectral densities of unmodelled acceleration [m2/s3] and of the change of the current
-#: [m2/s3], about that of gusts of 0.1 m/s over 10 s; variances of the measured velocity, and of an unknown current.
-_ACCELERATION_PSD, _CURRENT_PSD, _VELOCITY_VARIANCE, _MOST_CURRENT_VARIANCE = 1e-3, 3e-3, 4e-4, 0.1
-_MOST_CURRENT_MPS = 1.0  # limit of the estimate: a vehicle that is held fast looks as if it were in a strong current
 INTEGRAL_LIMIT = np.array([2.0, 2.0, 2.0, 1.5, 1.5, 1.5])  # [rad/s2, m/s2]: more than any survey current requires
 
 
@@ -74,21 +71,6 @@ def commanded_velocity(position: Array, reference: Reference, natural_frequency_
     return reference.velocity + natural_frequency_radps * (reference.position - position)
 
 
-class CurrentEstimate(NamedTuple):
-    """Estimate of the horizontal current, modified in place by `update_current`."""
-
-    current: Array  # (3,) in the world [m/s]; its vertical part stays 0, because trim errors would look like one
-    velocity: Array  # (3,) predicted velocity in body axes [m/s]
-    #: (2, 3) covariance of velocity and current along forward and left: their variances, and the covariance [m2/s2]
-    cov: Array
-    force: Array  # (3,) of the thrusters since the last update, in body axes [N]
-
-
-def unknown_current() -> CurrentEstimate:
-    cov = np.tile([_VELOCITY_VARIANCE, _MOST_CURRENT_VARIANCE, 0.0], (2, 1))
-    return CurrentEstimate(np.zeros(3), np.zeros(3), cov, np.zeros(3))
-
-
 class ControllerState(NamedTuple):
     """Parameters and state of the pose controller; `integral` and `flow` are modified in place."""
 
@@ -138,46 +120,17 @@ def _wrench(pose, twist, position, velocity, acceleration, yaw, hull, gains, int
     The error is [rotation in the body, position in the world] [rad, m].
     """
     error = _pose_error(pose, position, yaw)
-    velocity_body = _rotate_to_body(pose, velocity)
-    feedforward = _rotate_to_body(pose, integral[3:] + acceleration)
+    velocity_body = rotate_to_body(pose, velocity)
+    feedforward = rotate_to_body(pose, integral[3:] + acceleration)
     target = gains.proportional * error - gains.derivative * twist
     for k in range(3):
         target[k] += integral[k]
         target[3 + k] += gains.derivative[3 + k] * velocity_body[k] + feedforward[k]
-    wrench = hull.inertia * target + feedforward_wrench(hull, velocity_body - _rotate_to_body(pose, current))
+    wrench = hull.inertia * target + feedforward_wrench(hull, velocity_body - rotate_to_body(pose, current))
     integrated_error = error.copy()
     for i in range(3):
         integrated_error[3 + i] = position[i] - pose[i, 3]
     return wrench, integrated_error
-
-
-@kernel
-def update_current(flow, hull, pose, twist, period_s):
-    """Updates the estimate of the horizontal current with the measured velocity: a Kalman filter for each body axis.
-
-    Its states are the velocity v and the current c, with m v' = F - D(v - c) for the thrust F and the drag D of the
-    hull model; where the drag hardly depends on the current, the estimate of it changes little.
-    """
-    current = _rotate_to_body(pose, flow.current)
-    change = np.zeros(3)
-    for k in range(2):
-        through, mass = flow.velocity[k] - current[k], hull.inertia[3 + k]
-        linear, quadratic = hull.linear_drag[3 + k], hull.quadratic_drag[3 + k]
-        drag = (linear + quadratic * abs(through)) * through
-        slope = (linear + 2 * quadratic * abs(through)) / mass * period_s  # of the velocity over a period
-        v = flow.velocity[k] + (flow.force[k] - drag) / mass * period_s
-        vv, cc, vc = flow.cov[k]
-        keep = 1 - slope
-        vv, vc = keep * keep * vv + 2 * keep * slope * vc + slope * slope * cc, keep * vc + slope * cc
-        vv, cc = vv + _ACCELERATION_PSD * period_s, min(cc + _CURRENT_PSD * period_s, _MOST_CURRENT_VARIANCE)
-        gain = 1 / (vv + _VELOCITY_VARIANCE)
-        innovation = twist[3 + k] - v
-        flow.velocity[k], change[k] = v + vv * gain * innovation, vc * gain * innovation
-        flow.cov[k, 0], flow.cov[k, 1], flow.cov[k, 2] = vv - vv * vv * gain, cc - vc * vc * gain, vc - vv * vc * gain
-    for i in range(2):
-        for k in range(2):
-            flow.current[i] += pose[i, k] * change[k]
-        flow.current[i] = min(max(flow.current[i], -_MOST_CURRENT_MPS), _MOST_CURRENT_MPS)
 
 
 @kernel
@@ -190,21 +143,12 @@ def _integrate(integral, gain, error, saturated):
 
 
 @kernel
-def _rotate_to_body(pose, vector):
-    result = np.zeros(3)
-    for i in range(3):
-        for k in range(3):
-            result[i] += pose[k, i] * vector[k]
-    return result
-
-
-@kernel
 def _pose_error(pose, position, yaw):
     """Returns the motion (6,) from the pose to a level reference, [rotation, translation] in the body [rad, m]."""
     c, s = np.cos(yaw), np.sin(yaw)
     # columns of body_from_reference
-    x, y = _rotate_to_body(pose, np.array([c, s, 0.0])), _rotate_to_body(pose, np.array([-s, c, 0.0]))
-    z = _rotate_to_body(pose, np.array([0.0, 0.0, 1.0]))
-    t = _rotate_to_body(pose, position - pose[:3, 3])
+    x, y = rotate_to_body(pose, np.array([c, s, 0.0])), rotate_to_body(pose, np.array([-s, c, 0.0]))
+    z = rotate_to_body(pose, np.array([0.0, 0.0, 1.0]))
+    t = rotate_to_body(pose, position - pose[:3, 3])
     # half the antisymmetric part: the rotation vector for small angles, bounded for large ones
     return np.array([0.5 * (y[2] - z[1]), 0.5 * (z[0] - x[2]), 0.5 * (x[1] - y[0]), t[0], t[1], t[2]])

@@ -67,7 +67,7 @@ MUTANTS = [
         ("twin/simulate/gusts.py", "white * np.sqrt(power)", "white * power", "simulate_sea"),
         ("twin/simulate/waves.py", "flow[4, 2] -= u_x", "flow[4, 2] += u_x", "simulate_sea"),
         ("twin/simulate/faults.py", "start - 1e-9 <= time_s < end - 1e-9", "start - 1e-9 <= time_s <= end", "simulate_faults"),
-        ("controllers/tracking.py", "through, mass = flow.velocity[k] - current[k], hull.inertia[3 + k]", "through, mass = flow.velocity[k], hull.inertia[3 + k]", "controllers_tracking"),
+        ("controllers/current_estimate.py", "through, mass = flow.velocity[k] - current[k], hull.inertia[3 + k]", "through, mass = flow.velocity[k], hull.inertia[3 + k]", "controllers_tracking"),
         ("twin/world/pilot.py", "target = target + late_s * velocity + 0.5 * late_s**2 * acceleration", "target = target + 0.0", "world_latency"),
         ("twin/estimate/navigation/kalman.py", "if not is_disputed or counts[4] < _MANY_PREDICTED:", "if not is_disputed:", "estimate_aiding"),
         ("twin/estimate/pipeline.py", "        self.filter.state = blind.state\n", "", "estimate_blindness"),

@@ -133,6 +133,17 @@ def test_the_current_is_estimated_within_a_few_seconds(bearing_deg):
     assert worst_m < 0.03
 
 
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0, 60.0])
+def test_the_estimate_of_the_current_is_stable_at_any_rate(rate_hz):
+    """At 5 Hz and 0.5 m/s the drag of the hull would stop it within less than a period."""
+    controller, current = nominal_controller(VehicleConfig(), 0.6, rate_hz), np.array([0.0, 0.5, 0.0])
+    rov = MujocoVehicle(bare_model(), VehicleConfig(), steady_current(current), np.eye(4))
+    hold = Reference(np.zeros(3), np.zeros(3), 0.0, np.zeros(3))
+    for _ in range(round(20 * rate_hz)):
+        rov.step(command(controller, rov.world_from_body, rov.twist_body, hold), 1 / rate_hz)
+    np.testing.assert_allclose(controller.flow.current, current, atol=0.05)
+
+
 def test_the_current_is_known_after_a_turn():
     """Its estimate is in the world: a yaw of 90 deg does not change it."""
     controller, current = nominal_controller(VehicleConfig(), 1.2, RATE_HZ), np.array([0.3, 0.0, 0.0])

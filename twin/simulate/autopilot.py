@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
+from twin.controllers.current_estimate import unknown_current
 from twin.controllers.tracking import (
     ControllerState,
     HullModel,
     feedforward_wrench,
     pole_placement_gains,
-    unknown_current,
 )
 from twin.core.geometry import Array
 from twin.scenario.model import VehicleConfig
