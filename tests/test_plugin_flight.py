@@ -183,7 +183,7 @@ def test_an_estimator_of_another_package_is_mapped_and_judged(tmp_path):
     assert m["self_check"]["frames_lost"] == pytest.approx(1 / m["timing"]["frames"])
     assert m["trajectory"]["final"] == m["trajectory"]["online"]
     assert m["trajectory"]["final"]["z_rmse_m"] < 0.02 < m["trajectory"]["final"]["ate_rmse_m"]
-    assert m["map"]["completeness"] > 0.5 and m["links"]["along"]["count"] == 0
+    assert m["map"]["completeness"] > 0.4 and m["links"]["along"]["count"] == 0
     assert m["consistency"]["nees_position_mean"] is not None
     assert (result.folder / "dem.tif").exists()
 

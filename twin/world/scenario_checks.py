@@ -103,7 +103,7 @@ def _of_lens(scenario: Scenario) -> Iterator[TwinError]:
 def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
     current, waves = scenario.current, scenario.waves
     if scenario.vehicle.dynamics == "kinematic":
-        problem, allowed = "has no effect on a kinematic vehicle", 'the default, or vehicle.dynamics = "rigid"'
+        problem, allowed = "has no effect on a kinematic vehicle", 'zero, or vehicle.dynamics = "rigid"'
         sea = ("velocity_mps", "gust_mps", "tide_mps", "file")
         yield from keys_without_effect("current", current, sea, problem, allowed)
         yield from keys_without_effect("waves", waves, ("height_m", "wind_mps"), problem, allowed)
