@@ -197,9 +197,8 @@ def main():
     parser.add_argument("--ordinary", action="store_true", help="fly the ordinary missions, one seed each")
     given = parser.parse_args()
     missions = ordinary_missions() if given.ordinary else HOSTILE
-    if given.missions == ["faults"]:
-        given.missions = list(FAULTS)
-    chosen = {name: missions[name] for name in given.missions or missions}
+    names = [name for word in given.missions for name in (FAULTS if word == "faults" else [word])]
+    chosen = {name: missions[name] for name in names or missions}
     rows = [json.loads(text) for text in given.out.read_text().splitlines()] if given.out.exists() else []
     flown = {(row["mission"], row["seed"]) for row in rows}
     seeds = range(101, 102) if given.ordinary else range(1, given.seeds + 1)
