@@ -8,14 +8,17 @@ from typer.testing import CliRunner
 
 import twin
 from twin.cli import app
+from twin.controllers.tracking import control_thrusters
 from twin.errors import TwinError
 from twin.planning.vehicle_limits import electrical_power_w, stopping_distance_m
 from twin.scenario.file import load_scenario
 from twin.scenario.model import VehicleConfig
-from twin.simulate.autopilot import full_force_n, top_speed_mps
+from twin.simulate.autopilot import full_force_n, nominal_controller, top_speed_mps
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import trimmed_hull
+from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import steady_current
+from twin.simulate.thrusters import steady_thrust_n
 
 #: Power and thrust of a T200 at 14 V at a tenth, a quarter, half and all of its thrust (Blue Robotics, 2019).
 T200 = ((4.5, 8.4), (11.2, 32.2), (22.2, 99.4), (44.4, 284.1))
@@ -36,16 +39,18 @@ def test_without_linear_drag_coasting_is_logarithmic():
 
 
 @pytest.mark.parametrize("model", ["bluerov2_heavy", "bluerov2_heavy_wu", "bluerov2"])
-def test_at_full_force_the_vehicle_reaches_its_top_speed(model):
-    """Flown: one thruster at full thrust along the bow, with the pitching suppressed; within 1 %."""
+def test_flown_at_full_thrust_the_vehicle_reaches_its_top_speed(model):
+    """All horizontal thrusters push forwards with the thrust of the limit; a large inertia suppresses the pitching."""
     section = load_scenario("reef", [f"vehicle.model={model}"]).vehicle
-    ahead = np.array([1.0, 0.0, 0.0])
-    hull = trimmed_hull(section)
-    drag = (
-        hull.linear_drag[3, 3] * top_speed_mps(section, ahead)
-        + hull.quadratic_drag[3, 3] * top_speed_mps(section, ahead) ** 2
-    )
-    assert drag == pytest.approx(full_force_n(section, ahead), rel=1e-6)
+    ahead, rov = np.array([1.0, 0.0, 0.0]), parameters_of(section)
+    body = CompiledVehicle(section, steady_current(np.zeros(3)), np.eye(4), 1 / 120)
+    body.state = body.state._replace(hull=body.state.hull._replace(inertia=np.array([1e9] * 3 + [section.mass_kg] * 3)))
+    horizontal = rov.thrust_configuration[0] > 0.1
+    per_thruster_n = full_force_n(section, ahead) / rov.thrust_configuration[0, horizontal].sum()
+    command = np.linspace(0, 1, 10_001)
+    thrust_n = steady_thrust_n(command, rov.thrust_coefficients, rov.thrust_table)
+    body.step(horizontal * command[np.argmax(thrust_n >= per_thruster_n * (1 - 1e-6))], 60.0)
+    assert body.twist_body[3] == pytest.approx(top_speed_mps(section, ahead), rel=0.01)
 
 
 def test_the_limits_of_a_survey_follow_its_plan_and_its_current():
@@ -59,14 +64,16 @@ def test_the_limits_of_a_survey_follow_its_plan_and_its_current():
     assert still.current_mps == pytest.approx(still.speeds_mps["sideways"], rel=0.02)
 
 
-def test_the_vehicle_holds_the_current_that_is_stated_and_not_more():
-    """Open loop: at the stated current from the side the force balances the drag; the vehicle at rest stays there."""
-    section = VehicleConfig()
-    limit = twin.vehicle("reef").current_mps
-    body = CompiledVehicle(section, steady_current(np.array([0.0, limit, 0.0])), np.eye(4), 1 / 120)
-    hull = body.state.hull
-    drag = (hull.linear_drag[4, 4] + hull.quadratic_drag[4, 4] * limit) * limit
-    assert drag == pytest.approx(full_force_n(section, np.array([0.0, 1.0, 0.0])), rel=0.01)
+@pytest.mark.parametrize(("share", "holds"), [(0.9, True), (1.15, False)])
+def test_the_vehicle_holds_the_current_that_is_stated_and_not_more(share, holds):
+    """Flown by the controller with the true motion known, in a current from the side."""
+    section, limit = VehicleConfig(), twin.vehicle("reef").current_mps
+    body = CompiledVehicle(section, steady_current(np.array([0.0, share * limit, 0.0])), np.eye(4), 1 / 120)
+    controller = nominal_controller(section, 1.2, 30.0)
+    for _ in range(30 * 30):
+        pose, twist, still = body.world_from_body, body.twist_body, np.zeros(3)
+        body.step(control_thrusters(controller, pose, twist, still, still, still, 0.0), 1 / 30)
+    assert (np.linalg.norm(body.world_from_body[:3, 3]) < 0.1) == holds
 
 
 def test_the_command_prints_and_draws_the_limits(tmp_path):

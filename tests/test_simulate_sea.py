@@ -106,8 +106,10 @@ def test_the_components_have_the_variance_of_the_significant_height(waves, heigh
     ({"height_m": 4.0, "depth_m": 5.0}, "waves of 4 m break in a depth of 5 m"),
 ])  # fmt: skip
 def test_waves_that_cannot_be_are_refused(keys, problem):
-    with pytest.raises(TwinError, match=problem):
-        sea_of(Scenario(waves=WavesConfig(**keys)))
+    scenario = Scenario(waves=WavesConfig(**keys))
+    for rng in (None, np.random.default_rng(0)):  # checked before the flight, without random numbers, too
+        with pytest.raises(TwinError, match=problem):
+            make_sea(scenario, rng)
 
 
 def test_wavenumbers_solve_the_dispersion_relation_from_shallow_to_deep_water():

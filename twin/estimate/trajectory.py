@@ -46,12 +46,6 @@ class PoseLog:
         _close(motion, motions, np.maximum(self.variances.array[first:], _LEAST_VARIANCE))
         self.steps.array[first:] = np.array([geometry.log(one) for one in motions]).reshape(-1, 6)
 
-    def close_steps(self, first: int, motion: Array) -> None:
-        """Corrects the steps of the rows from `first` on so that their product is a motion (4, 4) measured later."""
-        motions = _motions(self.steps.array[first:])
-        _close(motion, motions, np.maximum(self.variances.array[first:], _LEAST_VARIANCE))
-        self.steps.array[first:] = [geometry.log(one) for one in motions]
-
     def append(self, times_s: float | Array, f2f: Array, online: Array, steps: Array, variances: Array) -> None:
         self.times_s.append(times_s)
         self.f2f.append(f2f)

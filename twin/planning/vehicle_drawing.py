@@ -1,4 +1,4 @@
-"""Drawing of a vehicle's limits: speed by thrust, power and endurance by speed, and the current that it holds."""
+"""Drawing of a vehicle's limits: speed by thrust, power by speed, and the current that it holds."""
 
 from __future__ import annotations
 
@@ -9,12 +9,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from twin.planning.vehicle_limits import VehicleLimits, electrical_power_w
+from twin.planning.vehicle_limits import AXES, VehicleLimits, electrical_power_w
 from twin.report.style import FIGURE_STYLE
 from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
-
-_AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
 
 
 def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
@@ -23,7 +21,7 @@ def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
         figure = Figure(figsize=(14, 4.5))
         speed, power = (figure.add_subplot(1, 3, k) for k in (1, 2))
         current = figure.add_subplot(1, 3, 3, projection="polar")
-        for name, axis in _AXES.items():
+        for name, axis in AXES.items():
             speeds = np.linspace(0, limits.speeds_mps[name], 60)
             velocities = speeds[:, None] * np.array(axis)
             speed.plot(100 * thrust_loads(vehicle, velocities), speeds, label=name)

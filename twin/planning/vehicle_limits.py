@@ -21,9 +21,11 @@ from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.sea import make_sea, mean_current_mps, steady_current
 from twin.world.mission import Mission
+from twin.world.path_checks import body_velocities
 from twin.world.pilot import RovPilot
 
-_AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
+#: Directions in the body, by name.
+AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
 _BEARINGS = np.linspace(0.0, 2 * np.pi, 72, endpoint=False)
 _LEG_S, _SETTLED_S, _STABLE_M = 5.0, 20.0, 0.1  # the last _LEG_S of _SETTLED_S are judged
 _RESERVE = 0.2  # share of the battery that stays unused
@@ -44,8 +46,8 @@ class VehicleLimits:
     stopping_m: float  #: distance from the planned speed to rest at full thrust, with the lag of the thrusters
     coasting_m: float  #: distance from the planned speed to a tenth of it without thrust
     latency_s: float  #: greatest latency of the computer with which leg and station keeping are stable
-    hover_h: float  #: endurance at rest with the whole usable battery
-    cruise_h: float  #: endurance at the planned speed
+    hover_h: float  #: endurance at rest, without the reserve of a fifth
+    cruise_h: float  #: the same at the planned speed
     survey_s: float  #: duration of the survey, with station keeping
     survey_wh: float  #: energy of the survey
     dives: int  #: number of batteries that the survey takes, each with a reserve of a fifth
@@ -54,12 +56,12 @@ class VehicleLimits:
 def vehicle_limits(mission: Mission) -> VehicleLimits:
     vehicle, plan = mission.scenario.vehicle, mission.plan
     hull = trimmed_hull(vehicle)
-    speed_mps, ahead = plan.speed_mps, np.array(_AXES["forwards"])
+    speed_mps, ahead = plan.speed_mps, np.array(AXES["forwards"])
     flown = plan.all_references()
     current = mean_current_mps(make_sea(mission.scenario), float(flown.position[:, 2].mean()))
-    along = _in_body(np.asarray(flown.yaw), flown.velocity - current)
+    along = body_velocities(np.asarray(flown.yaw), flown.velocity - current)
     frame_s, hold_s = 1 / mission.rig.frame_rate_hz, mission.scenario.control.hold_s * len(mission.tracks)
-    held = _in_body(np.asarray(flown.yaw)[-1:], -current[None])
+    held = body_velocities(np.asarray(flown.yaw)[-1:], -current[None])
     power_w = np.concatenate([electrical_power_w(vehicle, along), electrical_power_w(vehicle, held)])
     survey_wh = float(power_w[:-1].sum() * frame_s + power_w[-1] * hold_s) / 3600
     usable_wh = (1 - _RESERVE) * vehicle.battery_wh
@@ -69,8 +71,8 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
         title=vehicle.title,
         buoyancy_n=hull.buoyancy_n - hull.weight_n,
         righting_nm_per_deg=math.radians(hull.buoyancy_n * float(hull.centre_of_buoyancy_m[2])),
-        speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in _AXES.items()},
-        forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in _AXES.items()},
+        speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in AXES.items()},
+        forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in AXES.items()},
         current_mps=min(top_speed_mps(vehicle, direction) for direction in directions),
         speed_mps=speed_mps,
         load=float(thrust_loads(vehicle, along).max()),
@@ -142,12 +144,6 @@ def stopping_distance_m(vehicle: VehicleConfig, speed_mps: float, force_n: float
     stopped.terminal = True  # type: ignore[attr-defined]
     found = solve_ivp(rates, (0.0, 600.0), [0.0, speed_mps], events=stopped, rtol=1e-8)
     return float(found.y[0, -1])
-
-
-def _in_body(yaw: Array, velocities: Array) -> Array:
-    c, s = np.cos(yaw), np.sin(yaw)
-    x, y, z = velocities.T
-    return np.column_stack([c * x + s * y, c * y - s * x, z])
 
 
 def rows(limits: VehicleLimits) -> list[tuple[str, str]]:

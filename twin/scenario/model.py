@@ -272,7 +272,7 @@ class VehicleConfig(Section):
     hotel_w: float = Field(default=40.0, ge=0, le=1e5)
     """power of computer, cameras, sensors and lamps [W]"""
     battery_wh: float = Field(default=266.0, gt=0, le=1e6)
-    """energy of the battery that can be used [W h]"""
+    """energy of the battery; `twin vehicle` leaves a fifth as a reserve [W h]"""
     size_m: tuple[Metres, Metres, Metres] = (0.457, 0.575, 0.254)
     """length, width and height of the box that stands for the hull in contacts [m]"""
     hull_centre_m: Vector3 = (0.0, 0.0, -0.03)
@@ -646,7 +646,8 @@ class CurrentConfig(Section):
     """log: roughness length of the sea floor; 0.05 over reefs (Lentz et al. 2017) [m]"""
     file: FilePath | None = None
     """measured or modelled current, which replaces velocity_mps and profile: CSV with the columns time_s, height_m,
-    east_mps, north_mps and, if known, up_mps; interpolated linearly, constant above and below its heights"""
+    east_mps, north_mps and, if known, up_mps; interpolated linearly, constant after its last time.
+    It covers the duration of the legs and, with more than one height, the heights of the path"""
     gust_mps: float = Field(default=0.0, ge=0, le=2)
     """gusts: standard deviation of the velocity to the east, and to the north [m/s]"""
     gust_vertical_mps: float | None = Field(default=None, ge=0, le=2)

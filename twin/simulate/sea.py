@@ -30,7 +30,7 @@ class Sea(NamedTuple):
 
 
 def make_sea(scenario: Scenario, rng: np.random.Generator | None = None) -> Sea:
-    """Returns the sea of a scenario; `rng` draws gusts and waves, None: it has none.
+    """Returns the sea of a scenario; `rng` draws gusts and waves, None: it has none of them, for checks.
 
     Raises TwinError if the file of the current cannot be read, or waves have no depth.
     """

@@ -31,15 +31,16 @@ CALM = Waves(np.zeros((0, 4)), np.array([1.0, 0.0]), 1.0)
 
 
 def wave_components(waves: WavesConfig, sun_depth_m: float, rng: np.random.Generator | None) -> Waves:
-    """Returns the components of waves with random phases; without `rng` there are none.
+    """Returns the components of waves with random phases; without `rng` the waves are only checked.
 
     Their frequencies are drawn within equal intervals of the band, so that the sum does not repeat. Raises TwinError if
     the depth is missing, fetch or wind is missing, or the waves would break.
     """
+    depth_m = waves.depth_m or sun_depth_m
+    if not waves.is_calm:
+        _check(waves, depth_m)
     if waves.is_calm or rng is None:
         return CALM
-    depth_m = waves.depth_m or sun_depth_m
-    _check(waves, depth_m)
     edges = np.linspace(*_BAND, _N + 1) * peak_radps(waves)
     omega = rng.uniform(edges[:-1], edges[1:])
     amplitude_m = np.sqrt(2 * jonswap(waves, omega) * np.diff(edges))

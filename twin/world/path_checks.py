@@ -228,13 +228,13 @@ def _check_coverage(sea: Sea, lowest_m: float, highest_m: float, duration_s: flo
 
 
 def _check_thrust_in(vehicle: VehicleConfig, current: Array, cruise_mps: float, yaw: Array, velocity: Array) -> None:
-    hold, speed_mps = _body_velocities(yaw, -np.tile(current, (len(yaw), 1))), float(np.linalg.norm(current))
+    hold, speed_mps = body_velocities(yaw, -np.tile(current, (len(yaw), 1))), float(np.linalg.norm(current))
     if (factor := _saturating_factor(vehicle, lambda k: k * hold)) is not None:
         raise TwinError(
             "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
             f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
         )  # fmt: skip
-    factor = _saturating_factor(vehicle, lambda k: _body_velocities(yaw, k * velocity - current))
+    factor = _saturating_factor(vehicle, lambda k: body_velocities(yaw, k * velocity - current))
     if factor is not None:
         against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " where it rises"
         raise TwinError(
@@ -269,7 +269,7 @@ def _load(vehicle: VehicleConfig, velocities: Array) -> float:
     return float(thrust_loads(vehicle, velocities).max(initial=0.0))
 
 
-def _body_velocities(yaw: Array, velocity: Array) -> Array:
+def body_velocities(yaw: Array, velocity: Array) -> Array:
     """Returns velocities (n, 3) converted from world axes to the body axes of a level vehicle at yaws (n,) [rad]."""
     c, s = np.cos(yaw), np.sin(yaw)
     x, y, z = velocity.T

@@ -112,7 +112,7 @@ class RovPilot:
     def __init__(self, mission: Mission):
         rig, scenario, n_late = mission.rig, mission.scenario, frames_of_latency(mission)
         frequency, latency_s = scenario.control.natural_frequency_radps, n_late / rig.frame_rate_hz
-        if n_late and scenario.vehicle.dynamics == "rigid":
+        if n_late:
             delay_s = latency_s + _VELOCITY_SMOOTHING_S + thruster_lag_s(scenario.vehicle)
             frequency = min(frequency, _MOST_PHASE_RAD / delay_s)
         self.state = PilotState(
