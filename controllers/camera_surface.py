@@ -65,6 +65,7 @@ def surface_above_floor(
     altitude_m: float,
     footprint_m: tuple[float, float],
     max_slope: tuple[float, float],
+    least_at: Callable[[Array, Array], Array] | None = None,
 ) -> CameraSurface:
     """Returns the surface that the camera follows at an altitude above the smoothed floor.
 
@@ -78,6 +79,7 @@ def surface_above_floor(
         footprint_m: extent of an image on the floor along u and v.
         max_slope: greatest slope (rise over run) of the surface along u, which is that of paths at cruise speed, and
             along v.
+        least_at: least height of the camera [m] at arrays x and y [m], to which the surface is raised; None: none.
     """
     reach_m = np.array(area.size_m) / 2 + footprint_m
     step_m = max(min(spacing_m, min(footprint_m) / _NODES), float(np.sqrt(4 * reach_m.prod() / _MOST_SAMPLES)))
@@ -92,6 +94,8 @@ def surface_above_floor(
     rows, cols = (np.linspace(0, n - 1, k) for n, k in zip(shape, n_nodes, strict=True))
     coarse = map_coordinates(smooth, np.meshgrid(rows, cols, indexing="ij"), order=1)
     u, v = np.interp(rows, np.arange(len(u)), u), np.interp(cols, np.arange(len(v)), v)
+    if least_at is not None:
+        coarse = np.maximum(coarse, least_at(*area.to_scene(u[:, None], v)) - altitude_m)
     coarse = _limit_slope(coarse, max_slope[0] * (u[1] - u[0]), max_slope[1] * (v[1] - v[0]))
     coarse = gaussian_filter(coarse, 1.0, mode="nearest")
     return CameraSurface(RectBivariateSpline(u, v, coarse + altitude_m), area, max_slope[0], altitude_m)

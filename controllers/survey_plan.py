@@ -56,6 +56,14 @@ class SurveyRequest(NamedTuple):
         return float(self.image_width_px * per_px), float(self.image_height_px * per_px)
 
 
+class Detour(NamedTuple):
+    """Track away from the legs, for a task."""
+
+    track: int  # its number, from 1
+    name: str
+    n_frames_per_keyframe: int
+
+
 @dataclass(frozen=True)
 class SurveyPlan:
     """Planned path and heading of the left camera. The vehicle keeps station after each track."""
@@ -74,6 +82,7 @@ class SurveyPlan:
     least_spacing_m: float  # least distance between neighbouring swaths
     legs_after_gaps: tuple[int, ...] = ()  # numbers of legs, from 0, between which and the one before no area lies
     covered_to_m: float = math.inf  # greatest v of the part of the area that the planned legs have to cover
+    detours: tuple[Detour, ...] = ()
 
     def inside_area(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point of the scene lies in the asked area, which the planned tracks have to cover.
@@ -94,17 +103,20 @@ class SurveyPlan:
     @property
     def swath_notes(self) -> dict[str, Any]:
         """Returns what tells legs from other parts of the path, and neighbours from legs beside a gap of the area."""
-        return {"cross_track": self.cross_track, "legs_after_gaps": self.legs_after_gaps}
+        others = [detour.track for detour in self.detours]
+        last = {"cross_track": self.cross_track, "other_tracks": others, "last_track": self.n_tracks}
+        return last | {"legs_after_gaps": self.legs_after_gaps}
 
     @property
     def n_leg_tracks(self) -> int:
-        """Returns the number of tracks of legs or loops: all but that of the cross lines."""
-        return self.n_tracks - (self.cross_track is not None)
+        """Returns the number of tracks of legs or loops: all but those of the cross lines and of tasks."""
+        return self.n_tracks - (self.cross_track is not None) - len(self.detours)
 
     @property
     def cross_track(self) -> int | None:
         """Returns the number of the track of the cross lines, from 1; None without cross lines."""
-        return self.n_tracks if self.request.cross_lines else None
+        last = max(set(range(1, self.n_tracks + 1)) - {detour.track for detour in self.detours})
+        return last if self.request.cross_lines else None
 
     @property
     def follows_floor(self) -> bool:
@@ -146,10 +158,12 @@ class SurveyPlan:
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
         """Returns the times (n,) of the frames of a track since its start [s], and whether each is a keyframe.
 
-        These are every N-th frame and the last one, and more while the vehicle turns (`TURN_PER_KEYFRAME`).
+        These are every N-th frame, with its own N for a task, and the last one, and more while the vehicle turns
+        (`TURN_PER_KEYFRAME`).
         """
         frames = np.arange(round(self.track_duration_s(track) * self.request.frame_rate_hz) + 1)
-        times_s, n = frames / self.request.frame_rate_hz, self.n_frames_per_keyframe
+        steps = {detour.track: detour.n_frames_per_keyframe for detour in self.detours}
+        times_s, n = frames / self.request.frame_rate_hz, steps.get(track, self.n_frames_per_keyframe)
         keyframe = (frames % n == 0) | (frames == frames[-1])
         if self.turns_on_the_spot:
             n_turning = max(1, int(TURN_PER_KEYFRAME / TURN_RATE * self.request.frame_rate_hz))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from twin.core.interrupts import StageGuard
 from twin.core.output_folder import sole_writer
+from twin.core.quality import Gaps
 from twin.core.records import Estimate, Frame
 from twin.core.threads import one_blas_thread
 from twin.core.timing import Stopwatch
@@ -23,6 +24,7 @@ from twin.session.monitor import SurveyMonitor, SurveyProgress
 from twin.world.mission import Mission, prepare
 from twin.world.mission_flight import Flight
 from twin.world.pace import FULL
+from twin.world.path_adaptation import PathAdaptation
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
 
@@ -63,6 +65,7 @@ def _run(
     with guard, open_world(mission, stopwatch) as world, RunFolder(out, scenario, outputs) as folder:
         _log_warnings(mission, world, folder)
         monitor = SurveyMonitor(mission, folder, progress, live)
+        gaps = Gaps()
         with make_navigator(mission, world, out, stopwatch) as navigator:
             try:
                 with guard.stage(), FrameRecorder(out, scenario.record if images else "none") as recorder:
@@ -71,13 +74,14 @@ def _run(
                         recorder.add(frame, world.world_from_camera, world.vehicle.twist_body)
                         monitor(estimate, frame)
 
-                    fly(mission, world, navigator, observe, monitor.actions)
+                    gaps = fly(mission, world, navigator, observe, monitor.actions)
             except (SurveyAborted, OSError, KeyboardInterrupt) as error:
                 guard.cause = str(error) or "interrupted"
             for event in world.faults.events:
                 folder.log("fault", **event.described)
             warnings = (*world.warnings, *world.faults.sentences)
-            flown = FlownSurvey(mission, world.truth(), warnings, monitor.actions.times)
+            actions = monitor.actions.times
+            flown = FlownSurvey(mission, world.truth(), warnings, actions, gaps, world.detail_truth)
             estimation = Estimation(navigator, stopwatch, guard, folder, monitor.report_stage, monitor.start_s)
             result, _ = conclude(estimation, flown)
     if scenario.record == "none" and images:
@@ -98,10 +102,11 @@ def fly(
     navigator: Estimators,
     observe: Callable[[Estimate, Frame], None],
     actions: MissionActions | None = None,
-) -> None:
+) -> Gaps:
     """Runs the closed loop over all tracks: the pilot steers by the estimates, and its commands move the vehicle.
 
-    After each track, the vehicle keeps station while the navigator runs a global alignment.
+    After each track, the vehicle keeps station while the navigator runs a global alignment. Returns the gaps that were
+    found and flown over after the last track.
 
     Args:
         observe: called with the estimate and its frame after every update of the navigator; not called for frames
@@ -114,7 +119,9 @@ def fly(
         OSError: images could not be read or written.
     """
     pilot = make_pilot(mission)
-    flight = Flight(mission, world, world.fast_forward(navigator, pilot))
+    by_frame = mission.scenario.control.height == "altimeter"  # its readings are used at every frame
+    flight = Flight(mission, world, None if by_frame else world.fast_forward(navigator, pilot))
+    adapt = PathAdaptation(flight)
     frame = flight.start()
     while frame is not None:
         if flight.aligns:
@@ -122,6 +129,8 @@ def fly(
         estimate = navigator.update(frame, flight.track)
         observe(estimate, frame)
         command = pilot(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
+        adapt(frame, estimate, navigator)
         frame = flight.step(command, FULL if actions is None else actions(estimate, bool(frame.keyframe)))
         if actions is not None:
             actions.add_measured_frames(flight.n_skipped)
+    return adapt.gaps

@@ -120,6 +120,20 @@ class Finding(NamedTuple):
     sentence: str  #: the finding in words
 
 
+class Gaps(NamedTuple):
+    """Parts of the asked area that fewer than two keyframes show; None if they were not looked for."""
+
+    found_m2: float | None = None  #: after the planned tracks [m2]
+    left_m2: float | None = None  #: after the legs over them [m2]
+
+    @property
+    def sentence(self) -> str:
+        if not self.found_m2 or self.left_m2 is None:
+            return ""
+        left = f"{self.left_m2:.2g} m2 of them could not be covered" if self.left_m2 else "none is left"
+        return f"After the planned tracks, gaps of {self.found_m2:.2g} m2 were flown over; {left}."
+
+
 class ActionTimes(NamedTuple):
     """Durations of the actions "slow" and "hold" of a mission [s]."""
 

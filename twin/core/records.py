@@ -169,6 +169,7 @@ class Readings:
     ahrs_rpy_rad: Array | None = None  #: (3,) roll, pitch, yaw of the body in the world [rad]
     dvl_mps: Array | None = None  #: (3,) velocity of the body's origin over ground, in body axes [m/s]
     usbl_m: Array | None = None  #: (3,) position of the left camera in the world, at some keyframes [m]
+    altitude_m: float | None = None  #: distance from the left camera to the floor below, from the altimeter [m]
     beacons: tuple[BeaconDetection, ...] | None = None  #: beacons detected in the left image, at keyframes
     imu: ImuReadings | None = None  #: readings of the IMU after the previous frame, up to the time of this frame
     #: (3,) unit vector that points vertically upwards, in body axes: an attitude without heading, as an IMU gives it.
@@ -387,6 +388,9 @@ class Truth:
     albedo: Callable[[MapGrid], NDArray[np.float32]] | None = None
     #: returns whether points (x, y) [m] lie in the asked area. None: not known.
     in_area: Callable[[Array, Array], NDArray[np.bool_]] | None = None
+    #: returns the height z [m] at which a camera is `plan.altitude_m` above the smoothed floor, and the height of the
+    #: floor, at points (x, y) [m]. None: the path does not follow the floor.
+    heights_to_follow: Callable[[Array, Array], tuple[Array, Array]] | None = None
     #: (rows, cols) uint16, 1 + number of the object at the top of each cell, 0 for the floor; None for a height grid
     #: without objects and for the surrogate. `height_m` is the height of the highest surface, floor or object.
     objects: NDArray[np.uint16] | None = None

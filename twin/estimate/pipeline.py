@@ -382,7 +382,11 @@ class Navigator:
         )
 
     def build_map(
-        self, result: SurveyResult, grid: MapGrid | None = None, progress: Callable[[float], None] | None = None
+        self,
+        result: SurveyResult,
+        grid: MapGrid | None = None,
+        progress: Callable[[float], None] | None = None,
+        chosen: NDArray[np.bool_] | None = None,
     ) -> ElevationMap | None:
         """Builds the elevation map along the final trajectory, from all keyframes but `SurveyResult.unlinked`.
 
@@ -394,10 +398,11 @@ class Navigator:
             result: result of the survey (`finish`).
             grid: grid of the map; by default it covers the images of all keyframes.
             progress: called with the fraction of the keyframes processed so far, 0 to 1.
+            chosen: (n_keyframes,) keyframes from which the map is built; None: all.
         """
-        if not len(result.keyframe_rows):
+        if not (~result.unlinked if chosen is None else chosen & ~result.unlinked).any():
             return None
-        turned, linked, map_from_world = _linked_in_map(result)
+        turned, linked, map_from_world = _linked_in_map(result, chosen)
         grid, report = grid or footprint_grid(turned, self.rig), progress or _ignore
         steps = steps_between(result.step_cov, linked)
         found = self.vision.build_map(turned, grid, steps, lambda n_done: report(n_done / len(linked)))
@@ -430,17 +435,21 @@ class Navigator:
         elevation: ElevationMap,
         restore: Restore | None = None,
         progress: Callable[[float], None] | None = None,
+        chosen: NDArray[np.bool_] | None = None,
     ) -> Iterator[OrthoTile] | None:
         """Returns an iterator over the tiles of the orthomosaic of the keyframe images; None if there are no images.
 
         Args:
             restore: removes the effects of lamps and water from an image; None: colours as seen, at equal exposure.
             progress: called with the finished fraction, 0 to 1.
+            chosen: (n_keyframes,) keyframes from which it is made; None: all.
 
         Raises:
             OSError: an image could not be read. The iterator raises it too.
         """
-        result = _of_keyframes(result, np.flatnonzero(~result.unlinked))
+        result = _of_keyframes(
+            result, np.flatnonzero(~result.unlinked if chosen is None else chosen & ~result.unlinked)
+        )
         rows = result.keyframe_rows
         if len(rows) == 0 or self.vision.left_image(int(rows[0])) is None:
             return None
@@ -460,9 +469,11 @@ def _ignore(_: float) -> None:
     """Progress that nobody follows."""
 
 
-def _linked_in_map(result: SurveyResult) -> tuple[SurveyResult, NDArray[np.int64], Array]:
+def _linked_in_map(
+    result: SurveyResult, chosen: NDArray[np.bool_] | None = None
+) -> tuple[SurveyResult, NDArray[np.int64], Array]:
     """Returns the result with linked keyframes only, in the map frame; their numbers; and map_from_world (4, 4)."""
-    linked, final = np.flatnonzero(~result.unlinked), result.final
+    linked, final = np.flatnonzero(~result.unlinked if chosen is None else chosen & ~result.unlinked), result.final
     map_from_world = viewing_plane(final.world_from_camera[result.keyframe_rows[linked[0]]])
     turned = Trajectory(final.times_s, map_from_world @ final.world_from_camera)
     return replace(_of_keyframes(result, linked), final=turned), linked, map_from_world

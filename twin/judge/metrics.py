@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.core.quality import ActionTimes
+from twin.core.quality import ActionTimes, Gaps
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.judge.consistency import consistency_metrics
@@ -26,6 +26,7 @@ from twin.judge.recorded import (
 from twin.judge.summary_statistics import finite_float, finite_tree
 from twin.judge.survey_quality import self_check_metrics, stereo_quality
 from twin.judge.swaths import control_metrics, overlap_metrics
+from twin.judge.task_errors import SurveyedTask, task_metrics
 from twin.judge.trajectory_errors import path_errors, track_metrics, trajectory_metrics
 from twin.judge.verdict import check_metric_names, judge_requirements, metric_warnings
 
@@ -55,6 +56,8 @@ class EvaluationInput:
     idealisations: Sequence[str] = ()  #: sentences on effects of a real survey that the scenario leaves out
     water: Mapping[str, float] = field(default_factory=dict)  #: visibility_m and secchi_m of a survey
     actions: ActionTimes = ActionTimes()  #: durations for which the mission slowed and stopped the vehicle
+    gaps: Gaps = Gaps()
+    tasks: Sequence[SurveyedTask] = ()
     orthomosaic: Mapping[str, float | None] | None = None  #: `OrthomosaicJudge.metrics`; None if none was made
     #: description of the data set of a replay (reader, number of skipped frames by reason, etc.); None for a survey.
     source: Mapping[str, Any] | None = None
@@ -114,6 +117,8 @@ def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
         "self_check": self_check_metrics(result),
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth) | survey.actions._asdict(),
+        "gaps": survey.gaps._asdict(),
+        "tasks": [task_metrics(task, result, elevation, truth) for task in survey.tasks],
         "overlap": overlap_metrics(result, truth, survey.rig, grid, survey.plan),
     }
 

@@ -52,14 +52,16 @@ def swath_numbers(
 
     Args:
         reference, yaw, track: planned positions (n, 3), headings (n,) or None, and numbers (n,) of the tracks, from 1.
-        planned: `pattern`, `cross_track` and `legs_after_gaps` of the plan.
+        planned: `pattern` and `SurveyPlan.swath_notes`.
     """
+    away = np.isin(track, planned.get("other_tracks", [])) | (track > planned.get("last_track", np.inf))
     if planned.get("pattern") == "loops":
-        return track - 1
-    off_leg = track == planned.get("cross_track")
+        return np.where(away, -1, track - 1 - np.searchsorted(planned.get("other_tracks", []), track))
+    off_leg = away | (track == planned.get("cross_track"))
     if yaw is not None:
         off_leg |= is_turning(yaw)
-    legs = leg_numbers(reference)
+    legs = np.full(len(track), -1)
+    legs[~away] = leg_numbers(reference[~away])
     return np.where(off_leg, -1, legs + np.searchsorted(planned.get("legs_after_gaps", ()), legs, side="right"))
 
 
@@ -89,15 +91,22 @@ def control_metrics(truth: Truth) -> dict[str, float | None]:
     """Returns `control.*` of metrics.json, without slowed_s and held_s.
 
     The horizontal cross-track error is over the frames in which the vehicle travels, the altitude error over all
-    frames, the station-keeping error (3-D distance) over those at which it keeps station.
+    frames, the station-keeping error (3-D distance) over those at which it keeps station. Of a path that follows the
+    floor, the height error is that from `plan.altitude_m` above the true floor, smoothed over an image.
     """
     n = min(len(truth.trajectory), len(truth.reference))
     offset = truth.trajectory.positions[:n] - truth.reference[:n]
     holding, direction = truth.holding[:n], travel_direction(truth.reference[:n])
     across = direction[:, 0] * offset[:, 1] - direction[:, 1] * offset[:, 0]
+    height = {"height_error_rmse_m": None, "least_height_m": None}
+    if truth.heights_to_follow is not None and n:
+        x, y, z = truth.trajectory.positions[:n].T
+        wanted_m, floor_m = truth.heights_to_follow(x, y)
+        height = {"height_error_rmse_m": rms(z - wanted_m), "least_height_m": percentile(z - floor_m, 0)}
     return {
         "cross_track_rmse_m": rms(across[~holding]),
         "altitude_rmse_m": rms(offset[:, 2]),
+        **height,
         "station_keeping_rmse_m": rms(np.linalg.norm(offset[holding], axis=1)),
     }
 

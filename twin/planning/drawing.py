@@ -35,7 +35,7 @@ def draw(summary: PlanSummary, file: Path) -> Path:
         _draw_floor(plan, summary)
         _draw_holes(plan, mission)
         _draw_path(plan, summary)
-        add_coordinates(plan, mission.terrain.georeference)
+        add_coordinates(plan, mission.chart.georeference)
         _draw_overlap(overlap, summary)
         plan.set(xlabel="x, east [m]", ylabel="y, north [m]", title=f"Plan of {mission.scenario.name}")
         overlap.set(xlabel="x, east [m]", title="Overlap over the floor")
@@ -49,7 +49,7 @@ def draw(summary: PlanSummary, file: Path) -> Path:
 
 def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
     """Draws the overlap of each image pair midway between its two cameras; outlined where it is insufficient."""
-    floor, t = summary.floor, summary.mission.terrain
+    floor, t = summary.floor, summary.mission.chart
     along, across = required_overlaps(summary.mission)
     axes.set(xlim=(t.west_m, t.east_m), ylim=(t.south_m, t.north_m))
     _draw_area(axes, summary.mission)
@@ -72,7 +72,7 @@ def _draw_overlap(axes: Axes, summary: PlanSummary) -> None:
 
 def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
     mission = summary.mission
-    t, top = mission.terrain, summary.floor.surface
+    t, top = mission.chart, summary.floor.surface
     x, y = np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
     hole = t.in_hole(*np.meshgrid(x, y))
     height, top_m = (surface.height_at(*np.meshgrid(x, y)) for surface in (t, top))
@@ -89,7 +89,7 @@ def _draw_floor(axes: Axes, summary: PlanSummary) -> None:
 
 
 def _draw_holes(axes: Axes, mission: Mission) -> None:
-    t = mission.terrain
+    t = mission.chart
     x, y = np.meshgrid(
         np.linspace(t.west_m, t.east_m, _SHADE_SAMPLES), np.linspace(t.north_m, t.south_m, _SHADE_SAMPLES)
     )
@@ -104,7 +104,7 @@ def _draw_holes(axes: Axes, mission: Mission) -> None:
 
 
 def _extent(mission: Mission) -> tuple[float, float, float, float]:
-    t = mission.terrain
+    t = mission.chart
     return t.west_m, t.east_m, t.south_m, t.north_m
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from twin.judge.map_error import KEYS as MAP_KEYS
 from twin.judge.metrics import empty_metrics
 from twin.scenario.model import Scenario
 
@@ -18,6 +19,7 @@ OBSERVATION_KEYS = ("row", "n_points", "contrast")
 _TRACK = {"track": 0} | dict.fromkeys(
     ("before_ga_rmse_m", "after_ga_rmse_m", "farthest_error_m", "ga_ms", "nodes", "edges")
 )
+_TASK = {"name": "", "track": 0} | dict.fromkeys((*MAP_KEYS, "area_map_le90_m", "error_before_m", "error_after_m"))
 _INDEX = {
     "frames": [0],
     "tracks": [0],
@@ -36,7 +38,9 @@ def checked_metrics(metrics: Any) -> dict[str, Any]:
     sentences = {"warnings": [""], "idealisations": [""]}
     require = {_ANY: {"value": None, "limit": 0.0, "passed": False}}
     return conform(
-        metrics, template | texts | optional | sentences | {"tracks": [_TRACK], "require": require}, complete=True
+        metrics,
+        template | texts | optional | sentences | {"tracks": [_TRACK], "tasks": [_TASK], "require": require},
+        complete=True,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -23,6 +23,7 @@ from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajec
 from twin.core.timing import Stopwatch
 from twin.errors import TwinError
 from twin.exchange import posegraph
+from twin.judge.task_errors import SurveyedTask
 from twin.report.replay_description import RunDescription
 from twin.scenario import file as scenario_file
 from twin.scenario.model import Scenario
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 #: Optional outputs of `RunFolder.finish`: HTML report, Rerun recording.
 OPTIONAL_OUTPUTS = ("report", "recording")
 #: Glob patterns of the files that each interruptible stage of the writing creates.
-_FILES = {"maps": ("*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
+_FILES = {"maps": ("*.tif", "task_*/*.tif", "mesh.glb"), "report": ("report.html",), "recording": ("run.rrd",)}
 _ERROR_LAYER = "estimated minus true elevation [m]"  # description of the band of dem_error.tif
 _RESERVE_BYTES = 4 * 2**20  # size of a file deleted before the results are written, to free space on a full disk
 
@@ -66,6 +67,7 @@ class SurveyRecord:
     stopwatch: Stopwatch
     metrics: dict[str, Any]  # contents of metrics.json
     georeference: Georeference | None = None  # None: rasters are in scene coordinates
+    tasks: Sequence[SurveyedTask] = ()  # their maps are written to task_1, task_2, ...
     has_orthomosaic: bool = False  # whether mosaic.tif exists; otherwise it is written with the cells of the map
     recorded_truth: Trajectory | None = None  # of all frames, in the world of the estimates
     recorded_heights_m: NDArray[np.float32] | None = None  # (rows, cols) along the axis of height of the map
@@ -213,8 +215,16 @@ class RunFolder:
                 }
                 geotiff.write_masks(self.path / "objects_truth.tif", masks, grid, origin)
             if elevation is not None:
-                error_m = np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
-                geotiff.write_layer(self.path / "dem_error.tif", error_m, grid, _ERROR_LAYER, origin)
+                geotiff.write_layer(self.path / "dem_error.tif", _error_m(elevation, truth), grid, _ERROR_LAYER, origin)
+        for number, task in enumerate(record.tasks, 1):
+            if task.elevation is None:
+                continue
+            folder, cells = self.path / f"task_{number}", task.elevation.grid
+            folder.mkdir(exist_ok=True)
+            geotiff.write_map(folder, task.elevation, origin)
+            geotiff.write_elevations(folder / "dem_truth.tif", task.truth.height_m, cells, "true elevation [m]", origin)
+            error_m = _error_m(task.elevation, task.truth)
+            geotiff.write_layer(folder / "dem_error.tif", error_m, cells, _ERROR_LAYER, origin)
         if record.recorded_heights_m is not None and elevation is not None:
             grid, true_m = elevation.grid, record.recorded_heights_m
             geotiff.write_elevations(self.path / "dem_truth.tif", true_m, grid, "true elevation [m]")
@@ -232,6 +242,10 @@ class RunFolder:
             from twin.report import recording
 
             recording.write_recording(self.path, metrics)
+
+
+def _error_m(elevation: ElevationMap, truth: Truth) -> NDArray[np.float32]:
+    return np.where(truth.seen, elevation.height_m - truth.height_m, np.nan).astype(np.float32)
 
 
 @cache

@@ -154,6 +154,16 @@ class TerrainConfig(Section):
     """height of full white above full black in a PNG height file [m]"""
     z: Literal["up", "down"] | None = None
     """direction of growing values of height_file: up, or down for depths; default: found from the file, or an error"""
+    prior: Literal["floor", "none"] = "floor"
+    """what is known of the sea floor before the survey, over which it is planned. floor: its heights, those of
+    prior_file, or the true ones with prior_smoothing_m and prior_offset_m; none: only its height at the start"""
+    prior_file: FilePath | None = None
+    """DEM that is known before the survey, in the CRS and the vertical datum of height_file; ${TWIN_DATA} is expanded;
+    default: height_file itself"""
+    prior_smoothing_m: float = Field(default=0.0, ge=0, le=1000)
+    """standard deviation of the Gaussian filter by which the known heights are smoother than the true ones [m]"""
+    prior_offset_m: float = Field(default=0.0, ge=-20, le=20)
+    """known heights minus true ones, a constant [m]"""
     cover: Literal["sand", "rubble", "rock", "reef", "coral", "seagrass", "mud"] | None = None
     """materials of a generated texture; reef: sand, rubble, rock and coral by height and slope; coral: sand, fragments
     of coral and rock with crustose algae; default: that of the kind of floor; not with texture_file"""
@@ -712,6 +722,13 @@ class NavigationConfig(Section):
     """standard deviation of each axis of an acoustic position fix [m]"""
     usbl_interval_s: float = Field(default=1.0, gt=0, le=3600)
     """shortest time between acoustic fixes, each taken at a keyframe [s]"""
+    altimeter_range_m: tuple[Metres, Metres] = (0.3, 50.0)
+    """nearest and farthest sea floor that the altimeter measures, for control.height = "altimeter"; 0.3: from there on
+    the echo sounder Ping of Blue Robotics measures [m]"""
+    altimeter_beam_deg: float = Field(default=6.0, ge=0, le=60)
+    """width of its beam, whose nearest echo it returns; a narrow one; 25 to 30: Ping [deg]"""
+    altimeter_sigma: float = Field(default=0.005, ge=0, le=0.5)
+    """standard deviation of its noise, a fraction of the range"""
     beacon_sigma_px: float = Field(default=SensorNoise.beacon_px, gt=0, le=50)
     """standard deviation of column and row of a beacon in the image [px]"""
 
@@ -787,6 +804,9 @@ class PlanConfig(Section):
     """number of lines across the legs that are flown after them, as a last track; 0: none"""
     cross_rise_m: float = Field(default=0.0, ge=0, le=20)
     """height of the cross lines above the legs: a second altitude shows wrong scales [m]"""
+    fill_gaps: bool = False
+    """true: after the last track, the vehicle flies legs over the parts of the area that fewer than two keyframes show,
+    by the estimated poses and depths, until none is left or a second track of such legs has not covered them"""
     clearance_m: float = Field(default=0.3, ge=0, le=10)
     """smallest allowed vertical distance from the cameras to the sea floor in their images or, with height = "floor",
     within 0.4 m plus this distance around them [m]"""
@@ -848,6 +868,35 @@ class ObjectConfig(Section):
     other entries too (Poisson disc); scattered objects never overlap any object [m]"""
 
 
+class TaskConfig(Section):
+    """Close survey of a target, for which the survey is broken off at the end of a leg; afterwards the vehicle returns.
+
+    Its keyframes have an elevation map of their own, in the frame of the map of the area.
+    """
+
+    name: str = Field(default="target", min_length=1, max_length=40)
+    """name of the target for reports"""
+    position_m: Vector2
+    """centre of the target: x, y in the scene [m]"""
+    size_m: tuple[Metres, Metres] = (1.0, 1.0)
+    """extent along and across the legs of the survey [m]"""
+    altitude_m: Metres = 1.0
+    """height of the cameras above the sea floor around the target [m]"""
+    speed_mps: float = Field(default=0.1, gt=0.01, le=2)
+    """speed along the legs [m/s]"""
+    overlap_along: float = Field(default=0.9, gt=0, lt=1)
+    """overlap of consecutive keyframes, a fraction of the image width"""
+    overlap_across: float = Field(default=0.8, gt=0, lt=1)
+    """sidelap of neighbouring legs, a fraction of the footprint"""
+    after_track: int | None = Field(default=None, ge=1, le=10_000)
+    """number of the planned track after which the survey is broken off; default: see start_s"""
+    start_s: float | None = Field(default=None, ge=0, le=1e6)
+    """time from which on the survey is broken off, at the next end of a leg; default: at the end of a leg that is
+    nearest to the target [s]"""
+    cell_m: float | None = Field(default=None, gt=0.0005, le=1)
+    """cell size of its map; default: map.cell_m in the ratio of the altitudes [m]"""
+
+
 class ControlConfig(Section):
     """Trajectory following and station keeping."""
 
@@ -856,6 +905,10 @@ class ControlConfig(Section):
     twin.controllers; it runs code of that package"""
     hold_s: float = Field(default=2.0, ge=0.1, le=600)
     """station keeping at the end of a track, during global alignment [s]"""
+    height: Literal["planned", "altimeter", "map"] = "planned"
+    """height of the path. planned: as planned; altimeter, map: plan.altitude_m above the smoothed sea floor as measured
+    during the survey, by the altimeter below the vehicle or by the stereo points of the keyframes so far, from which it
+    also rises over obstacles (plan.clearance_m); where nothing has been measured yet, the floor is taken to continue"""
     natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10)
     """natural frequency of the closed position loop [rad/s]"""
     latency: Literal["none"] | Latency = "none"
@@ -1003,6 +1056,8 @@ class Scenario(Section):
     """small lights at surveyed positions"""
     objects: tuple[ObjectConfig, ...] = Field(default=(), max_length=1000)
     """objects on the sea floor"""
+    tasks: tuple[TaskConfig, ...] = Field(default=(), max_length=100)
+    """close surveys of targets within the survey"""
     faults: tuple[FaultConfig, ...] = Field(default=(), max_length=100)
     """faults of thrusters, cameras and navigation sensors"""
     require: dict[str, Number] = {}

@@ -9,6 +9,9 @@ from functools import partial
 from importlib.metadata import version
 from typing import NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from twin.core.interrupts import StageGuard
 from twin.core.quality import Finding
 from twin.core.records import ElevationMap, MapGrid, SurveyResult
@@ -31,10 +34,12 @@ class Estimation(NamedTuple):
     progress: Callable[[str, float], None]  #: called with a stage ("map", "orthomosaic", "report") and its done share
     start_s: float  #: value of `time.perf_counter` at the start of the run
 
-    def build_map(self, result: SurveyResult, grid: MapGrid | None) -> ElevationMap | None:
-        """Returns the elevation map; None if an interrupt ends the stage or there are no keyframes."""
+    def build_map(
+        self, result: SurveyResult, grid: MapGrid | None, chosen: NDArray[np.bool_] | None = None
+    ) -> ElevationMap | None:
+        """Returns the elevation map from the chosen keyframes; None without any, or if an interrupt ends the stage."""
         report = partial(self.progress, "map")
-        return self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report))
+        return self.guard.attempt("map", lambda: self.navigator.build_map(result, grid, report, chosen))
 
 
 class Maps(NamedTuple):
@@ -43,6 +48,7 @@ class Maps(NamedTuple):
     elevation: ElevationMap | None
     orthomosaic: dict[str, float | None] | None = None  #: `orthomosaic.*` of metrics.json; None if none was made
     n_tiles: int = 0  #: number of tiles of a map in tiles
+    details: tuple[ElevationMap | None, ...] = ()  #: map of each task of a survey
 
 
 class RunKind(Protocol):

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core.ortho_tiles import mean_colours, window
-from twin.core.quality import ActionTimes, Finding
+from twin.core.quality import ActionTimes, Finding, Gaps
 from twin.core.records import ElevationMap, SurveyResult, Truth
 from twin.judge.metrics import EvaluationInput
 from twin.judge.orthomosaic_errors import OrthomosaicJudge
+from twin.judge.task_errors import SurveyedTask
 from twin.plugin.navigator import NOTE
 from twin.report.run_writer import PlannedTruth, SurveyRecord
 from twin.scenario.idealisations import idealisations
@@ -20,7 +22,7 @@ from twin.scenario.model import Scenario
 from twin.session.conclusion import Estimation, Maps
 from twin.session.survey_check import calibration_notes, survey_findings
 from twin.world.floor_forecast import planned_overlap
-from twin.world.mission import Mission
+from twin.world.mission import Detail, Mission
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,27 @@ class FlownSurvey:
     truth: Truth
     world_warnings: Sequence[str]  #: sentences on limits of the simulation
     actions: ActionTimes  #: durations for which the mission slowed and stopped the vehicle
+    gaps: Gaps = Gaps()
+    #: returns the truth at the cells of the map of a task, from that of the survey and the rows of its keyframes
+    detail_truth: Callable[[Detail, Truth, NDArray[np.int64]], Truth] | None = None
+
+    def _keyframes_of_area(self, result: SurveyResult) -> NDArray[np.bool_] | None:
+        """Returns the mask (n,) of the keyframes of the map of the area: all but those of tasks; None: all."""
+        tracks = [detail.track for detail in self.mission.details]
+        return ~np.isin(result.track_of_keyframe, tracks) if tracks else None
 
     def maps(self, estimation: Estimation, result: SurveyResult) -> Maps:
         """Builds the elevation map and, if maps are written or it is judged, the orthomosaic of the scenario."""
+        chosen, track_of = self._keyframes_of_area(result), result.track_of_keyframe
         with estimation.stopwatch("map"):
-            elevation = estimation.build_map(result, self.mission.grid)
+            elevation = estimation.build_map(result, self.mission.grid, chosen)
+            details = tuple(estimation.build_map(result, d.grid, track_of == d.track) for d in self.mission.details)
+        return self._with_orthomosaic(estimation, result, elevation, chosen)._replace(details=details)
+
+    def _with_orthomosaic(
+        self, estimation: Estimation, result: SurveyResult, elevation: ElevationMap | None,
+        chosen: NDArray[np.bool_] | None,
+    ) -> Maps:  # fmt: skip
         scenario = self.mission.scenario
         required = any(name.startswith("orthomosaic.") for name in scenario.require)
         if elevation is None or not (scenario.map.orthomosaic and (estimation.folder.writes_maps or required)):
@@ -44,7 +62,7 @@ class FlownSurvey:
 
         def without_file_errors() -> Maps | None:
             try:
-                return make_orthomosaic(self.mission, self.truth, estimation, result, elevation)
+                return make_orthomosaic(self.mission, self.truth, estimation, result, elevation, chosen)
             except OSError as error:
                 guard.cause = guard.cause or str(error)
                 return None
@@ -62,7 +80,7 @@ class FlownSurvey:
         warnings = [
             *plugin_notes(scenario), *mission.hole_notes, *self.world_warnings,
             *calibration_notes(result, mission.rig), *result.quality.repeat_notes, *result.quality.reading_notes,
-            *filter(None, [actions.sentence]),
+            *filter(None, [actions.sentence, self.gaps.sentence]),
         ]  # fmt: skip
         return EvaluationInput(
             result,
@@ -77,7 +95,19 @@ class FlownSurvey:
             idealisations=idealisations(scenario),
             water=mission.clarity._asdict(),
             actions=actions,
+            gaps=self.gaps,
+            tasks=self._tasks(result, maps),
         )
+
+    def _tasks(self, result: SurveyResult, maps: Maps) -> list[SurveyedTask]:
+        if self.detail_truth is None:
+            return []
+        found, (x, y) = list[SurveyedTask](), np.meshgrid(*self.mission.grid.centres())
+        for detail, elevation in zip(self.mission.details, maps.details, strict=True):
+            rows = result.keyframe_rows[result.track_of_keyframe == detail.track]
+            truth = self.detail_truth(detail, self.truth, rows[rows < len(self.truth.trajectory)])
+            found.append(SurveyedTask(detail.name, detail.track, elevation, truth, detail.area.contains(x, y)))
+        return found
 
     def record(self, survey: EvaluationInput, written: SurveyRecord) -> SurveyRecord:
         mission = self.mission
@@ -87,6 +117,7 @@ class FlownSurvey:
             n_frames_per_keyframe=mission.plan.n_frames_per_keyframe,
             georeference=mission.terrain.georeference,
             has_orthomosaic=survey.orthomosaic is not None,
+            tasks=survey.tasks,
         )
 
 
@@ -100,8 +131,9 @@ def plugin_notes(scenario: Scenario) -> list[str]:
 
 
 def make_orthomosaic(
-    mission: Mission, truth: Truth, estimation: Estimation, result: SurveyResult, elevation: ElevationMap
-) -> Maps | None:
+    mission: Mission, truth: Truth, estimation: Estimation, result: SurveyResult, elevation: ElevationMap,
+    chosen: NDArray[np.bool_] | None = None,
+) -> Maps | None:  # fmt: skip
     """Makes the orthomosaic of a survey, writes it if the run folder keeps maps, and compares it with the truth.
 
     It is made from the images, the estimated poses and map, and, for the restoration of colours, from the lamps and the
@@ -119,7 +151,7 @@ def make_orthomosaic(
 
             restore = Restoration(mission.scenario, mission.illumination, mission.rig, elevation)
         report = partial(estimation.progress, "orthomosaic")
-        tiles = estimation.navigator.orthomosaic(result, elevation, restore, report) or iter(())
+        tiles = estimation.navigator.orthomosaic(result, elevation, restore, report, chosen) or iter(())
         first = tile = next(tiles, None)
     if first is None:
         return None

@@ -21,6 +21,7 @@ from twin.session.mission_actions import MissionActions
 from twin.world.mission import Mission, prepare
 from twin.world.mission_flight import Flight
 from twin.world.pace import FULL, Pace
+from twin.world.path_adaptation import PathAdaptation
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
 
@@ -45,6 +46,7 @@ class SteppedWorld:
         self._mission = prepare(scenario)
         self._open = ExitStack()
         self._flight: Flight | None = None
+        self._estimators: Estimators | None = None
         self._stopwatch = Stopwatch()
 
     def __enter__(self) -> Self:
@@ -55,7 +57,7 @@ class SteppedWorld:
 
     def close(self) -> None:
         """Ends the flight: closes its estimators and releases the OpenGL context; `reset` can start another flight."""
-        self._flight = None
+        self._flight = self._estimators = None
         self._open.close()
 
     def reset(self, seed: int | None = None) -> Frame:
@@ -118,18 +120,27 @@ class SteppedWorld:
         """
         if folder is None:
             folder = Path(self._open.enter_context(TemporaryDirectory(prefix="twin-")))
-        return self._open.enter_context(make_navigator(self._mission, self.world, folder, self._stopwatch))
+        opened = self._open.enter_context(make_navigator(self._mission, self.world, folder, self._stopwatch))
+        self._estimators = opened
+        return opened
 
     def pilot(self) -> Callable[[Estimate, Frame], Array]:
         """Returns the controller of the scenario: a function from the estimate of a frame and this frame to a command.
 
-        It steers to the planned reference of the current frame. Raises TwinError if the plug-in that the scenario names
-        cannot be loaded.
+        It steers to the reference of the current frame, and adapts the path to what `estimator` has measured, as
+        `control.height` and `plan.fill_gaps` ask. Raises TwinError if the plug-in that the scenario names cannot be
+        loaded.
         """
         steer, flight = make_pilot(self._mission), self.flight
-        return lambda estimate, frame: steer(
-            without_feedback(estimate, flight.reference, frame.readings), flight.reference
-        )
+        adapt = PathAdaptation(flight)
+
+        def command(estimate: Estimate, frame: Frame) -> Array:
+            found = steer(without_feedback(estimate, flight.reference, frame.readings), flight.reference)
+            if self._estimators is not None:
+                adapt(frame, estimate, self._estimators)
+            return found
+
+        return command
 
     def actions(self) -> MissionActions:
         """Returns the actions in poor visibility: a function from an estimate to the pace towards the next frame."""

@@ -10,12 +10,14 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.height_field import HeightField, cast_camera_ray
 from twin.core.records import BeaconDetection, Depth, ImuReadings, Readings, SensorNoise, StereoRig
 from twin.errors import TwinError
 from twin.kernels import kernel
 from twin.scenario.model import ImuConfig, NavigationConfig
 from twin.simulate.hydrodynamics import GRAVITY_MPS2
 
+_BEAM_RINGS, _BEAM_RAYS = 2, 8  # rays of the altimeter's beam: one on its axis, and rings around it
 _BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded
 
 
@@ -31,6 +33,31 @@ class PerFrameSensors(NamedTuple):
     has_pressure: bool
     has_ahrs: bool
     has_dvl: bool
+
+
+class Altimeter:
+    """Echo sounder at the left camera that looks along its optical axis; it returns the nearest echo within its beam.
+
+    Args:
+        floor: true floor, with its objects.
+    """
+
+    def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
+        self._settings, self._floor, self._rng = settings, floor, rng
+        rings = np.tan(np.deg2rad(settings.altimeter_beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
+        angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
+        ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        self._rays = np.concatenate([np.zeros((1, 2)), *(radius * ring for radius in rings)])
+
+    def read(self, world_from_camera: Array) -> float | None:
+        """Returns the distance to the floor [m]; None outside the range of the sensor."""
+        number = float(self._rng.standard_normal())
+        depths = [cast_camera_ray(self._floor, world_from_camera, a, b) for a, b in self._rays.tolist()]
+        distance_m = float(np.min(np.array(depths) * np.sqrt(1 + (self._rays**2).sum(axis=1))))
+        nearest_m, farthest_m = self._settings.altimeter_range_m
+        if not nearest_m <= distance_m <= farthest_m:
+            return None
+        return distance_m * (1 + self._settings.altimeter_sigma * number)
 
 
 class NavigationSensors:

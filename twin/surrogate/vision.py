@@ -124,8 +124,11 @@ class SurrogateVision:
         self._tracked_view = view  # of the keyframe whose points are tracked
         self.floor = height_field(terrain.height_m, terrain.spacing_m, terrain.west_m, terrain.south_m)
         self.rig = rig = mission.rig.binned(matchability.binning)
-        heights = true_heights(mission.grid, terrain.height_at)
-        self.map_model = MapModel(mission.grid, heights, rig, self.floor, matchability, view)
+        floor = self.floor
+        self._map_model_of: Callable[[MapGrid], MapModel] = lambda grid: MapModel(
+            grid, true_heights(grid, terrain.height_at), rig, floor, matchability, view
+        )
+        self.map_model = self._map_model_of(mission.grid)
         self.settings, self.model, self.stopwatch = settings, model, stopwatch
         self._true_pose, self._rng = true_pose, rng
         margin_px = float(stereo.margin_px(settings.patch_px))
@@ -360,7 +363,8 @@ class SurrogateVision:
     def build_map(
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
-        mapper, map_model, rng = elevation.ElevationMapper(grid), self.map_model, self._rng
+        mapper, rng = elevation.ElevationMapper(grid), self._rng
+        map_model = self.map_model if grid == self.map_model.grid else self._map_model_of(grid)
         calibration = result.quality.calibration
         map_model.calibrate(calibration)
         noise = map_model.new_noise(self.model, rng)

@@ -14,13 +14,11 @@ from twin.core.records import MapGrid
 from twin.judge.swaths import KeyframePoses, image_pairs
 from twin.terrains import Terrain
 from twin.world.mission import Mission
-from twin.world.observed_cells import Coverage
+from twin.world.observed_cells import seen_over
 from twin.world.planning import floor_of, planned_keyframes, thinned
 from twin.world.top_surface import with_objects
 
-#: Approximate number of columns of the binned depth images from which the coverage is computed, and largest number of
-#: grid cells along the longer side of the terrain.
-_COVERAGE_COLUMNS, _COVERAGE_CELLS = 80, 1000
+_COVERAGE_CELLS = 1000  #: largest number of cells of the grid of the coverage along the longer side of the terrain
 
 
 class Spread(NamedTuple):
@@ -58,9 +56,9 @@ class PlannedOverlap(NamedTuple):
 
 
 def planned_surface(mission: Mission) -> Terrain:
-    """Returns the floor with its objects as seen from above; the surrogate, which simulates none, sees the floor."""
-    if not mission.objects or mission.scenario.imaging.fidelity != "rendered":
-        return mission.terrain
+    """Returns the floor as known before the survey; the true one with its objects, which the surrogate lacks."""
+    if mission.chart is not mission.terrain or not mission.objects or mission.scenario.imaging.fidelity != "rendered":
+        return mission.chart
     return with_objects(mission.terrain, mission.objects)
 
 
@@ -90,7 +88,7 @@ def forecast_over_floor(mission: Mission) -> FloorForecast:
         surface=surface,
         keyframes=keyframes,
         depth_m=depth,
-        altitude_m=np.where(mission.terrain.in_hole(x, y), np.nan, z - surface.height_at(x, y)),
+        altitude_m=np.where(mission.chart.in_hole(x, y), np.nan, z - surface.height_at(x, y)),
         clearance_m=nearest,  # the optical axis is vertical
         footprint_m=median[:, None] * [rig.width_px / rig.fx_px, rig.height_px / rig.fy_px],
         gsd_m=median / rig.focal_px,
@@ -118,15 +116,11 @@ def _row_statistic(statistic, values: Array) -> Array:
 
 
 def _coverage(mission: Mission, field: HeightField, poses: Array) -> float:
-    small, grid = mission.rig.binned(max(1, mission.rig.width_px // _COVERAGE_COLUMNS)), _grid_of_terrain(mission)
-    coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
-    shape = small.height_px, small.width_px
-    for left in poses:
-        pair = cast_pixels(field, np.stack([left, left @ small.left_from_right]), small, pixels)
-        coverage.add(left, *(depth.reshape(shape).astype(np.float32) for depth in pair))
+    grid = _grid_of_terrain(mission)
+    seen = seen_over(grid, mission.rig, field, poses)
     x, y = np.meshgrid(*grid.centres())
     asked = mission.asked(x, y)
-    return float(coverage.seen[asked].mean()) if asked.any() else 0.0
+    return float(seen[asked].mean()) if asked.any() else 0.0
 
 
 def _grid_of_terrain(mission: Mission) -> MapGrid:

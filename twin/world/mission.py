@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple, ParamSpec, TypeVar
 
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from twin import terrains
 from twin.controllers import segments
+from twin.controllers.camera_surface import CameraSurface
+from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import SurveyPlan
 from twin.core import geometry
 from twin.core.geometry import Array
@@ -24,11 +26,12 @@ from twin.imaging.scene.object_view import Objects
 from twin.judge.metrics import check_require
 from twin.plugin.guard import check_loadable
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
-from twin.scenario.model import BeaconConfig, Scenario, Source
+from twin.scenario.model import BeaconConfig, Scenario, Source, TaskConfig
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.sea import make_sea
 from twin.simulate.sensors import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
+from twin.world.chart import chart_of
 from twin.world.height_floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
@@ -38,6 +41,7 @@ from twin.world.path_checks import (
     check_lamp,
     check_objects,
     check_speed,
+    check_tasks,
     check_thrust,
     highest_near,
     unknown_share,
@@ -47,6 +51,15 @@ from twin.world.scenario_checks import contradictions, floor_contradictions
 
 P = ParamSpec("P")
 T = TypeVar("T")
+
+
+class Detail(NamedTuple):
+    """Map of a task, apart from that of the area."""
+
+    name: str
+    track: int  #: number of the track from whose keyframes it is made, from 1
+    grid: MapGrid
+    area: SurveyArea  #: rectangle that the task asked for
 
 
 class Step(NamedTuple):
@@ -83,6 +96,7 @@ class Mission:
 
     scenario: Scenario
     terrain: terrains.Terrain  #: sea floor as a height grid; of a mesh floor, that of its highest surface
+    chart: terrains.Terrain  #: sea floor as it is known before the survey, over which it is planned
     plan: SurveyPlan
     rig: StereoRig  #: calibration that the estimators use
     grid: MapGrid  #: cells of the map
@@ -120,6 +134,20 @@ class Mission:
         return self.plan.inside_area(x_m, y_m) & ~self.terrain.in_hole(x_m, y_m)
 
     @property
+    def details(self) -> tuple[Detail, ...]:
+        """Returns the maps of the tasks, in the order in which they are flown."""
+        tasks = {task.name: task for task in self.scenario.tasks}
+        return tuple(self._detail(tasks[detour.name], detour.track) for detour in self.plan.detours)
+
+    def _detail(self, task: TaskConfig, track: int) -> Detail:
+        area = SurveyArea("rectangle", task.size_m, task.position_m, self.plan.area.heading)
+        ratio = min(1.0, task.altitude_m / self.plan.request.altitude_m)
+        cell_m = round(self.scenario.map.cell_m * ratio, 4) if task.cell_m is None else task.cell_m
+        (west, south), (east, north) = (f(area.outline(), axis=0) for f in (np.min, np.max))
+        n = np.ceil(np.array([north - south, east - west]) / cell_m - 1e-9).astype(int).tolist()
+        return Detail(task.name, track, MapGrid(float(west), float(north), cell_m, *n), area)
+
+    @property
     def hole_notes(self) -> list[str]:
         """Returns sentences on floor without a height: how much of the floor, and of the asked area."""
         share = unknown_share(self.plan, self.terrain)
@@ -129,6 +157,12 @@ class Mission:
     @property
     def tracks(self) -> range:
         return range(1, self.plan.n_tracks + 1)
+
+    def above(self, surface: CameraSurface | None) -> Mission:
+        """Returns the mission with a path that follows another surface; None: the planned one."""
+        if surface is None:
+            return self
+        return replace(self, plan=replace(self.plan, request=self.plan.request._replace(surface=surface)))
 
     def planned_frames(self, track: int) -> FrameSequence:
         times_s, keyframes = self.plan.frames_of_track(track)
@@ -178,7 +212,8 @@ def prepare(scenario: Scenario) -> Mission:
     errors = _Errors(scenario.source)
     faults = list(floor_contradictions(scenario.terrain))
     terrain, mesh_floor = (None if faults else errors.attempt(_load_floor, scenario)) or (None, None)
-    plan = errors.attempt(plan_survey, scenario, terrain)
+    chart = None if terrain is None else errors.attempt(chart_of, scenario, terrain)
+    plan = None if terrain is not None and chart is None else errors.attempt(plan_survey, scenario, chart)
     errors.lines += [scenario.source.describe(fault) for fault in (*faults, *contradictions(scenario))]
     true_cameras, illumination = _check_equipment(scenario, errors)
     objects, grid = (), None
@@ -187,13 +222,23 @@ def prepare(scenario: Scenario) -> Mission:
         for k, beacon in enumerate(scenario.beacons):
             errors.attempt(_check_beacon, k, beacon, terrain)
     errors.attempt(check_speed, scenario.vehicle, scenario.plan, (plan or scenario.plan).speed_mps)
-    if terrain is not None and plan is not None:
-        _check_path(scenario, terrain, plan, objects, errors)
-        grid = errors.attempt(_grid, scenario.map.cell_m, plan, terrain)
-    if errors.lines or terrain is None or plan is None or grid is None or true_cameras is None or illumination is None:
+    if terrain is not None and chart is not None and plan is not None:
+        _check_path(scenario, chart, plan, objects if chart is terrain else (), errors)
+        grid = errors.attempt(
+            _grid, scenario.map.cell_m, plan, {id(floor): floor for floor in (chart, terrain)}.values()
+        )
+    if (
+        errors.lines
+        or terrain is None
+        or chart is None
+        or plan is None
+        or grid is None
+        or true_cameras is None
+        or illumination is None
+    ):
         raise ScenarioError(errors.lines)
     return Mission(
-        scenario, terrain, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects, mesh_floor
+        scenario, terrain, chart, plan, scenario.believed_rig(), grid, true_cameras, illumination, objects, mesh_floor
     )
 
 
@@ -241,6 +286,7 @@ def _check_path(
 ) -> None:
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
+    errors.attempt(check_tasks, plan, terrain, scenario.plan.clearance_m)
     if (sea := errors.attempt(make_sea, scenario)) is not None:
         errors.attempt(check_thrust, scenario.vehicle, sea, plan)
     camera_m = scenario.believed_rig().body_from_camera[:3, 3]
@@ -248,9 +294,9 @@ def _check_path(
         errors.attempt(check_lamp, k, np.array(lamp.position_m), camera_m, terrain, plan)
 
 
-def _grid(cell_m: float, plan: SurveyPlan, terrain: terrains.Terrain) -> MapGrid:
+def _grid(cell_m: float, plan: SurveyPlan, floors: Iterable[terrains.Terrain]) -> MapGrid:
     """Returns the grid of the map: a rectangle that contains the footprints along the path and a margin of 0.5 m."""
-    widest = max(1.0, _greatest_altitude_m(plan, terrain) / plan.request.altitude_m)
+    widest = max(1.0, *(_greatest_altitude_m(plan, floor) / plan.request.altitude_m for floor in floors))
     corners, margin = plan.outline()[:, :2], np.array(_half_extent_m(plan)) * widest + 0.5
     west, south = np.floor((corners.min(axis=0) - margin) / cell_m) * cell_m
     east, north = np.ceil((corners.max(axis=0) + margin) / cell_m) * cell_m

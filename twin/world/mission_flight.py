@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
-from twin.controllers.segments import Reference
+from twin.controllers.camera_surface import CameraSurface
+from twin.controllers.detours import end_of
+from twin.controllers.segments import Point, Reference, Segment
 from twin.core.geometry import Array
 from twin.core.records import Frame
+from twin.world.height_change import HeightChange
 from twin.world.mission import FrameSequence, Mission
 from twin.world.pace import FULL, Pace
 from twin.world.world import FastForward, World
+
+_UNCHANGED = HeightChange(0.0, 0.0, 0)
 
 
 class Flight:
@@ -22,12 +28,16 @@ class Flight:
         aligns: whether the network is aligned before the current frame is estimated: it is the first one of the second
             half of the station keeping after a track.
         n_skipped: number of frames that `fast_forward` simulated in the last step.
+        further_path: called with the last reference and the end of the path after its last track; returns the path of
+            one more track, () for none.
     """
 
     def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
         self.mission, self.world = mission, world
         self._fast_forward, self._parts = fast_forward, self._planned_parts()
+        self._mission, self._change = mission, _UNCHANGED  # with the heights that the path has now
         self.aligns, self.n_skipped = False, 0
+        self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda *_: ()
 
     @property
     def track(self) -> int:
@@ -40,6 +50,22 @@ class Flight:
     @property
     def holding(self) -> bool:
         return self._step.holding
+
+    def follow(self, surface: CameraSurface) -> None:
+        """Lets the camera follow another surface after this frame, without a step of height or vertical velocity.
+
+        A vehicle that keeps station keeps its height.
+        """
+        if self.holding:
+            return
+        sequence, path_time_s, last = self._sequence, self._path_time_s, self.reference
+        self._mission = self._mission.above(surface)
+        new = self._mission.plan.reference(sequence.track, path_time_s)
+        rate_mps = last.velocity[2] - sequence.rate * new.velocity[2]
+        self._change = HeightChange(float(last.position[2] - new.position[2]), float(rate_mps), len(self.world) - 1)
+        self.world.end_sequence(self._k + 1)
+        self._enter(self._mission.next_frames(sequence.track, path_time_s, FULL))
+        self._k = -1
 
     def start(self) -> Frame:
         self._enter(*next(self._parts))
@@ -67,7 +93,7 @@ class Flight:
             self.n_skipped = self._k - k
         else:
             self.world.end_sequence(k)
-            self._enter(self.mission.next_frames(sequence.track, sequence.path_times_s[k - 1], pace))
+            self._enter(self._mission.next_frames(sequence.track, self._path_time_s, pace))
         self.aligns = False
         while self._k == len(self._sequence):
             part = next(self._parts, None)
@@ -79,15 +105,28 @@ class Flight:
     def _planned_parts(self) -> Iterator[tuple[FrameSequence, bool]]:
         """Yields the planned sequences, each with the value of `aligns` at its first frame."""
         for track in self.mission.tracks:
-            yield self.mission.planned_frames(track), False
-            yield self.mission.station_keeping_frames(track), False
-            yield self.mission.station_keeping_frames(track), True
+            yield from self._parts_of(track)
+        while path := self.further_path(self.reference, end_of(self._mission.plan.paths[-1])):
+            plan = self._mission.plan
+            self._mission = replace(self._mission, plan=replace(plan, paths=(*plan.paths, path)))
+            yield from self._parts_of(self._mission.plan.n_tracks)
+
+    def _parts_of(self, track: int) -> Iterator[tuple[FrameSequence, bool]]:
+        yield self._mission.planned_frames(track), False
+        yield self._mission.station_keeping_frames(track), False
+        yield self._mission.station_keeping_frames(track), True
 
     def _enter(self, sequence: FrameSequence, aligns: bool = False) -> None:
+        if self._change != _UNCHANGED:
+            reference = self._change.added_to(
+                sequence.reference, len(self.world), self.mission.plan.request.frame_rate_hz
+            )
+            sequence = replace(sequence, reference=reference)
         self._sequence, self._k, self.aligns = sequence, 0, aligns
         self.world.start_sequence(sequence)
 
     def _observe(self, keyframe: bool | None = None) -> Frame:
         planned = self._sequence[self._k]
+        self._path_time_s = float(self._sequence.path_times_s[self._k])
         self._step = planned if keyframe is None else planned._replace(keyframe=keyframe)
         return self.world.observe(self._step)

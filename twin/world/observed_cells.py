@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.height_field import HeightField, cast_pixels, ray_grid
 from twin.core.records import Array, MapGrid, StereoRig
 from twin.kernels import kernel
 
@@ -13,6 +14,7 @@ from twin.kernels import kernel
 EDGE_SHARE = 0.05
 #: Tolerance of the left-right depth comparison, as a fraction of the depth.
 DEPTH_TOLERANCE = 0.005
+_COLUMNS = 80  # approximate number of columns of the images of `seen_over`
 
 
 class Coverage:
@@ -39,6 +41,17 @@ class Coverage:
         pose = np.ascontiguousarray(world_from_left, dtype=np.float64)
         left, right = np.ascontiguousarray(depth_left, np.float32), np.ascontiguousarray(depth_right, np.float32)
         _mark_seen(self.seen, raster, pose, camera, left, right, self._top_m)
+
+
+def seen_over(grid: MapGrid, rig: StereoRig, floor: HeightField, poses: Array) -> NDArray[np.bool_]:
+    """Returns the cells (rows, cols) of a grid that a rig at poses (n, 4, 4) observes, from images of fewer pixels."""
+    small = rig.binned(max(1, rig.width_px // _COLUMNS))
+    coverage, pixels = Coverage(grid, small), ray_grid(small, small.width_px)
+    shape = small.height_px, small.width_px
+    for left in poses:
+        pair = cast_pixels(floor, np.stack([left, left @ small.left_from_right]), small, pixels)
+        coverage.add(left, *(depth.reshape(shape).astype(np.float32) for depth in pair))
+    return coverage.seen
 
 
 @kernel

@@ -59,6 +59,19 @@ def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> 
         )
 
 
+def check_tasks(plan: SurveyPlan, terrain: Terrain, clearance_m: float) -> None:
+    """Raises TwinError if the path of a task leaves the terrain or is too near the floor."""
+    for k, detour in enumerate(plan.detours):
+        times_s, _ = plan.frames_of_track(detour.track)
+        x, y, z = plan.references(detour.track, times_s).position.T
+        if not np.isfinite(terrain.height_at(x, y)).all():
+            raise TwinError(f"tasks.{k}.position_m", "the path leaves the terrain", f"inside {terrain.extent}")
+        least_m = float((z - highest_near(terrain, x, y, VEHICLE_REACH_M)).min())
+        if least_m < clearance_m:
+            problem = f"the cameras come within {least_m:.2f} m of the floor"
+            raise TwinError(f"tasks.{k}.altitude_m", problem, f"{clearance_m - least_m:.2f} m more")
+
+
 def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearance:
     """Returns the least clearance of the planned path.
 

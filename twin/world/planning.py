@@ -9,6 +9,7 @@ from scipy.ndimage import uniform_filter1d
 
 from twin.controllers import lawnmower, loops
 from twin.controllers.camera_surface import CameraSurface, surface_above_floor
+from twin.controllers.detours import Task, with_tasks
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import SurveyPlan, SurveyRequest
 from twin.core import geometry
@@ -49,18 +50,53 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     They are not adapted without a terrain or if the path leaves it or leads over its holes, nor the spacing if the path
     meets the floor. Raises TwinError if no plan satisfies the scenario, or it exceeds the limits of `check_plan_size`.
     """
-    request, pattern = survey_request(scenario, terrain), scenario.plan.pattern
-    plan = _PATTERNS[pattern](request)
+    plan, pattern = level_plan(scenario, terrain), scenario.plan.pattern
+    request = plan.request
     check_plan_size(plan, scenario.control.hold_s)
     if terrain is None or not _lies_over(plan, terrain):
         return plan
-    if scenario.plan.height == "floor":
+    if scenario.plan.height == "floor" or scenario.control.height != "planned":
         request = request._replace(surface=_surface(scenario, request, plan.area, terrain))
         plan = _PATTERNS[pattern](request)
     if scenario.plan.overlap_reference == "floor" and _lies_above(plan, terrain):
         plan = _over_floor(plan, pattern, terrain, scenario.believed_rig())
         check_plan_size(plan, scenario.control.hold_s)
-    return plan
+    return _with_tasks(scenario, plan, terrain)
+
+
+def _with_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> SurveyPlan:
+    """Returns the plan with its tasks; raises TwinError, which names the task, if one cannot be planned."""
+    hold_s, n_tracks = scenario.control.hold_s, plan.n_tracks
+    for k, task in enumerate(scenario.tasks):
+        if task.after_track is not None and task.after_track > n_tracks:
+            raise TwinError(f"tasks.{k}.after_track", f"{task.after_track}: no such track", f"1 to {n_tracks}")
+        if not plan.inside_area(*task.position_m):
+            position = "({:g}, {:g})".format(*task.position_m)
+            raise TwinError(f"tasks.{k}.position_m", f"{position} lies outside the area", "a point in the asked area")
+    tasks = [
+        Task(
+            task.name, task.position_m, task.size_m, task.altitude_m,
+            0.0 if plan.follows_floor else _mean_height_m(terrain, task.position_m, task.size_m),
+            task.speed_mps, task.overlap_along, task.overlap_across, task.after_track, task.start_s,
+        )
+        for task in scenario.tasks
+    ]  # fmt: skip
+    for k, task in enumerate(tasks):
+        try:
+            with_tasks(plan, [task], hold_s)
+        except TwinError as error:
+            raise TwinError(error.field.replace("plan.", f"tasks.{k}."), error.problem, error.allowed) from None
+    return with_tasks(plan, tasks, hold_s)
+
+
+def _mean_height_m(terrain: Terrain, centre_m: tuple[float, float], size_m: tuple[float, float]) -> float:
+    east, north = np.meshgrid(*(np.linspace(-0.5, 0.5, 20) * max(size_m) for _ in range(2)))
+    return float(terrain.height_near(centre_m[0] + east, centre_m[1] + north).mean())
+
+
+def level_plan(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
+    """Returns the plan of a survey over the reference plane; raises TwinError like `plan_survey`."""
+    return _PATTERNS[scenario.plan.pattern](survey_request(scenario, terrain))
 
 
 def check_plan_size(plan: SurveyPlan, hold_s: float) -> None:
@@ -113,13 +149,24 @@ def _lies_above(plan: SurveyPlan, terrain: Terrain) -> bool:
 
 def _surface(scenario: Scenario, request: SurveyRequest, area: SurveyArea, terrain: Terrain) -> CameraSurface:
     if scenario.vehicle.dynamics == "kinematic":
-        raise TwinError("plan.height", "'floor': a kinematic vehicle moves in a horizontal plane", '"plane"')
+        planned = scenario.plan.height == "floor"
+        key, allowed = ("plan.height", '"plane"') if planned else ("control.height", '"planned"')
+        value = "floor" if planned else scenario.control.height
+        raise TwinError(key, f"{value!r}: a kinematic vehicle moves in a horizontal plane", allowed)
+    sides, slopes = smoothed_over(scenario, request), climb_slopes(scenario)
+    return surface_above_floor(terrain.height_near, area, terrain.spacing_m, request.altitude_m, sides, slopes)
+
+
+def smoothed_over(scenario: Scenario, request: SurveyRequest) -> tuple[float, float]:
+    """Returns the lengths along and across the legs over which a path that follows the floor averages it [m]."""
     across_m, along_m = request.footprint_m
+    return (along_m if scenario.plan.pattern == "lawnmower" else across_m), across_m
+
+
+def climb_slopes(scenario: Scenario) -> tuple[float, float]:
+    """Returns the greatest slopes of a path that follows the floor, along and across the legs."""
     slope = climb_slope(scenario.vehicle, scenario.plan.speed_mps)
-    footprint_m, slopes = (across_m, across_m), (slope, slope)
-    if scenario.plan.pattern == "lawnmower":
-        footprint_m, slopes = (along_m, across_m), (slope, _ACROSS_SLOPE)
-    return surface_above_floor(terrain.height_near, area, terrain.spacing_m, request.altitude_m, footprint_m, slopes)
+    return slope, _ACROSS_SLOPE if scenario.plan.pattern == "lawnmower" else slope
 
 
 def _over_floor(plan: SurveyPlan, pattern: str, terrain: Terrain, rig: StereoRig) -> SurveyPlan:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.records import Image
+from twin.core.records import Image, MapGrid
 from twin.core.timing import StageTimer
 from twin.imaging.image_formation import ImageFormation
 from twin.imaging.scene.renderer import Renderer
@@ -18,11 +18,12 @@ from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.sea import make_sea
 from twin.simulate.sensors import InertialSensor, NavigationSensors
+from twin.terrains import Terrain
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, Step, motion_rate_hz
 from twin.world.observed_cells import Coverage
 from twin.world.obstacles import Obstacles
-from twin.world.top_surface import TopSurface, top_surface, true_heights
+from twin.world.top_surface import TopSurface, top_surface, true_heights, with_objects
 from twin.world.world import CameraImages, World, streams
 
 
@@ -53,9 +54,13 @@ class RenderedWorld(World):
         image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
         self.camera = StereoCamera(self.renderer, image_formation, scenario, *noise_rngs, stopwatch, cameras)
-        self._surface = _overhanging_surface(mission)
+        self._surface = _overhanging_surface(mission, mission.grid)
         top_m = None if self._surface is None else self._surface.height_m
         self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
+
+    def true_floor(self) -> Terrain:
+        floor, objects = self.mission.terrain, self.mission.objects
+        return with_objects(floor, objects) if objects else floor
 
     def close(self) -> None:
         self.renderer.close()
@@ -72,12 +77,15 @@ class RenderedWorld(World):
     def true_surface(self) -> TopSurface:
         return super().true_surface() if self._surface is None else self._surface
 
+    def surface_on(self, grid: MapGrid) -> TopSurface:
+        return _overhanging_surface(self.mission, grid) or super().surface_on(grid)
+
     def seen(self) -> NDArray[np.bool_]:
         return self.coverage.seen
 
 
-def _overhanging_surface(mission: Mission) -> TopSurface | None:
-    grid, whole = mission.grid, mission.mesh_floor
+def _overhanging_surface(mission: Mission, grid: MapGrid) -> TopSurface | None:
+    whole = mission.mesh_floor
     if whole is None and not mission.objects:
         return None
     bare = TopSurface(true_heights(grid, mission.terrain.height_at)) if whole is None else floor_surface(whole, grid)

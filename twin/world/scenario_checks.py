@@ -21,6 +21,8 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     """Yields an error for each contradiction in a scenario, apart from its floor and objects."""
     if scenario.estimate.plugin is not None and scenario.imaging.fidelity != "rendered":
         yield TwinError("estimate.plugin", "needs images; the surrogate has none", 'imaging.fidelity = "rendered"')
+    yield from _of_prior(scenario)
+    yield from _of_tasks(scenario)
     yield from _of_sea(scenario)
     yield from _of_faults(scenario)
     if scenario.plan.cross_rise_m and not scenario.plan.cross_lines:
@@ -98,6 +100,31 @@ def _of_lens(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"lens.{key}", "needs the f-number and the pixel size of the sensor", "with [sensor]")
     if 0 < lens.focus_m < NEAREST_FOCUS_M:
         yield TwinError("lens.focus_m", f"{lens.focus_m:g}: too near", f"0, or {NEAREST_FOCUS_M:g} or more")
+
+
+def _of_tasks(scenario: Scenario) -> Iterator[TwinError]:
+    names = [task.name for task in scenario.tasks]
+    for k, task in enumerate(scenario.tasks):
+        if task.name in names[:k]:
+            yield TwinError(f"tasks.{k}.name", f"{task.name!r} is the name of another task", "a name of its own")
+        if task.after_track is not None and task.start_s is not None:
+            yield TwinError(f"tasks.{k}.start_s", "contradicts after_track", "one of the two")
+        if scenario.vehicle.dynamics == "kinematic":
+            problem, allowed = "a kinematic vehicle moves in a horizontal plane", 'vehicle.dynamics = "rigid"'
+            yield TwinError(f"tasks.{k}.altitude_m", problem, allowed)
+
+
+def _of_prior(scenario: Scenario) -> Iterator[TwinError]:
+    t, blind = scenario.terrain, scenario.terrain.prior == "none"
+    if blind:
+        unused = ("prior_file", "prior_smoothing_m", "prior_offset_m")
+        yield from keys_without_effect("terrain", t, unused, "has no effect without a prior", 'terrain.prior = "floor"')
+        if scenario.plan.along_contours:
+            yield TwinError("plan.along_contours", 'needs a known floor (terrain.prior = "none")', "false")
+        if scenario.plan.height == "plane" and scenario.control.height == "planned":
+            yield TwinError("plan.height", '"plane" lies at a height above an unknown floor', '"floor"')
+    if t.prior_file is not None and t.kind != "file":
+        yield TwinError("terrain.prior_file", f"has no effect on terrain.kind = {t.kind!r}", 'terrain.kind = "file"')
 
 
 def _of_sea(scenario: Scenario) -> Iterator[TwinError]:

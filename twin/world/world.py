@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.controllers.camera_surface import surface_above_floor
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Exposure, Frame, Image, MapGrid, StereoRig, Trajectory, Truth
@@ -18,9 +20,13 @@ from twin.errors import TwinError
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.faults import Faults
 from twin.simulate.kinematic_vehicle import KinematicVehicle
-from twin.simulate.sensors import NavigationSensors
-from twin.world.mission import FrameSequence, Mission, Step
+from twin.simulate.sensors import Altimeter, NavigationSensors
+from twin.terrains import Terrain
+from twin.world.mission import Detail, FrameSequence, Mission, Step
+from twin.world.observed_cells import seen_over
 from twin.world.pilot import PilotOfEstimates
+from twin.world.planning import floor_of as field_of
+from twin.world.planning import smoothed_over
 from twin.world.top_surface import TopSurface, true_albedo, true_heights, without_objects
 
 if TYPE_CHECKING:
@@ -31,10 +37,13 @@ if TYPE_CHECKING:
 #: Random streams in the order of their seeds; a new one at the end leaves the numbers of the others unchanged.
 _STREAMS = (
     "left_camera", "right_camera", "navigation", "dvl", "usbl", "beacons", "snow", "surrogate", "imu", "sea", "faults",
+    "altimeter",
 )  # fmt: skip
 
 #: Simulates frames from index k, at most up to the next keyframe; returns the index of the first one not simulated.
 FastForward = Callable[[FrameSequence, int], int]
+
+_ANY_SLOPE = (1e6, 1e6)
 
 
 class CameraImages(NamedTuple):
@@ -56,6 +65,10 @@ class World(ABC):
         scenario = mission.scenario
         duration_s = 2 * mission.n_frames / mission.rig.frame_rate_hz  # also of a survey that is slowed
         self.faults = Faults(scenario.faults, duration_s, streams(scenario.seed)["faults"])
+        self._altimeter = None
+        if scenario.control.height == "altimeter":
+            floor = field_of(self.true_floor())
+            self._altimeter = Altimeter(scenario.navigation, floor, streams(scenario.seed)["altimeter"])
         self._true_poses = GrowingArray(4, 4)
         self._sequences: list[FrameSequence] = []
 
@@ -102,6 +115,8 @@ class World(ABC):
         assert left is not None
         depth_m = images.depth_m if step.keyframe else None
         readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
+        if self._altimeter is not None:
+            readings = replace(readings, altitude_m=self._altimeter.read(self.world_from_camera))
         readings = self.faults.readings(readings)
         return Frame(index, time_s, left, right, readings, step.keyframe, images.exposure)
 
@@ -147,10 +162,40 @@ class World(ABC):
             in_area=self.mission.asked,
             objects=surface.objects,
             overhung=surface.overhung,
+            heights_to_follow=self._heights_to_follow() if self.mission.plan.follows_floor else None,
         )
 
+    def true_floor(self) -> Terrain:
+        """Returns the floor as a height grid, with the objects that this world simulates."""
+        return self.mission.terrain
+
+    def _heights_to_follow(self) -> Callable[[Array, Array], tuple[Array, Array]]:
+        mission, floor = self.mission, self.true_floor()
+        sides_m, request = smoothed_over(mission.scenario, mission.plan.request), mission.plan.request
+        surface = surface_above_floor(
+            floor.height_near, mission.plan.area, floor.spacing_m, request.altitude_m, sides_m, _ANY_SLOPE
+        )
+        return lambda x, y: (surface.height_at(x, y), floor.height_at(x, y))
+
     def true_surface(self) -> TopSurface:
-        return TopSurface(true_heights(self.mission.grid, self.mission.terrain.height_at))
+        return self.surface_on(self.mission.grid)
+
+    def surface_on(self, grid: MapGrid) -> TopSurface:
+        """Returns the true surface as seen from above at the cells of a grid."""
+        return TopSurface(true_heights(grid, self.mission.terrain.height_at))
+
+    def detail_truth(self, detail: Detail, truth: Truth, rows: NDArray[np.int64]) -> Truth:
+        """Returns the truth of a survey at the cells of the map of a task, from keyframes at rows of the trajectory."""
+        cells, surface = np.meshgrid(*detail.grid.centres()), self.surface_on(detail.grid)
+        unknown, poses = self.mission.terrain.in_hole(*cells), self._true_poses.array[rows]
+        return replace(
+            truth,
+            height_m=np.where(unknown, np.float32(np.nan), surface.height_m),
+            seen=seen_over(detail.grid, self.mission.rig, field_of(self.true_floor()), poses) & ~unknown,
+            asked=detail.area.contains(*cells) & ~unknown,
+            objects=surface.objects,
+            overhung=surface.overhung,
+        )
 
 
 def left_camera(vehicle: AnyVehicle, rig: StereoRig) -> Array:

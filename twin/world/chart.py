@@ -1,0 +1,54 @@
+"""Floor as it is known before a survey, over which the survey is planned; the true one may differ from it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from twin import terrains
+from twin.errors import TwinError
+from twin.scenario.model import Scenario, TerrainConfig
+from twin.terrains import Terrain
+from twin.world.planning import level_plan
+
+_SAMPLES = 20  # along each side of an image, for the mean height of the floor in it
+
+
+def chart_of(scenario: Scenario, floor: Terrain) -> Terrain:
+    """Returns the floor as it is known before the survey, on the grid of the true one.
+
+    Without a prior it is level, at the mean height of the true one in an image at the start of the path: the vehicle
+    dives there to the planned altitude above the floor. Raises TwinError if `terrain.prior_file` cannot be read, or its
+    coordinates are not those of the true floor, or no path can be planned.
+    """
+    t = scenario.terrain
+    if t.prior == "none":
+        level = replace(floor, height_m=np.zeros_like(floor.height_m), known=None, filled=None)
+        plan = level_plan(scenario, level)
+        east, north = np.meshgrid(*[np.linspace(-0.5, 0.5, _SAMPLES) * side for side in plan.request.footprint_m])
+        x, y, _ = plan.reference(1, 0.0).position
+        return replace(level, height_m=level.height_m + np.float32(floor.height_near(x + east, y + north).mean()))
+    chart = floor if t.prior_file is None else _of_file(t, t.prior_file, floor)
+    if not (t.prior_smoothing_m or t.prior_offset_m):
+        return chart
+    smooth = gaussian_filter(chart.height_m, t.prior_smoothing_m / chart.spacing_m, mode="nearest")
+    return replace(chart, height_m=(smooth + np.float32(t.prior_offset_m)).astype(np.float32))
+
+
+def _of_file(t: TerrainConfig, file: str, floor: Terrain) -> Terrain:
+    texture = terrains.TextureSource(1.0, in_images=False)
+    try:
+        prior = terrains.load(file, texture, t.height_spacing_m, t.height_range_m, 0, t.z)
+    except TwinError as error:
+        raise TwinError("terrain.prior_file", error.problem, error.allowed) from error
+    here, there = floor.georeference, prior.georeference
+    if here is None or there is None or here.crs_wkt != there.crs_wkt or here.vertical_datum != there.vertical_datum:
+        raise TwinError("terrain.prior_file", f"{file}: not in the coordinates of the floor", "CRS of height_file")
+    x = floor.west_m + floor.spacing_m * np.arange(floor.height_m.shape[1])
+    y = floor.south_m + floor.spacing_m * np.arange(floor.height_m.shape[0])
+    position = there.to_scene(*here.from_scene(*np.meshgrid(x, y)))
+    height_m = prior.height_near(*position) + (there.elevation_m - here.elevation_m)
+    known = np.isfinite(prior.height_at(*position)) & ~prior.in_hole(*position)
+    return replace(floor, height_m=height_m.astype(np.float32), filled=None, known=None if known.all() else known)

@@ -1,0 +1,39 @@
+"""Adaptation of the path in flight: its height to the floor that was measured, and legs over gaps at its end."""
+
+from __future__ import annotations
+
+from twin.core.quality import Gaps
+from twin.core.records import Estimate, Frame
+from twin.plugin.navigator import Estimators
+from twin.world.floor_following import FloorFollower
+from twin.world.gap_filling import GapFiller
+from twin.world.mission_flight import Flight
+
+
+class PathAdaptation:
+    """Adapts the path of a flight as `control.height` and `plan.fill_gaps` ask; by default, not at all."""
+
+    def __init__(self, flight: Flight):
+        scenario = flight.mission.scenario
+        self._flight, self._n_keyframes = flight, 0
+        self._follower = None if scenario.control.height == "planned" else FloorFollower(flight.mission)
+        self._filler = GapFiller(flight.mission) if scenario.plan.fill_gaps else None
+        if self._filler is not None:
+            flight.further_path = self._filler.path
+
+    def __call__(self, frame: Frame, estimate: Estimate, estimators: Estimators) -> None:
+        """Uses what the estimators have measured at a frame, before the vehicle moves on from it."""
+        if self._follower is None and self._filler is None:
+            return
+        keyframes = estimators.network.keyframes
+        new, self._n_keyframes = len(keyframes) > self._n_keyframes, len(keyframes)
+        if self._filler is not None and new:
+            self._filler.add(keyframes[-1])
+        if self._follower is not None:
+            surface = self._follower.found(frame, estimate, keyframes[-1] if new else None)
+            if surface is not None:
+                self._flight.follow(surface)
+
+    @property
+    def gaps(self) -> Gaps:
+        return Gaps() if self._filler is None else self._filler.gaps
