@@ -21,10 +21,10 @@ from twin.session.conclusion import Estimation, conclude
 from twin.session.flown_survey import FlownSurvey
 from twin.session.mission_actions import MissionActions
 from twin.session.monitor import SurveyMonitor, SurveyProgress
+from twin.session.path_adaptation import PathAdaptation
 from twin.world.mission import Mission, prepare
 from twin.world.mission_flight import Flight
 from twin.world.pace import FULL
-from twin.world.path_adaptation import PathAdaptation
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
 

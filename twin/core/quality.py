@@ -120,6 +120,13 @@ class Finding(NamedTuple):
     sentence: str  #: the finding in words
 
 
+class Energy(NamedTuple):
+    """Energy of thrusters and hotel load; None for a kinematic vehicle."""
+
+    survey_wh: float | None = None  #: energy of the survey [W h]
+    dives: int | None = None  #: number of batteries that it takes, each with a reserve of a fifth
+
+
 class Gaps(NamedTuple):
     """Parts of the asked area that fewer than two keyframes show; None if they were not looked for."""
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from twin.core.quality import ActionTimes, Gaps
+from twin.core.quality import ActionTimes, Energy, Gaps
 from twin.core.records import ElevationMap, StereoRig, SurveyResult, Trajectory, Truth
 from twin.core.timing import Stopwatch
 from twin.judge.consistency import consistency_metrics
@@ -57,6 +57,7 @@ class EvaluationInput:
     water: Mapping[str, float] = field(default_factory=dict)  #: visibility_m and secchi_m of a survey
     actions: ActionTimes = ActionTimes()  #: durations for which the mission slowed and stopped the vehicle
     gaps: Gaps = Gaps()
+    energy: Energy = Energy()
     tasks: Sequence[SurveyedTask] = ()
     orthomosaic: Mapping[str, float | None] | None = None  #: `OrthomosaicJudge.metrics`; None if none was made
     #: description of the data set of a replay (reader, number of skipped frames by reason, etc.); None for a survey.
@@ -118,6 +119,7 @@ def _sections(survey: EvaluationInput, truth: Truth) -> dict[str, Any]:
         "stages": stage_metrics(result, truth),
         "control": control_metrics(truth) | survey.actions._asdict(),
         "gaps": survey.gaps._asdict(),
+        "energy": survey.energy._asdict(),
         "tasks": [task_metrics(task, result, elevation, truth) for task in survey.tasks],
         "overlap": overlap_metrics(result, truth, survey.rig, grid, survey.plan),
     }

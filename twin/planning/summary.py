@@ -15,6 +15,7 @@ from twin.judge.verdict import judge_requirements
 from twin.planning.cost import ComputingCost, computing_cost
 from twin.planning.expected_error import ExpectedError, expected_error
 from twin.report.number_formats import length, percent, with_unit
+from twin.world.energy import planned_energy
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
 from twin.world.path_checks import unknown_share
@@ -149,6 +150,8 @@ def _limits_of_validity(mission: Mission, error: ExpectedError) -> Iterator[str]
     window, n_tracks = scenario.estimator_settings().window_tracks, mission.plan.n_leg_tracks
     if mission.plan.cross_track and window < n_tracks:
         yield (f"the cross lines are linked with the last {window} of {n_tracks} tracks only (estimate.window_tracks)")
+    if scenario.terrain.prior == "none":
+        yield "the floor is not known: legs are spaced as over a level one, and their sidelap is less on slopes"
     if mission.objects and scenario.imaging.fidelity != "rendered":
         yield "the surrogate surveys the bare sea floor, and so does this plan: both leave out [[objects]]"
 
@@ -166,11 +169,13 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
     return [
         (f"tracks L, {of_track} each", f"{mission.plan.n_leg_tracks}"),
         *([("cross lines", f"{n_cross}, flown after the {swath}s{higher}")] if n_cross else []),
+        *[("task", text) for text in _tasks(mission)],
         ("frames per keyframe N", f"{f.n_frames_per_keyframe}"),
         (f"keyframes per {swath} M", f"{f.keyframes_per_swath}"),
         ("keyframes", f"{f.n_keyframes}"),
         ("frames", f"{mission.n_frames}"),
         ("time", f"{f.duration_s + summary.hold_s:.0f} s, of which {summary.hold_s:.0f} s station keeping"),
+        *([("energy", _energy_text(mission))] if mission.scenario.vehicle.dynamics == "rigid" else []),
         ("path", length(f.path_m)),
         ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
         ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {_swath_spacing(mission)} between {swath}s"),
@@ -187,6 +192,23 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ),
         ("simulation", _cost_text(summary.cost)),
     ]
+
+
+def _energy_text(mission: Mission) -> str:
+    vehicle, energy = mission.scenario.vehicle, planned_energy(mission)
+    dives = "one dive" if energy.dives == 1 else f"{energy.dives} dives"
+    return f"{energy.survey_wh:.3g} W h: {dives} with a battery of {vehicle.battery_wh:g} W h, a fifth in reserve"
+
+
+def _tasks(mission: Mission) -> list[str]:
+    """Returns what is surveyed closely, and after which track, in words."""
+    tasks, plan = {task.name: task for task in mission.scenario.tasks}, mission.plan
+    texts = []
+    for detour in plan.detours:
+        task, time_s = tasks[detour.name], plan.track_duration_s(detour.track)
+        size = "{:g} m x {:g} m".format(*task.size_m)
+        texts.append(f"{task.name}: {size} from {length(task.altitude_m)}, as track {detour.track}, {time_s:.0f} s")
+    return texts
 
 
 def _swath_spacing(mission: Mission) -> str:
@@ -240,6 +262,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "holes": _holes(mission),
             "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,
+            "energy": planned_energy(mission)._asdict(),
             "cost": summary.cost._asdict(),
             "warnings": list(summary.warnings),
             "picture": picture,

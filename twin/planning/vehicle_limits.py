@@ -16,19 +16,19 @@ from twin.core.records import Estimate
 from twin.judge.summary_statistics import finite_tree
 from twin.report.number_formats import length, percent
 from twin.scenario.model import VehicleConfig
-from twin.simulate.autopilot import full_force_n, steady_thrusts_n, thrust_loads, thruster_lag_s, top_speed_mps
+from twin.simulate.autopilot import full_force_n, thrust_loads, thruster_lag_s, top_speed_mps
 from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.energy import electrical_power_w, usable_wh
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
-from twin.simulate.sea import make_sea, mean_current_mps, steady_current
+from twin.simulate.sea import steady_current
+from twin.world.energy import planned_energy, planned_velocities
 from twin.world.mission import Mission
-from twin.world.path_checks import body_velocities
 from twin.world.pilot import RovPilot
 
 #: Directions in the body, by name.
 AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
 _BEARINGS = np.linspace(0.0, 2 * np.pi, 72, endpoint=False)
 _LEG_S, _SETTLED_S, _STABLE_M = 5.0, 20.0, 0.1  # the last _LEG_S of _SETTLED_S are judged
-_RESERVE = 0.2  # share of the battery that stays unused
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,8 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
     vehicle, plan = mission.scenario.vehicle, mission.plan
     hull = trimmed_hull(vehicle)
     speed_mps, ahead = plan.speed_mps, np.array(AXES["forwards"])
-    flown = plan.all_references()
-    current = mean_current_mps(make_sea(mission.scenario), float(flown.position[:, 2].mean()))
-    along = body_velocities(np.asarray(flown.yaw), flown.velocity - current)
-    frame_s, hold_s = 1 / mission.rig.frame_rate_hz, mission.scenario.control.hold_s * len(mission.tracks)
-    held = body_velocities(np.asarray(flown.yaw)[-1:], -current[None])
-    power_w = np.concatenate([electrical_power_w(vehicle, along), electrical_power_w(vehicle, held)])
-    survey_wh = float(power_w[:-1].sum() * frame_s + power_w[-1] * hold_s) / 3600
-    usable_wh = (1 - _RESERVE) * vehicle.battery_wh
+    through_water, energy = planned_velocities(mission), planned_energy(mission)
+    assert energy.survey_wh is not None and energy.dives is not None  # a rigid vehicle
     rest, cruise = electrical_power_w(vehicle, np.array([np.zeros(3), speed_mps * ahead]))
     directions = np.column_stack([np.cos(_BEARINGS), np.sin(_BEARINGS), np.zeros_like(_BEARINGS)])
     return VehicleLimits(
@@ -75,16 +69,16 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
         forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in AXES.items()},
         current_mps=min(top_speed_mps(vehicle, direction) for direction in directions),
         speed_mps=speed_mps,
-        load=float(thrust_loads(vehicle, along).max()),
+        load=float(thrust_loads(vehicle, through_water).max()),
         stopping_m=speed_mps * thruster_lag_s(vehicle)
         + stopping_distance_m(vehicle, speed_mps, full_force_n(vehicle, ahead), 0.0),
         coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps),
         latency_s=largest_latency_s(mission),
-        hover_h=usable_wh / rest,
-        cruise_h=usable_wh / cruise,
-        survey_s=len(along) * frame_s + hold_s,
-        survey_wh=survey_wh,
-        dives=max(1, math.ceil(survey_wh / usable_wh)),
+        hover_h=usable_wh(vehicle) / rest,
+        cruise_h=usable_wh(vehicle) / cruise,
+        survey_s=len(through_water) / mission.rig.frame_rate_hz,
+        survey_wh=energy.survey_wh,
+        dives=energy.dives,
     )
 
 
@@ -116,16 +110,6 @@ def _settles(mission: Mission, latency_s: float) -> bool:
         if time_s > _SETTLED_S - _LEG_S:
             excursion_m = max(excursion_m, float(np.linalg.norm(pose[:3, 3] - position)))
     return excursion_m < _STABLE_M
-
-
-def electrical_power_w(vehicle: VehicleConfig, velocities: Array) -> Array:
-    """Returns the power (n,) at steady velocities (n, 3) through the water, in the body: hotel load and thrusters.
-
-    The power of a propeller at rest grows with its thrust to the power 1.5 (momentum theory); the tables of the T200
-    from 10 to 20 V have exponents of 1.4 to 1.7.
-    """
-    thrusts = np.abs(steady_thrusts_n(vehicle, velocities))
-    return np.asarray(vehicle.hotel_w + vehicle.power_coefficient * (thrusts**1.5).sum(axis=1), np.float64)
 
 
 def stopping_distance_m(vehicle: VehicleConfig, speed_mps: float, force_n: float, end_mps: float) -> float:

@@ -92,6 +92,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         raise TwinError(ascii(str(folder))[1:-1][:200], problem, "the folder of a run")
     if not is_file(folder / SCENARIO_FILE):
         raise TwinError(str(folder), "is not a run folder", f"a folder with {SCENARIO_FILE}, written by `twin run`")
+    tasks = sorted(folder.glob("task_[1-9]*"), key=lambda part: (len(part.name), part.name))
     return Run(
         folder,
         _read(folder / SCENARIO_FILE, lambda f: checked_scenario(parse_toml(read_text(f)))),
@@ -99,6 +100,7 @@ def load_run(folder: str | Path, metrics: dict[str, Any] | None = None) -> Run:
         metrics or _read_json(folder / "metrics.json", checked_metrics),
         _read_existing({k: folder / f"trajectory_{k}.tum" for k in TRAJECTORIES}, Trajectory.load),
         _read_existing({k: folder / f"{k}.tif" for k in RASTERS}, read_raster)
+        | _read_existing({f"{part.name}/{k}": part / f"{k}.tif" for part in tasks for k in RASTERS}, read_raster)
         | _read_existing({"mosaic": folder / "mosaic.tif"}, read_mosaic),
         _read_existing({"": folder / "posegraph.g2o"}, lambda f: _network(read_text(f))).get("", _network("")),
         _read_keyframes(folder / "keyframes" / "index.json"),

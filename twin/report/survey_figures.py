@@ -42,7 +42,7 @@ def draw_all(run: Run) -> dict[str, str]:
     functions = {
         "plan_view": plan_view, "path_errors": path_error_curves, "stages": stage_bars, "tracks": track_bars,
         "stereo_quality": stereo_quality_curves, "elevation": elevation_maps, "error": error_maps,
-        "histogram": error_histogram, "network": network_plot, "timing": timing_bars,
+        "tasks": task_maps, "histogram": error_histogram, "network": network_plot, "timing": timing_bars,
     }  # fmt: skip
     return drawn(functions, run)
 
@@ -194,6 +194,27 @@ def error_maps(run: Run) -> Figure | None:
     if "dem_sigma" in run.rasters:
         title = "Estimated standard deviation (sigma)"
         _scalar_map(_map_axes(right, run), run.rasters["dem_sigma"], title, "magma", Normalize(0, limit))
+    return figure
+
+
+def task_maps(run: Run) -> Figure | None:
+    """Returns hill-shaded maps of the tasks beside their height errors, one row for each task."""
+    names = [name for name in run.rasters if name.startswith("task_") and name.endswith("/dem")]
+    if not names:
+        return None
+    figure = Figure(figsize=(WIDTH_IN, 3.4 * len(names)))
+    titles = [task["name"] for task in (run.metrics or {}).get("tasks", [])]
+    for row, name in zip(figure.subplots(len(names), 2, squeeze=False), names, strict=True):
+        number = int(name.removeprefix("task_").split("/")[0])
+        title = titles[number - 1] if number <= len(titles) else name
+        heights, error = run.rasters[name], run.rasters.get(name.replace("/dem", "/dem_error"))
+        scale = height_scale(heights.values.ravel())
+        _map_axes(row[0], run).imshow(hillshade(subsampled(heights), "viridis", scale), extent=_extent(heights))
+        row[0].set_title(title)
+        figure.colorbar(ScalarMappable(Normalize(*scale), "viridis"), ax=row[0], label="height [m]", shrink=0.8)
+        if error is not None and np.isfinite(error.values).any():
+            limit = float(np.nanpercentile(np.abs(error.values), 98)) or 1e-3
+            _scalar_map(_map_axes(row[1], run), error, "Height error", "RdBu_r", Normalize(-limit, limit))
     return figure
 
 

@@ -21,6 +21,7 @@ from twin.scenario.idealisations import idealisations
 from twin.scenario.model import Scenario
 from twin.session.conclusion import Estimation, Maps
 from twin.session.survey_check import calibration_notes, survey_findings
+from twin.world.energy import flown_energy
 from twin.world.floor_forecast import planned_overlap
 from twin.world.mission import Detail, Mission
 
@@ -96,6 +97,7 @@ class FlownSurvey:
             water=mission.clarity._asdict(),
             actions=actions,
             gaps=self.gaps,
+            energy=flown_energy(mission, self.truth.trajectory),
             tasks=self._tasks(result, maps),
         )
 

@@ -18,10 +18,10 @@ from twin.core.timing import Stopwatch
 from twin.scenario.model import Scenario
 from twin.session.assembly import Estimators, make_navigator, open_world
 from twin.session.mission_actions import MissionActions
+from twin.session.path_adaptation import PathAdaptation
 from twin.world.mission import Mission, prepare
 from twin.world.mission_flight import Flight
 from twin.world.pace import FULL, Pace
-from twin.world.path_adaptation import PathAdaptation
 from twin.world.pilot import make_pilot, without_feedback
 from twin.world.world import World
 

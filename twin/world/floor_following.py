@@ -10,7 +10,6 @@ from twin.controllers.survey_area import SurveyArea
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Frame
-from twin.estimate.vision.stereo import Keyframe
 from twin.world.mission import Mission
 from twin.world.path_checks import VEHICLE_REACH_M
 from twin.world.planning import climb_slopes, smoothed_over
@@ -47,19 +46,18 @@ class FloorFollower:
         self._sum_m, self._n = np.zeros((rows, cols)), np.zeros((rows, cols), np.int64)
         self._top_m = np.full((rows, cols), -np.inf)
 
-    def found(self, frame: Frame, estimate: Estimate, keyframe: Keyframe | None) -> CameraSurface | None:
+    def found(self, frame: Frame, estimate: Estimate, points_m: Array | None) -> CameraSurface | None:
         """Adds what a frame has measured; returns the surface to follow from a keyframe on, None at other frames.
 
-        `keyframe` is the one that the estimators have made of the frame, None if they have not.
+        `points_m` are the stereo points (n, 3) of the keyframe in the world; None if the frame has become none.
         """
         if self._echoes is not None:
             if frame.readings.altitude_m is not None and estimate.is_measured:
                 self.add(self._echoes.floor_point(estimate.world_from_camera, frame.readings.altitude_m)[None])
             return self.surface(estimate.world_from_camera[:2, 3]) if frame.keyframe else None
-        if keyframe is None:
+        if points_m is None:
             return None
-        if keyframe.points is not None:
-            self.add(geometry.transform(keyframe.world_from_camera, keyframe.points.xyz))
+        self.add(points_m)
         return self.surface(estimate.world_from_camera[:2, 3])
 
     def add(self, points_m: Array) -> None:

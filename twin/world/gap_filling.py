@@ -7,10 +7,8 @@ from numpy.typing import NDArray
 
 from twin.controllers.detours import legs_at
 from twin.controllers.segments import Point, Reference, Segment
-from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.quality import Gaps
-from twin.estimate.vision.stereo import Keyframe
 from twin.world.mission import Mission
 
 _CELLS = 4  # cells along the shorter side of an image
@@ -36,11 +34,9 @@ class GapFiller:
         self._asked = plan.inside_area(x, y) & ~chart.in_hole(x, y)
         self._n_tracks, self.gaps = 0, Gaps()
 
-    def add(self, keyframe: Keyframe) -> None:
-        if keyframe.points is None:
-            return
-        points = geometry.transform(keyframe.world_from_camera, keyframe.points.xyz)
-        in_legs = np.stack(self._area.to_legs(points[:, 0], points[:, 1]))
+    def add(self, points_m: Array) -> None:
+        """Adds the stereo points (n, 3) of a keyframe in the world [m]."""
+        in_legs = np.stack(self._area.to_legs(points_m[:, 0], points_m[:, 1]))
         cell = np.floor((in_legs + np.array(self._extent_m)[:, None] / 2) / self._cell_m).astype(np.int64)
         inside = ((cell >= 0) & (cell < np.array(self._shape)[:, None])).all(axis=0)
         shown = np.zeros(self._shape, np.bool_)

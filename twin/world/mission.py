@@ -286,7 +286,7 @@ def _check_path(
 ) -> None:
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
-    errors.attempt(check_tasks, plan, terrain, scenario.plan.clearance_m)
+    errors.attempt(check_tasks, scenario, plan, terrain)
     if (sea := errors.attempt(make_sea, scenario)) is not None:
         errors.attempt(check_thrust, scenario.vehicle, sea, plan)
     camera_m = scenario.believed_rig().body_from_camera[:3, 3]

@@ -15,7 +15,7 @@ from twin.controllers.survey_plan import SurveyPlan
 from twin.controllers.tracking import rotate_lever_arm
 from twin.core.geometry import Array
 from twin.errors import TwinError
-from twin.scenario.model import PlanConfig, VehicleConfig
+from twin.scenario.model import PlanConfig, Scenario, VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.simulate.sea import Sea, strongest_currents_mps
 from twin.terrains import Terrain
@@ -59,17 +59,25 @@ def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> 
         )
 
 
-def check_tasks(plan: SurveyPlan, terrain: Terrain, clearance_m: float) -> None:
-    """Raises TwinError if the path of a task leaves the terrain or is too near the floor."""
-    for k, detour in enumerate(plan.detours):
-        times_s, _ = plan.frames_of_track(detour.track)
-        x, y, z = plan.references(detour.track, times_s).position.T
+def check_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> None:
+    """Raises TwinError if the path of a task leaves the terrain or is too near the floor, or its speed is too high."""
+    tracks = {detour.name: detour.track for detour in plan.detours}
+    for k, task in enumerate(scenario.tasks):
+        reach = np.inf
+        if scenario.vehicle.dynamics == "rigid":
+            reach = top_speed_mps(scenario.vehicle, np.array([1.0, 0.0, 0.0]))
+        if task.speed_mps > reach:
+            raise TwinError(
+                f"tasks.{k}.speed_mps", f"{task.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}"
+            )
+        times_s, _ = plan.frames_of_track(tracks[task.name])
+        x, y, z = plan.references(tracks[task.name], times_s).position.T
         if not np.isfinite(terrain.height_at(x, y)).all():
             raise TwinError(f"tasks.{k}.position_m", "the path leaves the terrain", f"inside {terrain.extent}")
         least_m = float((z - highest_near(terrain, x, y, VEHICLE_REACH_M)).min())
-        if least_m < clearance_m:
-            problem = f"the cameras come within {least_m:.2f} m of the floor"
-            raise TwinError(f"tasks.{k}.altitude_m", problem, f"{clearance_m - least_m:.2f} m more")
+        if (short_m := scenario.plan.clearance_m - least_m) > 0:
+            problem = f"{task.altitude_m:g}: the cameras come within {least_m:.2f} m of the floor"
+            raise TwinError(f"tasks.{k}.altitude_m", problem, f"at least {task.altitude_m + short_m:.2f}")
 
 
 def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearance:

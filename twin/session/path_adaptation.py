@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from twin.core import geometry
+from twin.core.geometry import Array
 from twin.core.quality import Gaps
 from twin.core.records import Estimate, Frame
 from twin.plugin.navigator import Estimators
@@ -25,14 +27,21 @@ class PathAdaptation:
         """Uses what the estimators have measured at a frame, before the vehicle moves on from it."""
         if self._follower is None and self._filler is None:
             return
-        keyframes = estimators.network.keyframes
-        new, self._n_keyframes = len(keyframes) > self._n_keyframes, len(keyframes)
-        if self._filler is not None and new:
-            self._filler.add(keyframes[-1])
+        points_m = self._new_points_m(estimators)
+        if self._filler is not None and points_m is not None:
+            self._filler.add(points_m)
         if self._follower is not None:
-            surface = self._follower.found(frame, estimate, keyframes[-1] if new else None)
+            surface = self._follower.found(frame, estimate, points_m)
             if surface is not None:
                 self._flight.follow(surface)
+
+    def _new_points_m(self, estimators: Estimators) -> Array | None:
+        """Returns the stereo points (n, 3) in the world [m] of a keyframe made since the last call; None without."""
+        keyframes = estimators.network.keyframes
+        new, self._n_keyframes = len(keyframes) > self._n_keyframes, len(keyframes)
+        if not new or keyframes[-1].points is None:
+            return None
+        return geometry.transform(keyframes[-1].world_from_camera, keyframes[-1].points.xyz)
 
     @property
     def gaps(self) -> Gaps:

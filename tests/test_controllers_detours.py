@@ -1,0 +1,97 @@
+"""Detours of a plan: tracks for tasks between its tracks, and legs over gaps after them."""
+
+import math
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from twin.controllers.detours import Task, legs_at, with_tasks
+from twin.controllers.lawnmower import plan
+from twin.controllers.survey_area import SurveyArea
+from twin.controllers.survey_plan import SurveyRequest
+from twin.judge.swaths import swath_numbers
+from twin.world.planning import planned_keyframes
+
+HOLD_S = 2.0
+REQUEST = SurveyRequest(
+    (6.0, 4.0), 2.0, 0.3, 0.8, 0.6, 0, 320, 240, 277.0, 30.0, area=SurveyArea("rectangle", (6.0, 4.0))
+)
+
+
+def task(**changes):
+    found = Task("coral", (0.5, -0.3), (0.8, 0.6), 1.0, 0.0, 0.1, 0.9, 0.8)
+    return found._replace(**changes)
+
+
+def positions(survey):
+    return [survey.references(k, survey.frames_of_track(k)[0]).position for k in range(1, survey.n_tracks + 1)]
+
+
+@pytest.mark.parametrize("where", [{"after_track": 1}, {"start_s": 10.0}, {}])
+def test_a_task_is_a_track_that_starts_and_ends_where_the_survey_was_left(where):
+    level = plan(REQUEST)
+    survey = with_tasks(level, [task(**where)], HOLD_S)
+    (detour,) = survey.detours
+    tracks = positions(survey)
+    own, before = tracks[detour.track - 1], tracks[detour.track - 2]
+    np.testing.assert_allclose(own[0], before[-1], atol=1e-3)
+    np.testing.assert_allclose(own[-1], own[0], atol=1e-3)
+    assert own[:, 2].min() == pytest.approx(1.0) and own[:, 2].max() == pytest.approx(2.0)
+    low = own[own[:, 2] < 1.0 + 1e-6]
+    assert (np.abs(low[:, :2] - [0.5, -0.3]) <= [0.4 + 1e-6, 0.3 + 1e-6]).all()
+    rest = np.concatenate([part for k, part in enumerate(tracks, 1) if k != detour.track])
+    known = np.concatenate(positions(level))
+    assert np.linalg.norm(np.diff(rest, axis=0), axis=1).sum() == pytest.approx(
+        np.linalg.norm(np.diff(known, axis=0), axis=1).sum(), rel=1e-3
+    )
+
+
+def test_a_task_leaves_at_the_end_of_the_leg_that_is_nearest_to_it():
+    survey = with_tasks(plan(REQUEST), [task(centre_m=(2.4, 0.9))], HOLD_S)
+    left = positions(survey)[survey.detours[0].track - 1][0]
+    ends = np.concatenate([[s.points()[-1] for s in path] for path in plan(REQUEST).paths])
+    assert math.dist(left[:2], (2.4, 0.9)) == pytest.approx(np.linalg.norm(ends[:, :2] - [2.4, 0.9], axis=1).min())
+
+
+def test_several_tasks_keep_their_tracks_and_every_leg_keeps_its_number():
+    tasks = [task(name="b", after_track=2), task(name="a", after_track=1), task(name="c", start_s=1e5)]
+    level = plan(REQUEST)
+    survey = with_tasks(level, tasks, HOLD_S)
+    assert [d.name for d in sorted(survey.detours, key=lambda d: d.track)] == ["a", "b", "c"]
+    assert survey.n_tracks == level.n_tracks + 3 and survey.n_leg_tracks == level.n_tracks
+    before, after = (planned_keyframes(one, "lawnmower") for one in (level, survey))
+    assert set(before.swath) == set(after.swath)
+    detours = [d.track for d in survey.detours]
+    reference = survey.all_references()
+    track = np.concatenate([np.full(len(p), k) for k, p in enumerate(positions(survey), 1)])
+    swath = swath_numbers(
+        reference.position, np.asarray(reference.yaw), track, {"pattern": "lawnmower"} | survey.swath_notes
+    )
+    assert (swath[np.isin(track, detours)] == -1).all()
+
+
+def test_keyframes_of_a_task_keep_its_overlap_and_bring_the_camera_down_in_small_steps():
+    survey = with_tasks(plan(REQUEST), [task()], HOLD_S)
+    number = survey.detours[0].track
+    times_s, keyframe = survey.frames_of_track(number)
+    at = survey.references(number, times_s).position[keyframe]
+    step = np.diff(at, axis=0)
+    low = at[:-1, 2] < 1.0 + 1e-6
+    assert np.linalg.norm(step[low], axis=1).max() <= 0.11 * 320 / 277.0
+    descending = np.abs(step[:, 2]) > 1e-6
+    assert (np.abs(step[descending, 2]) / at[1:][descending, 2]).max() < 0.15
+
+
+def test_a_level_survey_raises_a_task_to_the_height_above_its_floor():
+    survey = with_tasks(plan(REQUEST), [task(floor_m=0.4)], HOLD_S)
+    assert positions(survey)[survey.detours[0].track - 1][:, 2].min() == pytest.approx(1.4)
+
+
+def test_legs_over_gaps_are_flown_to_the_nearest_next():
+    legs = [((4.0, 0.0, 2.0), (5.0, 0.0, 2.0)), ((2.0, 1.0, 2.0), (1.0, 1.0, 2.0))]
+    path = legs_at(plan(REQUEST), (0.0, 0.0, 2.0), 0.0, legs)
+    ends = [segment.points()[-1].tolist() for segment in path]
+    np.testing.assert_allclose(ends, [legs[1][1], legs[1][0], legs[0][0], legs[0][1]])
+    for a, b in pairwise(path):
+        np.testing.assert_allclose(a.points()[-1], b.points()[0])
