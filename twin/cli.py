@@ -391,6 +391,9 @@ def replay(
     aiding: Annotated[
         bool, option("Use recorded readings of pressure, attitude and DVL.", flag="--aiding/--no-aiding")
     ] = True,
+    imu: Annotated[
+        bool, option("Predict the motion between frames by the recorded IMU, which is at the origin of the body.")
+    ] = False,
     true_map: Annotated[
         Path | None,
         option("True heights in the frame of the true poses (GeoTIFF), only for the comparison of the map.", "FILE"),
@@ -416,7 +419,7 @@ def replay(
     options = recorded.ReplayOptions(
         calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer),
         topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
-        rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma,
+        rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma, imu=imu,
     )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:

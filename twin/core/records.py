@@ -122,6 +122,17 @@ class StereoRig:
         return first, second
 
 
+class ImuErrorModel(NamedTuple):
+    """Noise of an IMU in the terms of Kalibr, and standard deviations of its biases at the start."""
+
+    rate_density: float  #: white noise of each angular rate [rad/s/sqrt(Hz)]
+    rate_walk: float  #: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]
+    force_density: float  #: white noise of each specific force [m/s2/sqrt(Hz)]
+    force_walk: float  #: random walk of the bias of each specific force [m/s3/sqrt(Hz)]
+    rate_bias: float  #: standard deviation of the bias of each angular rate [rad/s]
+    force_bias: float  #: standard deviation of the bias of each specific force [m/s2]
+
+
 @dataclass(frozen=True)
 class SensorNoise:
     """Believed noise of the navigation sensors: standard deviations from data sheets, and surveyed beacon positions."""
@@ -137,6 +148,7 @@ class SensorNoise:
     beacons_m: tuple[tuple[float, float, float], ...] = ()
     #: standard deviation of the direction of the vertical about each horizontal axis [rad], common to all readings.
     up_rad: float = float(np.deg2rad(1.2))
+    imu: ImuErrorModel | None = None  #: noise of the IMU that predicts the motion between frames; None: it is not used
 
     @property
     def attitude_sigmas_rad(self) -> Array:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.records import ImuReadings
+from twin.core.records import ImuErrorModel, ImuReadings
 from twin.errors import TwinError
 from twin.estimate.navigation.vertical import GRAVITY_MPS2, InertialNoise, verticals
 
@@ -17,6 +17,10 @@ _SIGMA_SHARES = 1e-12, 1e6
 
 #: Standard deviation of the bias of an accelerometer that states none [m/s2]: 20 mg, as of small MEMS sensors.
 USUAL_BIAS_MPS2 = 0.2
+#: The same of the bias of a gyroscope [rad/s] (EuRoC's have up to 0.08), and random walk of the bias of an accelerometer
+#: that states none [m/s3/sqrt(Hz)]: that of EuRoC.
+USUAL_RATE_BIAS_RADPS, USUAL_FORCE_WALK = 0.1, 3e-3
+_SAME_PLACE_M = 0.01  # an IMU at most this far from the origin of the body measures its motion
 _MOST_OFF = 0.15  # largest relative difference of the mean specific force from gravity
 
 
@@ -44,6 +48,13 @@ class SensorSeries(NamedTuple):
     sigmas: Array  #: (k,) standard deviations of a reading
 
 
+class RecordedInertial(NamedTuple):
+    """Readings of an IMU at the origin of the body, in its axes, and their errors."""
+
+    readings: ImuReadings
+    errors: ImuErrorModel
+
+
 class RecordedReadings(NamedTuple):
     """Readings of the navigation sensors of a data set; None where a sensor was not recorded or cannot be used."""
 
@@ -55,6 +66,7 @@ class RecordedReadings(NamedTuple):
     #: None if there is an attitude.
     vertical: SensorSeries | None = None
     notes: tuple[str, ...] = ()  #: sentences on readings that are not used, and on assumptions about their times
+    inertial: RecordedInertial | None = None  #: readings of the IMU, to predict the motion between frames
 
 
 def checked_series(
@@ -104,12 +116,19 @@ def _fault(quantity: SensorQuantity, series: SensorSeries) -> tuple[int | None, 
     return None
 
 
+def in_body(inertial: SensorSeries, body_from_sensor: Array, errors: ImuErrorModel) -> RecordedInertial | None:
+    """Returns the readings (n, 6) of an IMU at a pose (4, 4) in the body, in its axes; None if not at its origin."""
+    if np.linalg.norm(body_from_sensor[:3, 3]) > _SAME_PLACE_M:
+        return None
+    turned = inertial.values.reshape(-1, 2, 3) @ body_from_sensor[:3, :3].T
+    return RecordedInertial(ImuReadings(inertial.times_s, turned[:, 0], turned[:, 1]), errors)
+
+
 def vertical_series(
     source: str,
     inertial: SensorSeries,
     body_from_sensor: Array,
-    noise: InertialNoise,
-    bias_mps2: float,
+    errors: ImuErrorModel,
     notes: list[str],
 ) -> SensorSeries | None:
     """Returns the direction of the vertical in body axes (unit vectors that point upwards) and its standard deviation.
@@ -127,6 +146,9 @@ def vertical_series(
             f"gravity is {GRAVITY_MPS2} m/s2."
         )
         return None
-    up, sigma_rad = verticals(ImuReadings(inertial.times_s, rates, forces), noise)
-    sigma = float(np.hypot(np.sqrt(np.mean(sigma_rad**2)), bias_mps2 / GRAVITY_MPS2))
+    up, sigma_rad = verticals(
+        ImuReadings(inertial.times_s, rates, forces),
+        InertialNoise(errors.rate_density, errors.rate_walk, errors.force_density),
+    )
+    sigma = float(np.hypot(np.sqrt(np.mean(sigma_rad**2)), errors.force_bias / GRAVITY_MPS2))
     return SensorSeries(inertial.times_s, up @ body_from_sensor.T, np.array([sigma]))

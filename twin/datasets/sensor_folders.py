@@ -14,16 +14,17 @@ import numpy as np
 import yaml
 
 from twin.core.geometry import Array
+from twin.core.records import ImuErrorModel
 from twin.datasets import readings
 from twin.datasets.kalibr import pose_of
 from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries
 from twin.datasets.run_contents import RecordedImu, RunContents
 from twin.datasets.text_files import read_numbered_table, read_yaml
 from twin.errors import TwinError
-from twin.estimate.navigation.vertical import InertialNoise
 
 _LARGEST_DEVIATION = 100.0
 _BIAS = "accelerometer_bias_sigma"  # of the bias of each specific force [m/s2]; not in EuRoC's own files
+_WALK = "accelerometer_random_walk"
 _DENSITIES = ("gyroscope_noise_density", "gyroscope_random_walk", "accelerometer_noise_density")
 _FIRST_NS = 1_000_000_000  # timestamp of a frame at 0 s; times in EuRoC data sets are never 0
 
@@ -46,7 +47,7 @@ _IMU_COLUMNS = (
 
 
 def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
-    """Returns the readings in pressure0, ahrs0, dvl0 and, without an attitude, the vertical by imu0; None without any.
+    """Returns the readings in pressure0, ahrs0, dvl0 and imu0 and, without an attitude, the vertical; None without any.
 
     A sensor without standard deviations is not used, nor are readings with a value that is empty or not finite. Raises
     TwinError if a file is damaged, or a value is impossible.
@@ -54,10 +55,16 @@ def read_folder(root: Path, body_from_left: Array) -> RecordedReadings | None:
     notes: list[str] = []
     quantities = (readings.HEIGHT, readings.ATTITUDE, readings.VELOCITY)
     height, attitude, velocity = (_read_sensor(root / one.folder, one, notes) for one in quantities)
-    vertical = None if attitude is not None else _read_vertical(root / readings.INERTIAL.folder, notes)
-    if not notes and height is attitude is velocity is vertical is None:
+    vertical = inertial = None
+    if (imu := _read_imu(root / readings.INERTIAL.folder, notes)) is not None:
+        inertial = readings.in_body(*imu)
+        if attitude is None:
+            series, body_from_sensor, errors = imu
+            turn = body_from_sensor[:3, :3]
+            vertical = readings.vertical_series(readings.INERTIAL.folder, series, turn, errors, notes)
+    if not notes and height is attitude is velocity is vertical is inertial is None:
         return None
-    return RecordedReadings(body_from_left, height, attitude, velocity, vertical, tuple(notes))
+    return RecordedReadings(body_from_left, height, attitude, velocity, vertical, tuple(notes), inertial)
 
 
 def _read_sensor(folder: Path, quantity: SensorQuantity, notes: list[str]) -> SensorSeries | None:
@@ -90,10 +97,10 @@ def _read_sigmas(file: Path, n: int) -> Array | None:
     return np.broadcast_to(given, (n,)).copy()
 
 
-def _read_vertical(folder: Path, notes: list[str]) -> SensorSeries | None:
-    """Returns the direction of the vertical by an IMU; None without one, or with a note on why it is not used.
+def _read_imu(folder: Path, notes: list[str]) -> tuple[SensorSeries, Array, ImuErrorModel] | None:
+    """Returns readings (n, 6), pose in the body and errors of an IMU; None without one, or with a note on why.
 
-    By default the axes of the IMU are those of the body, and its bias is `readings.USUAL_BIAS_MPS2`.
+    By default the axes of the IMU are those of the body, and its biases are the usual ones.
     """
     file, description = folder / "data.csv", folder / "sensor.yaml"
     if not file.exists():
@@ -104,15 +111,14 @@ def _read_vertical(folder: Path, notes: list[str]) -> SensorSeries | None:
         return None
     rate, walk, force = (_deviation(tree, name, description) for name in _DENSITIES)
     bias = readings.USUAL_BIAS_MPS2 if tree.get(_BIAS) is None else _deviation(tree, _BIAS, description)
-    axes = pose_of(tree, "T_BS", description)[:3, :3] if "T_BS" in tree else np.eye(3)
-    if not np.allclose(axes @ axes.T, np.eye(3), atol=1e-3):
+    walks = readings.USUAL_FORCE_WALK if tree.get(_WALK) is None else _deviation(tree, _WALK, description)
+    pose = pose_of(tree, "T_BS", description) if "T_BS" in tree else np.eye(4)
+    if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
         raise TwinError(f"{description}: T_BS", "is not a rigid motion", "a rotation matrix and a translation [m]")
     inertial = _read_csv(file, readings.INERTIAL, np.ones(readings.INERTIAL.n), notes)
     if inertial is None:
         return None
-    return readings.vertical_series(
-        readings.INERTIAL.folder, inertial, axes, InertialNoise(rate, walk, force), bias, notes
-    )
+    return inertial, pose, ImuErrorModel(rate, walk, force, walks, readings.USUAL_RATE_BIAS_RADPS, bias)
 
 
 def _deviation(tree: Mapping[str, Any], name: str, file: Path) -> float:

@@ -17,6 +17,7 @@ from twin.core.records import (
     ElevationMap,
     Frame,
     Image,
+    ImuReadings,
     Map,
     MapGrid,
     SensorNoise,
@@ -67,7 +68,8 @@ class StereoVision:
         stopwatch: StageTimer | None = None,
         noise: SensorNoise | None = None,
     ):
-        self.repeats = RepeatedImages(settings.noisy_images, noise or SensorNoise())
+        noise = noise or SensorNoise()
+        self.repeats, self._imu_noise = RepeatedImages(settings.noisy_images, noise), noise.imu
         self.full_rig, self.settings, self.stopwatch = rig.with_square_pixels(), settings, stopwatch or Stopwatch()
         self._row_scale, self._size_px = rig.fx_px / rig.fy_px, (rig.width_px, rig.height_px)
         self._cell_m, self._folder = cell_m, folder
@@ -83,7 +85,7 @@ class StereoVision:
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self._pattern_fits: dict[int, Array] = {}  # by frame index
-        self.f2f = FrameToFrame(self.rig, self.settings.patch_px)
+        self.f2f = FrameToFrame(self.rig, self.settings.patch_px, self._imu_noise)
         self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
         self.search_range = disparity.SearchRange(self.rig)
         self._gray = self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
@@ -112,7 +114,8 @@ class StereoVision:
             last_s, self._last_s = self._last_s, frame.time_s
             interval_s = frame.time_s - last_s if frame.time_s > last_s else None
             frozen = self.repeats.status(frame, self.f2f.filter.velocity, interval_s or 1 / self.rig.frame_rate_hz)
-            motion, status = self.f2f.step(self._image, interval_s, frozen if frozen == LEFT_REPEATS else "")
+            unusable, imu = frozen if frozen == LEFT_REPEATS else "", frame.readings.imu
+            motion, status = self.f2f.step(self._image, interval_s, unusable, imu)
             return motion, status if frozen == "ok" else frozen
 
     def _set_image(self, left: Image) -> None:
@@ -124,7 +127,7 @@ class StereoVision:
         left, right = (matching.scaled_rows(image, self._row_scale) for image in (frame.left, frame.right))
         with self.stopwatch("stereo"):
             if self._points is None:
-                self._choose_scale(left, right)
+                self._choose_scale(left, right, frame.readings.imu)
             corrected, gray, dense_px, points = self._match_pair(right)
             if len(points.xyz) >= _MIN_POINTS:
                 self.calibration.add(points, self.rig, self.settings.patch_px)
@@ -142,14 +145,14 @@ class StereoVision:
         self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left, corrected)))
         return points
 
-    def _choose_scale(self, left: Image, right: Image) -> None:
+    def _choose_scale(self, left: Image, right: Image, imu: ImuReadings | None) -> None:
         """Chooses the binning from a stereo pair before the first keyframe; a change reprocesses the left image."""
         binning = stereo.choose_binning(left, right, self.full_rig, self.settings)
         if binning != self.binning:
             self.close()
             self._configure(binning)
             self._set_image(left)
-            self.f2f.step(self._image)
+            self.f2f.step(self._image, imu=imu)
 
     def _match_pair(self, right: Image) -> tuple[Image, matching.Gray, Map, StereoPoints]:
         """Matches the current left image with a right image, from which known rectification errors are removed.

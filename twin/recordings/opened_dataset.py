@@ -53,6 +53,7 @@ class ReplayOptions:
         estimator: estimator of another package ("module:Class" or the name of an entry point `twin.estimators`), from
             whose poses the map is built; None: the estimators of `twin.estimate`.
         aiding: whether recorded readings of pressure, attitude, DVL and IMU are used.
+        imu: whether the recorded IMU predicts the motion between frames.
         true_map: GeoTIFF of the true heights [m] in the frame of the true poses; None: that of the data set.
         rotation_sigma_deg, baseline_sigma_mm: standard deviations of the rotation between the cameras (about each axis)
             and of the baseline since the calibration; above 0, yaw and baseline are estimated. None: those of the data
@@ -72,6 +73,7 @@ class ReplayOptions:
     true_map: Path | None = None
     rotation_sigma_deg: float | None = None
     baseline_sigma_mm: float | None = None
+    imu: bool = False
 
     def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
         """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
@@ -136,7 +138,10 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     readings = _sound(dataset.readings) if options.aiding else None
     aiding, rectified = None, frames.rectification
     if readings is not None:
-        aiding = Aiding(readings, rectified.left_from_rectified, frames.start_s, rectified.rig.frame_rate_hz)
+        rate_hz = rectified.rig.frame_rate_hz
+        aiding = Aiding(readings, rectified.left_from_rectified, frames.start_s, rate_hz, options.imu)
+    elif options.imu:
+        raise TwinError("--imu", "the data set has no readings that are used", "a data set with imu0, and --aiding")
     true_map = _true_map(dataset, truth, options)
     return OpenedDataset(resolved(folder).name, reader, dataset, frames, truth, pair, plane, aiding, true_map)
 

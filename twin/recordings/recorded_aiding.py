@@ -11,10 +11,11 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Frame, Readings, SensorNoise, StereoRig, Trajectory
+from twin.core.records import Frame, ImuReadings, Readings, SensorNoise, StereoRig, Trajectory
 from twin.core.series import nearest_index
 from twin.core.settings import EstimatorSettings
 from twin.datasets.readings import RecordedReadings, SensorSeries
+from twin.errors import TwinError
 from twin.estimate import Navigator
 
 #: Largest time between an exposure and a reading of pressure or attitude that belongs to it: as a fraction of the
@@ -22,6 +23,7 @@ from twin.estimate import Navigator
 _SHARE, _MOST_S = 0.25, 0.01
 #: Velocities are interpolated between readings whose interval is at most this many times the median interval.
 _MOST_GAP = 2.5
+_FIRST_IMU_S, _ROUNDING_S = 0.05, 1e-6
 _START_FRAMES = 60  # number of frames whose readings determine the start
 #: Prior standard deviations of the first node in directions that readings determine: rotation [rad] and height [m].
 _LOOSE_RAD, _LOOSE_M = 0.1, 1.0
@@ -55,10 +57,17 @@ class Aiding:
 
     `left_from_rectified` and `body_from_camera` are poses (4, 4) of the rectified left camera, in the recorded one and
     in the body; `start_s` is the time of the first frame in the clock of the data set. `noise` is the noise of the
-    readings, the default for sensors that are not used.
+    readings, the default for sensors that are not used. With `imu`, the readings of the IMU are used for the motion
+    between frames; TwinError if there are none.
     """
 
-    def __init__(self, readings: RecordedReadings, left_from_rectified: Array, start_s: float, frame_rate_hz: float):
+    def __init__(
+        self, readings: RecordedReadings, left_from_rectified: Array, start_s: float, frame_rate_hz: float,
+        imu: bool = False,
+    ):  # fmt: skip
+        self._imu = None
+        if imu and readings.inertial is None:
+            raise TwinError("--imu", "no readings of an IMU at the origin of the body", "a data set with them")
         self.body_from_camera = readings.body_from_left @ left_from_rectified
         self.notes = readings.notes
         height, vertical = readings.height, readings.vertical if readings.attitude is None else None
@@ -73,17 +82,22 @@ class Aiding:
         }
         self._limit_s = min(_MOST_S, _SHARE / frame_rate_hz)
         self.noise = _noise(self._series, frame_rate_hz)
+        if imu and readings.inertial is not None:
+            recorded = readings.inertial.readings
+            self._imu = recorded._replace(times_s=recorded.times_s - start_s)
+            self.noise = replace(self.noise, imu=readings.inertial.errors)
         self._height_m = 0.0  # added to the recorded heights
 
     @property
     def used(self) -> list[str]:
-        """Returns the names of the sensors that are used: "pressure", "attitude", "vertical", "dvl"."""
-        return list(self._series)
+        """Returns the names of the sensors that are used: "pressure", "attitude", "vertical", "dvl", "imu"."""
+        return [*self._series, *(["imu"] if self._imu is not None else [])]
 
-    def at(self, time_s: float) -> Readings:
+    def at(self, time_s: float, since_s: float | None = None) -> Readings:
         """Returns the readings of a frame at a time [s] since the first one; None where a sensor has none near it.
 
-        Height and attitude are the readings nearest in time, the others are interpolated.
+        Height and attitude are the readings nearest in time, the others are interpolated. Those of the IMU are all
+        since the last frame, at `since_s`; None: of the last `_FIRST_IMU_S`.
         """
         series, limit_s = self._series.get, self._limit_s
         height, attitude = (_nearest(series(name), time_s, limit_s) for name in ("pressure", "attitude"))
@@ -93,7 +107,15 @@ class Aiding:
             ahrs_rpy_rad=attitude,
             dvl_mps=velocity,
             up=None if up is None else up / np.linalg.norm(up),
+            imu=self._imu_between(time_s - _FIRST_IMU_S if since_s is None else since_s, time_s),
         )
+
+    def _imu_between(self, start_s: float, end_s: float) -> ImuReadings | None:
+        """Returns the readings of the IMU after a time, up to another; None without any."""
+        if self._imu is None:
+            return None
+        first, last = np.searchsorted(self._imu.times_s, [start_s + _ROUNDING_S, end_s + _ROUNDING_S], "right")
+        return None if first == last else ImuReadings(*(part[first:last] for part in self._imu))
 
     def start(
         self,

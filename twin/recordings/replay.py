@@ -116,10 +116,11 @@ def _navigator(
 
 
 def _estimate(opened: OpenedDataset, navigator: Estimators, progress: Progress) -> None:
-    track, aligned, frames = 1, 0, opened.frames
+    track, aligned, frames, last_s = 1, 0, opened.frames, None
     for k, frame in enumerate(frames):
         if opened.aiding is not None:
-            frame = replace(frame, readings=opened.aiding.at(frame.time_s))
+            frame = replace(frame, readings=opened.aiding.at(frame.time_s, last_s))
+            last_s = frame.time_s
         navigator.update(frame, track)
         n = len(navigator.network.keyframes)
         if n - aligned >= np.clip(_SEGMENT_SHARE * n, *_SEGMENT_KEYFRAMES):

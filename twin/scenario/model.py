@@ -26,7 +26,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, PydanticCustomError
 
 from twin.core import geometry
-from twin.core.records import SensorNoise, StereoRig
+from twin.core.records import ImuErrorModel, SensorNoise, StereoRig
 from twin.core.refraction import FlatPort
 from twin.core.settings import EstimatorSettings
 from twin.core.user_files import path_problem
@@ -39,7 +39,7 @@ PLUGIN_NAME = r"^[\w.-]+(:[\w.]+)?$"  #: module:Class, or the name of an entry p
 _CALIBRATION_STREAM = 7311  # of random numbers, for the calibration error of a dive
 _VISIBLE_NOISE = 1e-4  # noise that changes an 8-bit image, a fraction of full scale
 JERLOV = Literal["clear", "I", "IA", "IB", "II", "III", "1C", "3C", "5C", "7C", "9C"]
-AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons"]
+AIDING = Literal["pressure", "ahrs", "dvl", "usbl", "beacons", "imu"]
 
 
 Number = Annotated[float, Strict()]  #: no text and no Booleans
@@ -707,7 +707,7 @@ class NavigationConfig(Section):
     """Navigation sensors and their noise; the estimators receive only the readings of the sensors in `aiding`."""
 
     aiding: tuple[AIDING, ...] = ()
-    """sensors that aid vision; empty: vision only"""
+    """sensors that aid vision; empty: vision only; imu: that of [imu] predicts the motion between frames"""
     pressure_sigma_m: float = Field(default=0.01, gt=0, le=10)
     """standard deviation of the height from the pressure sensor [m]"""
     attitude_sigma_deg: float = Field(default=0.2, gt=0, le=30)
@@ -735,6 +735,7 @@ class NavigationConfig(Section):
 
 class ImuConfig(Section):
     """Inertial measurement unit (IMU) at the origin of the body; its readings are recorded for exports and replays.
+    With "imu" in navigation.aiding, it predicts the motion between frames.
 
     It measures angular rates and specific forces in body axes. Names and units of the noise are those of Kalibr and
     EuRoC: a noise density times the root of the rate is the standard deviation of the white noise of a reading. The
@@ -1132,7 +1133,15 @@ class Scenario(Section):
             navigation.usbl_sigma_m,
             navigation.beacon_sigma_px,
             tuple(beacon.position_m for beacon in self.beacons),
+            imu=self._imu_noise() if "imu" in navigation.aiding else None,
         )
+
+    def _imu_noise(self) -> ImuErrorModel | None:
+        imu = self.imu
+        return imu and ImuErrorModel(
+            imu.gyroscope_noise_density, imu.gyroscope_random_walk, imu.accelerometer_noise_density,
+            imu.accelerometer_random_walk, imu.gyroscope_bias_sigma_radps, imu.accelerometer_bias_sigma_mps2,
+        )  # fmt: skip
 
     def estimator_settings(self) -> EstimatorSettings:
         noise = self.imaging.noise_sd, self.imaging.shot_noise

@@ -35,6 +35,10 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
         yield TwinError("vehicle.thrusters", problem, 'thrusters that can, or vehicle.dynamics = "kinematic"')
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
         yield TwinError("navigation.aiding", "'beacons': the scenario defines no beacon", "with a [[beacons]] section")
+    if "imu" in scenario.navigation.aiding and scenario.imu is None:
+        yield TwinError("navigation.aiding", "'imu': the scenario has no IMU", "with an [imu] section")
+    if "imu" in scenario.navigation.aiding and scenario.imaging.fidelity != "rendered":
+        yield TwinError("navigation.aiding", "'imu': the surrogate has no IMU", 'imaging.fidelity = "rendered"')
     if scenario.sensor is not None:
         yield from _of_sensor(scenario.sensor, scenario.rig.frame_rate_hz)
     yield from _of_lens(scenario)

@@ -11,14 +11,13 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import PASCAL_PER_METRE
+from twin.core.records import PASCAL_PER_METRE, ImuErrorModel
 from twin.datasets import readings
 from twin.datasets.dataset import are_rotations
-from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries
+from twin.datasets.readings import RecordedInertial, RecordedReadings, SensorQuantity, SensorSeries
 from twin.datasets.ros2.bag import Bag
 from twin.datasets.ros2.frame_transforms import Transforms, relative_pose
 from twin.errors import TwinError
-from twin.estimate.navigation.vertical import InertialNoise
 
 _PRESSURE, _IMU = "sensor_msgs/msg/FluidPressure", "sensor_msgs/msg/Imu"
 _DVL = "geometry_msgs/msg/TwistWithCovarianceStamped"
@@ -68,14 +67,14 @@ def read_bag(bag: Bag, camera: str, transforms: Transforms) -> RecordedReadings 
     if height is not None and not _same_place(relative_pose(transforms, camera, height.frame)):
         notes.append(_unused(height, "the pressure sensor is not at the left camera"))
         height = None
-    vertical = None
+    vertical = imu = None
     if body is not None and velocity is not None and velocity is not body:
         velocity = _in_body(velocity, relative_pose(transforms, body.frame, velocity.frame), notes)
     if body is not None and inertial is not None:
-        vertical = _vertical(inertial, relative_pose(transforms, body.frame, inertial.frame), notes)
+        vertical, imu = _inertial(inertial, relative_pose(transforms, body.frame, inertial.frame), notes)
     heights, attitudes, velocities = (None if one is None else one.series for one in (height, attitude, velocity))
     pose = np.eye(4) if body_from_left is None else body_from_left
-    return RecordedReadings(pose, heights, attitudes, velocities, vertical, tuple(notes))
+    return RecordedReadings(pose, heights, attitudes, velocities, vertical, tuple(notes), imu)
 
 
 def _unused(recorded: _Recorded, reason: str) -> str:
@@ -96,15 +95,21 @@ def _in_body(velocity: _Recorded, body_from_sensor: Array | None, notes: list[st
     return velocity._replace(series=SensorSeries(series.times_s, series.values @ body_from_sensor[:3, :3].T, sigmas))
 
 
-def _vertical(inertial: _Recorded, body_from_sensor: Array | None, notes: list[str]) -> SensorSeries | None:
+def _inertial(
+    inertial: _Recorded, body_from_sensor: Array | None, notes: list[str]
+) -> tuple[SensorSeries | None, RecordedInertial | None]:
+    """Returns the direction of the vertical, and the readings of the IMU in body axes."""
     if body_from_sensor is None:
         notes.append(_unused(inertial, "/tf_static does not join its frame and the body"))
-        return None
+        return None, None
     times_s, _, sigmas = inertial.series
     root_s = float(np.sqrt(np.median(np.diff(times_s)))) if len(times_s) > 1 else 0.0  # a density is sigma / sqrt(rate)
-    noise = InertialNoise(float(sigmas[:3].max()) * root_s, _USUAL_WALK, float(sigmas[3:].max()) * root_s)
-    turn = body_from_sensor[:3, :3]
-    return readings.vertical_series(inertial.topic, inertial.series, turn, noise, readings.USUAL_BIAS_MPS2, notes)
+    errors = ImuErrorModel(
+        float(sigmas[:3].max()) * root_s, _USUAL_WALK, float(sigmas[3:].max()) * root_s, readings.USUAL_FORCE_WALK,
+        readings.USUAL_RATE_BIAS_RADPS, readings.USUAL_BIAS_MPS2,
+    )  # fmt: skip
+    vertical = readings.vertical_series(inertial.topic, inertial.series, body_from_sensor[:3, :3], errors, notes)
+    return vertical, readings.in_body(inertial.series, body_from_sensor, errors)
 
 
 def _first(bag: Bag, topic: str) -> Iterable[Any]:

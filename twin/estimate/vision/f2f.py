@@ -8,8 +8,9 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import StereoRig
+from twin.core.records import ImuErrorModel, ImuReadings, StereoRig
 from twin.estimate.vision import matching, observation_equations, two_view_motion
+from twin.estimate.vision.inertial_filter import InertialFilter
 from twin.estimate.vision.motion_filter import MotionFilter
 from twin.estimate.vision.observation_equations import PairMeasurements
 from twin.estimate.vision.rolling_shutter import at_mid_exposure
@@ -57,7 +58,8 @@ class FrameToFrame:
     1.25 mrad over fine texture (this method: 0.1 +- 0.1 mrad) and 4 mrad over coarse texture (0.5 +- 0.7 mrad).
 
     A Kalman filter (`motion_filter`) fuses the measured pose with the prediction from the velocity, because the
-    acceleration of a vehicle is limited, whereas a pose from few and noisy pixels may have any error. A step fails if
+    acceleration of a vehicle is limited, whereas a pose from few and noisy pixels may have any error. With an IMU, it
+    predicts the motion (`inertial_filter`). A step fails if
     too few points are tracked or agree, or if the measured pose contradicts the prediction; the predicted motion is
     then returned, with a large covariance.
 
@@ -66,11 +68,11 @@ class FrameToFrame:
         filter: pose of the last frame in the reference camera, and velocity.
     """
 
-    def __init__(self, rig: StereoRig, patch_px: int):
-        self.rig, self.patch_px = rig, patch_px
+    def __init__(self, rig: StereoRig, patch_px: int, imu_noise: ImuErrorModel | None = None):
+        self.rig, self.patch_px, self._imu_noise = rig, patch_px, imu_noise
         self.reference: _Reference | None = None
         self.started = False
-        self.filter = MotionFilter()
+        self.filter: MotionFilter | InertialFilter = MotionFilter()
         self._reference_cov = np.zeros((6, 6))  # of the pose of the reference in the last keyframe
         self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 
@@ -82,19 +84,29 @@ class FrameToFrame:
         self._reference_cov = np.zeros((6, 6))
         self._set_reference(_Reference(image, points.pixels[strongest], measured[strongest], cov[strongest]))
 
-    def step(self, image: matching.Image, interval_s: float | None = None, unusable: str = "") -> tuple[Motion, str]:
+    def step(
+        self,
+        image: matching.Image,
+        interval_s: float | None = None,
+        unusable: str = "",
+        imu: ImuReadings | None = None,
+    ) -> tuple[Motion, str]:
         """Returns the motion from the last frame to this normalised image, and "ok" or the reason for a failure.
 
         At the first frame, these are the identity and "ok". As covariance of a measured motion, that of the pose of
         this frame in the reference camera is returned: the errors of successive motions partly cancel, so the sum of
         these is an upper bound. The interval is by default that of the frame rate; `unusable` is the reason why the
-        frame must not be matched.
+        frame must not be matched; `imu` has the readings since the last frame, which are used if there are some at the
+        first frame.
         """
         if not self.started:
             self.started = True
+            if self._imu_noise is not None and imu is not None and len(imu.times_s):
+                self.filter = InertialFilter(self.rig, self._imu_noise, imu, np.zeros(6))
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         last_from_reference = geometry.inverse(self.filter.pose)
-        self.filter.predict(1 / self.rig.frame_rate_hz if interval_s is None else interval_s)
+        last_cov = self.filter.cov
+        self.filter.predict(1 / self.rig.frame_rate_hz if interval_s is None else interval_s, imu)
         reference = None if unusable else self.reference
         located = None if reference is None else self._locate(image, reference, self.filter.pose)
         status = unusable or self._fuse(located)
@@ -102,6 +114,9 @@ class FrameToFrame:
         if status != "ok":
             self._common_cov = geometry.transport_covariance(self._common_cov, motion)
         if located is None or status != "ok":
+            if isinstance(self.filter, InertialFilter):
+                added = self.filter.cov - geometry.transport_covariance(last_cov, motion)
+                return Motion(motion, _positive(added), 0, np.inf), status
             return constant_velocity_motion(motion), status
         cov = self.filter.cov.copy()
         if located.tracked_share < _MIN_TRACKED:
@@ -193,6 +208,11 @@ def _at_left_pixels(points: StereoPoints, rig: StereoRig) -> tuple[Array, Array]
     cov[:, 1, 0] *= 2
     cov[:, 1, 1] *= 2
     return measured, cov
+
+
+def _positive(cov: Array) -> Array:
+    values, axes = np.linalg.eigh((cov + cov.T) / 2)
+    return axes * np.asarray(np.maximum(values, 1e-14), np.float64) @ axes.T
 
 
 def constant_velocity_motion(motion: Array) -> Motion:

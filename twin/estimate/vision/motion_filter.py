@@ -4,6 +4,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
+from twin.core.records import ImuReadings
 from twin.core.settings import braking_factor
 
 #: Standard deviation of the acceleration of an underwater vehicle [rotation, translation] (rad/s2, m/s2).
@@ -39,7 +40,7 @@ class MotionFilter:
         self.pose = np.eye(4)
         self._cov[:6], self._cov[:, :6] = 0.0, 0.0
 
-    def predict(self, interval_s: float) -> None:
+    def predict(self, interval_s: float, _: ImuReadings | None = None) -> None:
         """Predicts the pose of the next frame; after a time without measurements, the velocity decays."""
         self.velocity = braking_factor(self._blind_s, interval_s) * self.velocity
         self._blind_s += interval_s
