@@ -146,3 +146,45 @@ def test_without_gymnasium_the_import_says_which_extra_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "twin.gym")
     with pytest.raises(ImportError, match=r"^twin.gym needs the package gymnasium: pip install 'seabed-twin\[gym\]'"):
         importlib.import_module("twin.gym")
+
+
+def state_env(*overrides, **options):
+    name = "twin.gym:SeabedTwinState-v0"
+    return gymnasium.make(name, scenario="reef", overrides=[*SMALL, *overrides], disable_env_checker=True, **options)
+
+
+def test_the_environment_without_images_passes_the_checker_and_follows_the_plan():
+    env = state_env("plan.area_m=[1.8, 0.6]", observe=("pose", "velocity", "reference", "readings", "available"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        check_env(env.unwrapped, skip_render_check=True)
+    state, _ = env.reset(seed=1)
+    truncated, rewards = False, []
+    while not truncated:
+        ahead = (state["reference"][:3] - state["pose"][:3]) * 4.0
+        action = np.append(np.clip(ahead, -1, 1), 0.0).astype(np.float32)
+        state, reward, terminated, truncated, _ = env.step(action)
+        rewards.append(reward)
+        assert not terminated and env.observation_space.contains(state)
+    assert np.mean(rewards) > -0.3
+
+
+def test_contact_ends_an_episode_without_images_and_rewards_can_be_given():
+    env = state_env(action="thrust", frames=5, reward=lambda one: -one.world.true_pose[2, 3])
+    env.reset(seed=1)
+    for sense in (-1, 1):  # one of the two directions of the vertical thrusters is down
+        command = np.array([0, 0, 0, 0, sense, sense, sense, sense], np.float32)
+        for _ in range(60):
+            _, reward, terminated, truncated, info = env.step(command)
+            if terminated or truncated:
+                break
+        if terminated:
+            break
+        env.reset(seed=1)
+    assert terminated and "contact of the hull with the floor" in info["ended"] and -1.5 < reward < 0
+
+
+@pytest.mark.parametrize(("options", "message"), [({"observe": ("left",)}, "observe"), ({"frames": 0}, "frames")])
+def test_options_of_the_environment_without_images_are_checked(options, message):
+    with pytest.raises(TwinError, match=message):
+        state_env(**options)

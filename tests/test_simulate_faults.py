@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from twin.core.records import Readings
+from twin.core.records import Readings, StereoRig
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.scenario.model import FaultConfig
@@ -13,12 +13,13 @@ from twin.simulate.faults import Faults
 from twin.survey import run
 from twin.world.mission import prepare
 
+RIG = StereoRig(320, 240, 300.0, 0.15)
 IMAGE = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
 AIDED = 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
 
 
 def faults_of(*given, duration_s=100.0, seed=0):
-    return Faults([FaultConfig(**one) for one in given], duration_s, np.random.default_rng(seed))
+    return Faults([FaultConfig(**one) for one in given], duration_s, np.random.default_rng(seed), RIG, 2.0)
 
 
 def test_a_fault_lasts_from_its_start_for_its_duration():
@@ -133,3 +134,33 @@ def test_a_survey_without_a_thruster_is_flown_to_its_end(tmp_path, number):
     assert metrics["status"] == "complete" and metrics["control"]["cross_track_rmse_m"] < 0.1
     log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert [one["part"] for one in log if one["event"] == "fault"] == [f"thruster {number}"]
+
+
+def test_silt_takes_contrast_at_equal_brightness_and_settles():
+    image = np.random.default_rng(1).integers(20, 200, (40, 60, 3), np.uint8)
+    given = faults_of({"part": "water", "type": "silt", "start_s": 2.0, "duration_s": 4.0, "size": 0.8})
+    spread = {}
+    for time_s in (1.9, 2.5, 5.0, 9.0, 30.0):
+        given.at(time_s)
+        left, _ = given.images(image, None)
+        spread[time_s] = left.std() / image.std()
+        assert left.mean() == pytest.approx(image.mean(), abs=0.5)
+    assert spread[1.9] == spread[30.0] == 1
+    assert spread[2.5] == pytest.approx(0.6, abs=0.01) and spread[5.0] == pytest.approx(0.2, abs=0.01)
+    assert spread[9.0] == pytest.approx(1 - 0.8 * np.exp(-1), abs=0.01)
+
+
+def test_fish_move_and_have_the_parallax_of_their_distance():
+    blank = np.full((RIG.height_px, RIG.width_px, 3), 255, np.uint8)
+    given = faults_of({"part": "fish", "type": "school", "start_s": 0.0, "size": 1}, seed=3)
+    columns = []
+    for time_s in (0.0, 0.5):
+        given.at(time_s)
+        views = given.images(blank, blank)
+        columns.append([np.nonzero((view < 255).any(axis=2))[1].mean() for view in views])
+    (left, right), (later, _) = columns
+    near, far = (RIG.focal_px * RIG.baseline_m / (share * 2.0) for share in (0.3, 0.7))
+    assert far - 1 < left - right < near + 1 and abs(later - left) > 3
+    given = faults_of({"part": "fish", "type": "school", "start_s": 5.0, "duration_s": 1.0, "size": 3})
+    given.at(7.0)
+    assert (given.images(blank, None)[0] == blank).all()

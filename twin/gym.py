@@ -1,11 +1,11 @@
-"""Gymnasium environment over `twin.World`: `gymnasium.make("twin.gym:SeabedTwin-v0")`; see docs/plugins.md.
+"""Gymnasium environments over `twin.World`: "twin.gym:SeabedTwin-v0" and "twin.gym:SeabedTwinState-v0", without images.
 
 Importing this module registers the environment. It needs the extra `gym` of the package.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, SupportsFloat
 
 import numpy as np
@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from twin.controllers.segments import Reference
 from twin.core import geometry
-from twin.core.records import Array, Frame
+from twin.core.records import Array, Estimate, Frame
 from twin.errors import SurveyAborted, TwinError
 from twin.scenario.file import load_scenario
+from twin.scenario.model import Scenario
 from twin.session.stepped_world import SteppedWorld
 from twin.world.pilot import make_pilot, without_feedback
 
@@ -25,7 +26,7 @@ try:
 except ImportError as error:
     raise ImportError("twin.gym needs the package gymnasium: pip install 'seabed-twin[gym]'") from error
 
-ENVIRONMENT = "SeabedTwin-v0"
+ENVIRONMENT, STATE_ENVIRONMENT = "SeabedTwin-v0", "SeabedTwinState-v0"
 #: Turn rate for a yaw action of 1 [rad/s]; speed for a velocity action of 1, divided by the planned speed.
 YAW_RATE_RADPS, SPEED_RATIO = 0.5, 1.5
 
@@ -84,8 +85,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         given = load_scenario(scenario, overrides, allow_plugins)
         if given.imaging.fidelity != "rendered":
             raise TwinError("imaging.fidelity", f"{given.imaging.fidelity!r} has no images", '"rendered"')
-        if action not in ("velocity", "thrust") or (action == "thrust" and given.vehicle.dynamics != "rigid"):
-            raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
+        _check_action(given, action)
         if reward not in ("coverage", "track"):
             raise TwinError("reward", f"{reward!r}: no such reward", '"coverage" or "track"')
         self._world = SteppedWorld(given)
@@ -164,12 +164,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Returns the command of the vehicle for one frame; a velocity also moves the target of the controller."""
         if not self._velocity_action:
             return values
-        interval_s, last = 1 / self._world.rig.frame_rate_hz, self._target
-        yaw = float(last.yaw) + values[3] * YAW_RATE_RADPS * interval_s
-        c, s = np.cos(yaw), np.sin(yaw)
-        forward, left, up = values[:3] * self._most_mps
-        velocity = np.array([c * forward - s * left, s * forward + c * left, up])
-        self._target = Reference(last.position + velocity * interval_s, velocity, yaw, np.zeros(3))
+        self._target = moved(self._target, values, self._most_mps, 1 / self._world.rig.frame_rate_hz)
         estimate = without_feedback(self._estimate, self._target, self._frame.readings)
         return self._steer(estimate, self._target)
 
@@ -209,6 +204,146 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return "the camera left the terrain" if np.isnan(self._world.mission.terrain.height_at(x, y)) else ""
 
 
+class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
+    """Vehicle of a scenario by its true state, without images and estimators: thousands of steps a second.
+
+    A step lasts `frames` frames. An episode is truncated after the last frame of the plan, and terminated if the hull
+    touches the floor or the left camera leaves the terrain.
+
+    Observation (dictionary; `observe` selects, all are bounded, and values beyond the bounds are cut off):
+        pose: (7,) true pose of the left camera: x, y, z [m], quaternion x, y, z, w.
+        velocity: (6,) true angular rate [rad/s] and velocity [m/s] of the body in its axes.
+        reference: (4,) planned x, y, z [m] of the left camera and yaw [rad] at this time.
+        readings, available: as `SeabedTwinEnv`, with the noise of the scenario.
+
+    Action: as `SeabedTwinEnv`; the controller steers by the true pose.
+
+    Reward of a step: "track", minus the distance of the left camera from its planned position [m], or a function of
+    the environment.
+
+    Args:
+        scenario, overrides: as `SeabedTwinEnv`; the world is that of the surrogate.
+        observe: names of the observations.
+        reward: "track", or a function that gets this environment and returns the reward of its last step.
+        frames: number of frames of a step.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}
+
+    def __init__(
+        self,
+        scenario: str = "quickstart",
+        overrides: Sequence[str] = (),
+        action: Literal["velocity", "thrust"] = "velocity",
+        observe: Sequence[str] = ("pose", "velocity", "reference"),
+        reward: Literal["track"] | Callable[[SeabedTwinStateEnv], float] = "track",
+        frames: int = 1,
+        allow_plugins: bool = False,
+    ):
+        surrogate = ["imaging.fidelity=surrogate", "imaging.extrapolate=true"]
+        given = load_scenario(scenario, [*overrides, *surrogate], allow_plugins)
+        if unknown := [name for name in observe if name not in _BOUNDS]:
+            raise TwinError("observe", f"{unknown[0]!r}: no such observation", ", ".join(_BOUNDS))
+        if frames < 1:
+            raise TwinError("frames", f"{frames}", "1 or more")
+        _check_action(given, action)
+        self.world, self._observe, self._frames = SteppedWorld(given), tuple(observe), frames
+        self._velocity_action = action == "velocity"
+        self._reward = reward if callable(reward) else _minus_distance
+        self._most_mps = SPEED_RATIO * given.plan.speed_mps
+        self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else len(given.vehicle.thrusters),))
+        self._limits = {name: np.array(_BOUNDS[name], np.float64) for name in self._observe}
+        self.observation_space = spaces.Dict({n: spaces.Box(-b, b, dtype=np.float64) for n, b in self._limits.items()})
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Starts an episode, as `SeabedTwinEnv.reset`."""
+        super().reset(seed=seed)
+        self._frame = self.world.reset(int(self.np_random.integers(2**31)))
+        self._steer, start = make_pilot(self.world.mission), self.world.reference
+        self._target = Reference(start.position.copy(), np.zeros(3), float(start.yaw), np.zeros(3))
+        self._to_camera = geometry.adjoint(geometry.inverse(self.world.rig.body_from_camera))
+        return self._observation(), {"time_s": self._frame.time_s, "ended": ""}
+
+    def step(self, action: NDArray[np.float32]) -> tuple[Observation, SupportsFloat, bool, bool, dict[str, Any]]:
+        """Applies an action for `frames` frames; returns observation, reward, terminated, truncated and info."""
+        values, ended, truncated = np.clip(np.asarray(action, np.float64), -1.0, 1.0), "", False
+        try:
+            for _ in range(self._frames):
+                frame = self.world.step(self._command(values))
+                if truncated := frame is None:
+                    break
+                self._frame = frame
+        except SurveyAborted as error:
+            ended = str(error)
+        x, y = self.world.true_pose[:2, 3]
+        if not ended and np.isnan(self.world.mission.terrain.height_at(x, y)):
+            ended = "the camera left the terrain"
+        return (
+            self._observation(),
+            self._reward(self),
+            bool(ended),
+            truncated,
+            {"time_s": self._frame.time_s, "ended": ended},
+        )
+
+    def close(self) -> None:
+        self.world.close()
+
+    @property
+    def distance_m(self) -> float:
+        """Returns the distance of the left camera from its planned position [m]."""
+        return float(np.linalg.norm(self.world.true_pose[:3, 3] - self.world.reference.position))
+
+    def _command(self, values: Array) -> Array:
+        if not self._velocity_action:
+            return values
+        self._target = moved(self._target, values, self._most_mps, 1 / self.world.rig.frame_rate_hz)
+        pose, twist = self.world.true_pose, self._to_camera @ self.world.world.vehicle.twist_body
+        return self._steer(Estimate(self._frame.time_s, pose, pose, twist, 0.0, "ok"), self._target)
+
+    def _observation(self) -> Observation:
+        pose, reference = self.world.true_pose, self.world.reference
+        readings, available = _readings(self._frame) if "readings" in self._limits else (np.zeros(7), np.zeros(3))
+        values = {
+            "pose": np.append(pose[:3, 3], geometry.quaternion_xyzw(pose[:3, :3])),
+            "velocity": self.world.world.vehicle.twist_body,
+            "reference": np.append(reference.position, float(reference.yaw)),
+            "readings": readings,
+            "available": available.astype(np.float64),
+        }
+        return {name: np.clip(values[name], -limit, limit) for name, limit in self._limits.items()}
+
+
+#: Largest absolute values of the observations of `SeabedTwinStateEnv`.
+_BOUNDS: dict[str, Sequence[float]] = {
+    "pose": [1e3] * 3 + [1.0] * 4,
+    "velocity": [10.0] * 6,
+    "reference": [1e3] * 3 + [10.0],
+    "readings": [1e3, *[4.0] * 3, *[10.0] * 3],
+    "available": [1.0] * 3,
+}
+
+
+def _minus_distance(env: SeabedTwinStateEnv) -> float:
+    return -env.distance_m
+
+
+def moved(last: Reference, values: Array, most_mps: float, interval_s: float) -> Reference:
+    """Returns the target of the controller after an interval at a velocity (4,): forward, left, up and yaw rate."""
+    yaw = float(last.yaw) + values[3] * YAW_RATE_RADPS * interval_s
+    c, s = np.cos(yaw), np.sin(yaw)
+    forward, left, up = values[:3] * most_mps
+    velocity = np.array([c * forward - s * left, s * forward + c * left, up])
+    return Reference(last.position + velocity * interval_s, velocity, yaw, np.zeros(3))
+
+
+def _check_action(scenario: Scenario, action: str) -> None:
+    if action not in ("velocity", "thrust") or (action == "thrust" and scenario.vehicle.dynamics != "rigid"):
+        raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
+
+
 def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:
     """Returns the readings (7,) of pressure, attitude and DVL, zero where missing, and the mask (3,) of those given."""
     given = frame.readings
@@ -219,3 +354,4 @@ def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:
 
 if ENVIRONMENT not in gymnasium.registry:
     gymnasium.register(ENVIRONMENT, entry_point="twin.gym:SeabedTwinEnv")
+    gymnasium.register(STATE_ENVIRONMENT, entry_point="twin.gym:SeabedTwinStateEnv")

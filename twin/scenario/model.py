@@ -934,20 +934,25 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent"),
     "dvl": ("off", "stuck", "wrong", "garbage", "intermittent"),
     "usbl": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "water": ("silt",),
+    "fish": ("school",),
 }
 
 
 class FaultConfig(Section):
     """Fault of a part, at a time or at a rate; the estimators and the controller are not told of it."""
 
-    part: Literal["thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl"]
-    """part that fails; a sensor must be in navigation.aiding"""
+    part: Literal[
+        "thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl", "water", "fish"
+    ]  # fmt: skip
+    """part that fails, or what drifts in front of the cameras; a sensor must be in navigation.aiding"""
     number: int | None = Field(default=None, ge=1, le=32)
     """number of the thruster, from 1"""
-    type: Literal["off", "stuck", "wrong", "garbage", "intermittent"] = "off"
+    type: Literal["off", "stuck", "wrong", "garbage", "intermittent", "silt", "school"] = "off"
     """off: no thrust, black images, no readings; stuck: the command, the images or the reading of its start are
     repeated; wrong: thrust times `size`, readings plus `size`; garbage: images of noise, readings with added noise of
-    standard deviation `size`; intermittent: as off, at random frames"""
+    standard deviation `size`; intermittent: as off, at random frames; silt: a cloud hides the share `size` of the
+    contrast, rises in 1 s and settles at a time constant of 3 s; school: `size` fish swim between cameras and floor"""
     start_s: float | None = Field(default=None, ge=0, le=1e6)
     """time at which it starts; default: with per_hour [s]"""
     per_hour: float | None = Field(default=None, gt=0, le=3600)

@@ -1,4 +1,4 @@
-"""Faults of thrusters, cameras and navigation sensors: when each is active, and what it does to commands and data."""
+"""Faults of thrusters, cameras, sensors and water: when each is active, and what it does to commands and data."""
 
 from __future__ import annotations
 
@@ -9,10 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.records import Image, Readings
+from twin.core.records import Image, Readings, StereoRig
 from twin.scenario.model import FaultConfig
+from twin.simulate.image_faults import behind_fish, behind_silt, new_school, silt_share
 
 _READING_OF = {"pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "dvl": "dvl_mps", "usbl": "usbl_m"}
+_LEAST_SILT = 0.02  # share of the contrast below which a cloud has gone
 _CAMERAS_OF = {"cameras": (0, 1), "left_camera": (0,), "right_camera": (1,)}
 
 
@@ -35,10 +37,13 @@ class Faults:
 
     Args:
         duration_s: time up to which faults of a rate start.
+        rig, floor_m: calibration and distance to the floor [m], for what drifts in front of the cameras.
     """
 
-    def __init__(self, faults: Sequence[FaultConfig], duration_s: float, rng: np.random.Generator):
-        self._rng = rng
+    def __init__(
+        self, faults: Sequence[FaultConfig], duration_s: float, rng: np.random.Generator, rig: StereoRig, floor_m: float
+    ):
+        self._rng, self._rig, self._floor_m, self._time_s = rng, rig, floor_m, 0.0
         self._spans = [(fault, span) for fault in faults for span in _spans(fault, duration_s, rng)]
         self._active: list[FaultConfig] = []
         self._kept: dict[tuple[int, object], Any] = {}  # by fault and kind of data: what a stuck part repeats
@@ -47,6 +52,7 @@ class Faults:
 
     def at(self, time_s: float) -> None:
         """Sets the time of the following calls, and adds `events` for the faults that have started or ended."""
+        self._time_s = time_s
         active = [fault for fault, (start, end) in self._spans if start - 1e-9 <= time_s < end - 1e-9]
         for starts, new, old in ((True, active, self._active), (False, self._active, active)):
             for fault in new:
@@ -78,7 +84,7 @@ class Faults:
 
     def images(self, *images: Image | None) -> list[Image | None]:
         """Returns the images (h, w, 3) of the left and the right camera as they are delivered."""
-        delivered = list(images)
+        delivered = self._views(*images)
         for fault in self._of(*_CAMERAS_OF):
             lost = fault.type == "garbage" or fault.type == "stuck" or self._is_lost(fault)
             for k in _CAMERAS_OF[fault.part]:
@@ -86,6 +92,23 @@ class Faults:
                 if image is not None and lost:
                     delivered[k] = self._faulty_image(fault, k, image)
         return delivered
+
+    def _views(self, *images: Image | None) -> list[Image | None]:
+        """Returns the images (h, w, 3) of the left and the right camera behind silt and fish."""
+        seen = list(images)
+        for n, (fault, (start_s, end_s)) in enumerate(self._spans):
+            since_s = self._time_s - start_s
+            if fault.part == "water" and since_s >= 0:
+                share = silt_share(min(fault.size, 1.0), since_s, max(0.0, self._time_s - end_s))
+                if share > _LEAST_SILT:
+                    seen = [image if image is None else behind_silt(image, share, self._rng) for image in seen]
+            elif fault.part == "fish" and 0 <= since_s < end_s - start_s:
+                school = self._kept.setdefault((n, "school"), new_school(max(1, round(fault.size)), self._rng))
+                seen = [
+                    image if image is None else behind_fish(image, school, since_s, k, self._rig, self._floor_m)
+                    for k, image in enumerate(seen)
+                ]
+        return seen
 
     def _faulty_image(self, fault: FaultConfig, camera: int, image: Image) -> Image:
         if fault.type == "stuck":

@@ -12,7 +12,7 @@ from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
 from twin.scenario.model import FAULTS, Scenario, SensorConfig, SnowConfig, TerrainConfig
 from twin.simulate.parameters import moves_along_all_axes
 
-_CAMERAS = ("cameras", "left_camera", "right_camera")  # parts whose faults change images
+_CAMERAS = ("cameras", "left_camera", "right_camera", "water", "fish")  # parts whose faults change images
 _MESH_KEYS = ("mesh_file", "mesh_up", "mesh_scale")
 _FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z")
 

@@ -64,7 +64,8 @@ class World(ABC):
         self.mission, self.stopwatch, self.vehicle, self.sensors = mission, stopwatch, vehicle, sensors
         scenario = mission.scenario
         duration_s = 2 * mission.n_frames / mission.rig.frame_rate_hz  # also of a survey that is slowed
-        self.faults = Faults(scenario.faults, duration_s, streams(scenario.seed)["faults"])
+        rng, floor_m = streams(scenario.seed)["faults"], scenario.plan.altitude_m
+        self.faults = Faults(scenario.faults, duration_s, rng, mission.rig, floor_m)
         self._altimeter = None
         if scenario.control.height == "altimeter":
             floor = field_of(self.true_floor())
