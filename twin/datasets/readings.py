@@ -17,7 +17,7 @@ _SIGMA_SHARES = 1e-12, 1e6
 
 #: Standard deviation of the bias of an accelerometer that states none [m/s2]: 20 mg, as of small MEMS sensors.
 USUAL_BIAS_MPS2 = 0.2
-#: The same of a gyroscope [rad/s] (EuRoC's have up to 0.08), and random walk of the bias of an accelerometer that states
+#: The same of a gyroscope [rad/s] (EuRoC's: up to 0.08), and random walk of the bias of an accelerometer that states
 #: none [m/s3/sqrt(Hz)]: that of EuRoC.
 USUAL_RATE_BIAS_RADPS, USUAL_FORCE_WALK = 0.1, 3e-3
 _SAME_PLACE_M = 0.01  # an IMU at most this far from the origin of the body measures its motion
