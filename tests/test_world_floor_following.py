@@ -118,6 +118,9 @@ def test_without_a_chart_the_path_is_level_above_the_floor_at_its_start():
     mission = prepare(scenario("terrain.prior=none", "control.height=altimeter"))
     z = mission.plan.all_references().position[:, 2]
     x, y, _ = mission.plan.reference(1, 0.0).position
+    known = prepare(scenario("terrain.kind=flat", "plan.height=floor")).plan.request.footprint_m
+    assert known == mission.plan.request.footprint_m
+    assert mission.plan.request.across_scale == pytest.approx(1 / (1 + 0.3 * np.tan(np.deg2rad(30))), rel=0.02)
     assert np.ptp(z) < 1e-6 and abs(z[0] - 2.0 - float(mission.terrain.height_near(x, y))) < 0.2
 
 

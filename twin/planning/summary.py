@@ -19,7 +19,7 @@ from twin.world.energy import planned_energy
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
 from twin.world.path_checks import unknown_share
-from twin.world.planning import SHORT_PERCENT
+from twin.world.planning import SHORT_PERCENT, UNKNOWN_SLOPE
 
 #: Standard deviation of the disparity on good texture [px]; the depth error on the reference plane is proportional to
 #: it.
@@ -151,7 +151,8 @@ def _limits_of_validity(mission: Mission, error: ExpectedError) -> Iterator[str]
     if mission.plan.cross_track and window < n_tracks:
         yield (f"the cross lines are linked with the last {window} of {n_tracks} tracks only (estimate.window_tracks)")
     if scenario.terrain.prior == "none":
-        yield "the floor is not known: legs are spaced as over a level one, and their sidelap is less on slopes"
+        steepest = math.degrees(math.atan(UNKNOWN_SLOPE))
+        yield f"the floor is not known: the survey is spaced for slopes up to {steepest:.0f} deg"
     if mission.objects and scenario.imaging.fidelity != "rendered":
         yield "the surrogate surveys the bare sea floor, and so does this plan: both leave out [[objects]]"
 

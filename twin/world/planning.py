@@ -31,6 +31,7 @@ _ITERATIONS = 25
 _TOLERANCE = 0.005  # of 1 - overlap, relative
 _LEAST_SCALE = 0.05  # of the spacing relative to that over the reference plane
 _ACROSS_SLOPE = 2.0  # greatest slope of a path that follows the floor across the legs, where it is flown more slowly
+UNKNOWN_SLOPE = 0.3  #: slope (rise over run) for which a survey over an unknown floor is spaced
 _SPACING_POINTS = 200  #: largest number of points of `_leg_spacing` along the legs, and across them
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
@@ -51,6 +52,8 @@ def plan_survey(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     meets the floor. Raises TwinError if no plan satisfies the scenario, or it exceeds the limits of `check_plan_size`.
     """
     plan, pattern = level_plan(scenario, terrain), scenario.plan.pattern
+    if scenario.terrain.prior == "none":
+        plan = _PATTERNS[pattern](for_slopes(plan.request))
     request = plan.request
     check_plan_size(plan, scenario.control.hold_s)
     if terrain is None or not _lies_over(plan, terrain):
@@ -97,6 +100,16 @@ def _mean_height_m(terrain: Terrain, centre_m: tuple[float, float], size_m: tupl
 def level_plan(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
     """Returns the plan of a survey over the reference plane; raises TwinError like `plan_survey`."""
     return _PATTERNS[scenario.plan.pattern](survey_request(scenario, terrain))
+
+
+def for_slopes(request: SurveyRequest) -> SurveyRequest:
+    """Returns the request with the spacing that keeps the overlaps over an unknown floor with slopes of `UNKNOWN_SLOPE`.
+
+    At the slope g, the floor that rises reaches 1 / (1 + g t) as far into an image as level floor, with t the tangent
+    of half the angle of view (`_leg_spacing`).
+    """
+    across, along = (1 / (1 + UNKNOWN_SLOPE * side / 2 / request.altitude_m) for side in request.footprint_m)
+    return request._replace(across_scale=across, along_scale=along)
 
 
 def check_plan_size(plan: SurveyPlan, hold_s: float) -> None:
