@@ -14,9 +14,9 @@ from twin.session.mission_actions import MissionActions
 from twin.world.mission import Mission
 
 #: Vision is lost, and the survey is aborted, if fewer than the fraction _MIN_MEASURED of the frames of the last
-#: _MAX_BLIND_S seconds were measured; the vehicle has then been stopped for a while. Where no floor is visible, a few
-#: percent of the frames match by chance.
-_MAX_BLIND_S, _MIN_MEASURED = 6.0, 0.1
+#: _MAX_BLIND_S seconds were measured, _WITH_DVL_S if a DVL measures the motion meanwhile; the vehicle has then been
+#: stopped for a while. Where no floor is visible, a few percent of the frames match by chance.
+_MAX_BLIND_S, _WITH_DVL_S, _MIN_MEASURED = 6.0, 20.0, 0.1
 _MAX_HELD_S = 60.0  # the survey is aborted if the vehicle is stopped for longer in total
 _MAX_SIGMA = 0.5  # largest ratio of position sigma to shorter side of the footprint; the survey is aborted beyond it
 
@@ -50,7 +50,8 @@ class SurveyMonitor:
 
             self.live = LiveViewer(mission.rig)
         self.status = "ok"
-        self._measured = deque([True] * round(_MAX_BLIND_S * self.rate_hz))
+        longest_s = _WITH_DVL_S if "dvl" in mission.scenario.navigation.aiding else _MAX_BLIND_S
+        self._measured = deque([True] * round(longest_s * self.rate_hz))
         self.actions = MissionActions(mission, folder.log)
         self.max_sigma_m = _MAX_SIGMA * min(mission.plan.request.footprint_m)
 

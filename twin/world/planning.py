@@ -103,7 +103,7 @@ def level_plan(scenario: Scenario, terrain: Terrain | None) -> SurveyPlan:
 
 
 def for_slopes(request: SurveyRequest) -> SurveyRequest:
-    """Returns the request with the spacing that keeps the overlaps over an unknown floor with slopes of `UNKNOWN_SLOPE`.
+    """Returns the request with the spacing that keeps the overlaps over slopes of `UNKNOWN_SLOPE`.
 
     At the slope g, the floor that rises reaches 1 / (1 + g t) as far into an image as level floor, with t the tangent
     of half the angle of view (`_leg_spacing`).
