@@ -703,6 +703,22 @@ class WavesConfig(Section):
         return self.height_m == 0 and self.wind_mps is None
 
 
+class TetherConfig(Section):
+    """Tether of the vehicle: a neutrally buoyant line to a point above the start, paid out as needed.
+
+    Its drag pulls at the vehicle, which the controller does not know. Diameter: Fathom of Blue Robotics.
+    """
+
+    length_m: float = Field(default=0.0, ge=0, le=1000)
+    """height of its upper end above the start: surface, ship or clump weight; 0: no tether [m]"""
+    diameter_m: float = Field(default=0.0076, gt=0, le=0.1)
+    """diameter [m]"""
+    drag_coefficient: float = Field(default=1.2, ge=0, le=3)
+    """drag coefficient of a cylinder across the flow"""
+    attachment_m: Vector3 = (-0.2, 0.0, 0.1)
+    """point of the body where it is attached [m]"""
+
+
 class NavigationConfig(Section):
     """Navigation sensors and their noise; the estimators receive only the readings of the sensors in `aiding`."""
 
@@ -934,6 +950,7 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent"),
     "dvl": ("off", "stuck", "wrong", "garbage", "intermittent"),
     "usbl": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "tether": ("stuck",),
     "water": ("silt",),
     "fish": ("school",),
 }
@@ -943,16 +960,18 @@ class FaultConfig(Section):
     """Fault of a part, at a time or at a rate; the estimators and the controller are not told of it."""
 
     part: Literal[
-        "thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl", "water", "fish"
+        "thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl", "tether", "water",
+        "fish",
     ]  # fmt: skip
     """part that fails, or what drifts in front of the cameras; a sensor must be in navigation.aiding"""
     number: int | None = Field(default=None, ge=1, le=32)
     """number of the thruster, from 1"""
     type: Literal["off", "stuck", "wrong", "garbage", "intermittent", "silt", "school"] = "off"
     """off: no thrust, black images, no readings; stuck: the command, the images or the reading of its start are
-    repeated; wrong: thrust times `size`, readings plus `size`; garbage: images of noise, readings with added noise of
-    standard deviation `size`; intermittent: as off, at random frames; silt: a cloud hides the share `size` of the
-    contrast, rises in 1 s and settles at a time constant of 3 s; school: `size` fish swim between cameras and floor"""
+    repeated, the tether is caught with a slack of `size`; wrong: thrust times `size`, readings plus `size`; garbage:
+    images of noise, readings with added noise of standard deviation `size`; intermittent: as off, at random frames;
+    silt: a cloud hides the share `size` of the contrast, rises in 1 s and settles at a time constant of 3 s; school:
+    `size` fish swim between cameras and floor"""
     start_s: float | None = Field(default=None, ge=0, le=1e6)
     """time at which it starts; default: with per_hour [s]"""
     per_hour: float | None = Field(default=None, gt=0, le=3600)
@@ -961,7 +980,7 @@ class FaultConfig(Section):
     """duration of a fault; default: to the end of the survey [s]"""
     size: float = Field(default=0.5, ge=-100, le=100)
     """wrong, garbage: factor on the thrust; bias or noise of readings in their unit [m, deg, m/s]; intermittent: share
-    of the frames that are lost, 0 to 1"""
+    of the frames that are lost, 0 to 1; tether: slack [m]"""
 
     @property
     def name(self) -> str:
@@ -1051,6 +1070,7 @@ class Scenario(Section):
     snow: SnowConfig = SnowConfig()
     current: CurrentConfig = CurrentConfig()
     waves: WavesConfig = WavesConfig()
+    tether: TetherConfig = TetherConfig()
     navigation: NavigationConfig = NavigationConfig()
     imu: ImuConfig | None = None
     """inertial measurement unit; default: none"""

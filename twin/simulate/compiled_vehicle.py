@@ -22,6 +22,7 @@ from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, 
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import Sea, flow_at
+from twin.simulate.tether import NO_TETHER, Tether, add_tether
 from twin.simulate.thrusters import (
     ThrusterState,
     lagged_thrusters,
@@ -47,6 +48,7 @@ class RigidBodyState(NamedTuple):
     timestep_s: float
     n_steps: NDArray[np.int64]  #: (1,) number of timesteps since 0 s
     floor: FloorField  #: floor that the hull must not touch
+    tether: Tether
     #: (1,) number of timesteps that were not simulated since the hull touched the floor; -1 if it did not.
     left: NDArray[np.int64]
 
@@ -62,18 +64,23 @@ class CompiledVehicle:
 
     def __init__(
         self, vehicle: VehicleConfig, sea: Sea, world_from_body: Array, timestep_s: float,
-        floor: FloorField = OPEN_WATER,
+        floor: FloorField = OPEN_WATER, tether: Tether = NO_TETHER,
     ):  # fmt: skip
         thrusters = lagged_thrusters(parameters_of(vehicle), timestep_s)
         self.state = RigidBodyState(
             np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
-            trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, np.full(1, -1),
+            trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, tether,
+            np.full(1, -1),
         )  # fmt: skip
         self._time_s = 0.0
 
     @property
     def world_from_body(self) -> Array:
         return self.state.pose.copy()
+
+    @property
+    def tether(self) -> Tether:
+        return self.state.tether
 
     @property
     def thrust_factors(self) -> Array:
@@ -124,6 +131,7 @@ def advance(body, command, n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
         flow = flow_at(body.sea, body.n_steps[0] * body.timestep_s, pose[:3, 3])
         wrench = thruster_wrench(thrusters)
+        add_tether(wrench, body.tether, body.sea, body.n_steps[0] * body.timestep_s, pose[:3, :3], pose[:3, 3], now)
         geometry.copy_into(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, flow, wrench))
         velocity += body.kick[0] * body.timestep_s * acceleration
         body.kick[0] = 1.0

@@ -12,6 +12,7 @@ from twin.core.geometry import Array
 from twin.core.records import Image, Readings, StereoRig
 from twin.scenario.model import FaultConfig
 from twin.simulate.image_faults import behind_fish, behind_silt, new_school, silt_share
+from twin.simulate.tether import Tether
 
 _READING_OF = {"pressure": "pressure_z_m", "ahrs": "ahrs_rpy_rad", "dvl": "dvl_mps", "usbl": "usbl_m"}
 _LEAST_SILT = 0.02  # share of the contrast below which a cloud has gone
@@ -81,6 +82,14 @@ class Faults:
             elif self._is_lost(fault):
                 factors[k] = 0.0
         return command, factors
+
+    def catch_tether(self, tether: Tether, position_m: Array) -> None:
+        """Catches the tether at the position (3,) of the vehicle, or lets it go."""
+        caught = self._of("tether")
+        if not caught:
+            tether.snag[:] = 0.0
+        elif tether.snag[0] == 0.0:
+            tether.snag[:] = 1.0, *position_m, caught[0].size
 
     def images(self, *images: Image | None) -> list[Image | None]:
         """Returns the images (h, w, 3) of the left and the right camera as they are delivered."""

@@ -18,6 +18,7 @@ from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import Sea, flow_at
 from twin.simulate.sensors import inertial_quantities
+from twin.simulate.tether import NO_TETHER, Tether, add_tether
 from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, step_thrusters, thruster_wrench
 
 
@@ -34,11 +35,15 @@ class MujocoVehicle:
         world_from_body: (4, 4) initial pose, at rest.
 
     Attributes:
+        tether: its tether; `snag` can be modified in place.
         after_timestep: called with `inertial` after each timestep; None: nothing is called.
         touched: returns which obstacle the hull touches at a pose world_from_body, "" for none.
     """
 
-    def __init__(self, model: MjModel, vehicle: VehicleConfig, sea: Sea, world_from_body: Array):
+    def __init__(
+        self, model: MjModel, vehicle: VehicleConfig, sea: Sea, world_from_body: Array, tether: Tether = NO_TETHER
+    ):
+        self.tether = tether
         self._model, self._data = model, mujoco.MjData(model)
         self._hull, self._sea = trimmed_hull(vehicle), sea
         self._body = model.body("vehicle").id
@@ -89,7 +94,9 @@ class MujocoVehicle:
         return self._velocity + 0.5 * self._model.opt.timestep * self._acceleration
 
     def _acceleration_at(self, velocity: Array, wrench: Array) -> Array:
-        flow = flow_at(self._sea, self.time_s, self._data.xpos[self._body])
+        at = self._data.xpos[self._body]
+        flow = flow_at(self._sea, self.time_s, at)
+        add_tether(wrench, self.tether, self._sea, self.time_s, self._rotation, at, velocity)
         return free_joint_acceleration(self._hull, self._rotation, velocity, flow, wrench)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:

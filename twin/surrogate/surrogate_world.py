@@ -18,6 +18,7 @@ from twin.simulate.hull import physics_timestep_s
 from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.sea import make_sea
 from twin.simulate.sensors import NavigationSensors
+from twin.simulate.tether import tether_of
 from twin.surrogate.compiled_loop import compiled_loop
 from twin.surrogate.coverage import RENDERED, survey_conditions, unmodelled
 from twin.surrogate.error_model_file import FittedErrorModel
@@ -44,6 +45,7 @@ class SurrogateWorld(World):
             vehicle = CompiledVehicle(
                 scenario.vehicle, make_sea(scenario, rng["sea"]), mission.start_of_body,
                 physics_timestep_s(rig.frame_rate_hz), floor_of(mission),
+                tether_of(scenario.tether, mission.start_of_body[:3, 3]),
             )  # fmt: skip
         else:
             vehicle = KinematicVehicle(mission.start_of_body)

@@ -18,6 +18,7 @@ from twin.simulate.kinematic_vehicle import KinematicVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.sea import make_sea
 from twin.simulate.sensors import InertialSensor, NavigationSensors
+from twin.simulate.tether import tether_of
 from twin.terrains import Terrain
 from twin.world.mesh_floor import floor_surface
 from twin.world.mission import Mission, Step, motion_rate_hz
@@ -37,7 +38,13 @@ class RenderedWorld(World):
         body = scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2
         scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz), *body)
         vehicle = (
-            MujocoVehicle(scene.model, scenario.vehicle, make_sea(scenario, rng["sea"]), mission.start_of_body)
+            MujocoVehicle(
+                scene.model,
+                scenario.vehicle,
+                make_sea(scenario, rng["sea"]),
+                mission.start_of_body,
+                tether_of(scenario.tether, mission.start_of_body[:3, 3]),
+            )
             if scenario.vehicle.dynamics == "rigid"
             else KinematicVehicle(mission.start_of_body)
         )

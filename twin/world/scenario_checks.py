@@ -138,6 +138,7 @@ def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
         sea = ("velocity_mps", "gust_mps", "tide_mps", "file")
         yield from keys_without_effect("current", current, sea, problem, allowed)
         yield from keys_without_effect("waves", waves, ("height_m", "wind_mps"), problem, allowed)
+        yield from keys_without_effect("tether", scenario.tether, ("length_m",), problem, allowed)
     if current.file is not None:
         problem = "is unused: current.file has the mean current"
         yield from keys_without_effect("current", current, ("velocity_mps", "profile"), problem, "one of the two")
@@ -160,7 +161,10 @@ def _of_faults(scenario: Scenario) -> Iterator[TwinError]:
                 yield TwinError(f"{key}.number", "missing" if fault.number is None else f"{fault.number}", f"1 to {n}")
         elif fault.number is not None:
             yield TwinError(f"{key}.number", f"has no effect on {fault.part}", "no value")
-        if fault.part not in (*_CAMERAS, "thruster") and fault.part not in scenario.navigation.aiding:
+        if fault.part == "tether" and (not scenario.tether.length_m or kinematic or fault.size <= 0):
+            problem = "needs a tether, a rigid vehicle and a slack above 0"
+            yield TwinError(f"{key}.part", problem, "tether.length_m and size above 0")
+        if fault.part not in (*_CAMERAS, "thruster", "tether") and fault.part not in scenario.navigation.aiding:
             yield TwinError(f"{key}.part", f"{fault.part} is not used", "a sensor in navigation.aiding")
         if (fault.start_s is None) == (fault.per_hour is None):
             problem = "missing" if fault.start_s is None else "given together with per_hour"

@@ -125,6 +125,7 @@ class World(ABC):
         with self.stopwatch("physics"):
             if self.faults.exist and not isinstance(self.vehicle, KinematicVehicle):
                 command, self.vehicle.thrust_factors[:] = self.faults.thrusts(command)
+                self.faults.catch_tether(self.vehicle.tether, self.vehicle.world_from_body[:3, 3])
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def __len__(self) -> int:
