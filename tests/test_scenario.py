@@ -93,7 +93,9 @@ BAD_FILES = [
     ),
     (
         '[navigation]\naiding = ["pressure", "sonar"]',
-        ["2: navigation.aiding.1: 'sonar': not allowed (allowed: 'pressure', 'ahrs', 'dvl', 'usbl', 'beacons' or 'imu')"],
+        [
+            "2: navigation.aiding.1: 'sonar': not allowed (allowed: 'pressure', 'ahrs', 'dvl', 'usbl', 'beacons' or 'imu')"
+        ],
     ),
     ("[navigation]\nusbl_interval_s = 0", ["2: navigation.usbl_interval_s: 0: not allowed (allowed: greater than 0)"]),
     (

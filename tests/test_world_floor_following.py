@@ -101,6 +101,13 @@ def test_the_path_rises_over_a_measured_obstacle():
     assert before == pytest.approx(z + 2.0, abs=0.01) and after > z + 2.2 + 0.4
 
 
+def test_far_off_the_path_the_floor_is_that_of_its_edge():
+    mission = prepare(scenario("control.height=map", "terrain.prior=none"))
+    follower, far = FloorFollower(mission), np.array([500.0, -500.0])
+    follower.add(np.array([[0.0, 0.0, 0.3]]))
+    assert np.isfinite(follower.surface(far).height_at(*far[:, None])).all()
+
+
 @pytest.mark.parametrize(("prior", "mean_m", "std_share"), [
     (["terrain.prior_offset_m=0.3"], 0.3, 1.0), (["terrain.prior_smoothing_m=1.0"], 0.0, 0.95),
 ])  # fmt: skip

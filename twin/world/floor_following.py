@@ -79,7 +79,8 @@ class FloorFollower:
     def surface(self, position_m: Array) -> CameraSurface:
         """Returns the surface around a position (x, y) [m]: above the floor as measured and, elsewhere, continued."""
         reach = np.ceil(3 * max(self._sides_m) / self._cell_m).astype(int)
-        col, row = np.round((position_m - self._west_south_m) / self._cell_m).astype(int)
+        nearest = np.round((position_m - self._west_south_m) / self._cell_m).astype(int)
+        col, row = np.clip(nearest, 0, np.array(self._n.shape[::-1]) - 1)  # far off the path, its edge
         part = slice(max(0, row - reach), row + reach + 1), slice(max(0, col - reach), col + reach + 1)
         corner_m = self._west_south_m + self._cell_m * (np.array([part[1].start, part[0].start]) + 0.5)
         above_m, reach_m = self._continued(part), VEHICLE_REACH_M + self._clearance_m
