@@ -20,11 +20,13 @@ from twin.studies.surveys import surveys
 
 PLAN_KEYS = (
     "pattern, area_m, centre_m, centre_crs, heading_deg, along_contours, polygon, turns, altitude_m, speed_mps, "
-    "overlap_along, overlap_across, overlap_reference, height, tracks, cross_lines, cross_rise_m, fill_gaps, clearance_m"
+    "overlap_along, overlap_across, overlap_reference, height, tracks, cross_lines, cross_rise_m, fill_gaps, "
+    "clearance_m"
 )
 TOP_KEYS = (
     "name, seed, record, terrain, vehicle, rig, imaging, sensor, lens, port, calibration_error, water, lamps, sun, "
-    "snow, current, waves, tether, navigation, imu, plan, control, estimate, map, beacons, objects, tasks, faults, require"
+    "snow, current, waves, tether, navigation, imu, plan, control, estimate, map, beacons, objects, tasks, "
+    "faults, require"
 )
 SENSOR_KEYS = (
     "exposure_min_ms, exposure_max_ms, exposure_lag_s, gain_max_db, f_number, pixel_um, quantum_efficiency, "
@@ -94,7 +96,8 @@ BAD_FILES = [
     (
         '[navigation]\naiding = ["pressure", "sonar"]',
         [
-            "2: navigation.aiding.1: 'sonar': not allowed (allowed: 'pressure', 'ahrs', 'dvl', 'usbl', 'beacons' or 'imu')"
+            "2: navigation.aiding.1: 'sonar': not allowed (allowed: 'pressure', 'ahrs', 'dvl', 'usbl', 'beacons' or"
+            " 'imu')"
         ],
     ),
     ("[navigation]\nusbl_interval_s = 0", ["2: navigation.usbl_interval_s: 0: not allowed (allowed: greater than 0)"]),
