@@ -63,3 +63,19 @@ def test_a_survey_without_gaps_flies_no_further_track(tmp_path):
 def test_a_task_that_cannot_be_flown_is_refused(task, line):
     with pytest.raises(ScenarioError, match=f"tasks.0.*{line}"):
         prepare(scenario(f"tasks=[{{{task}}}]"))
+
+
+def test_tasks_have_their_own_maps_in_the_order_of_flight(tmp_path):
+    later, first = 'name="b",position_m=[0.5,0.3],altitude_m=1.0', 'name="a",position_m=[-0.5,0.0],altitude_m=1.0'
+    tasks = "tasks=[{%s},{%s,after_track=1}]" % (later, first)
+    given = scenario("plan.fill_gaps=false", tasks)
+    found = survey.run(given, tmp_path / "run", outputs=()).metrics
+    names = [task["name"] for task in found["tasks"]]
+    assert names == [detail.name for detail in prepare(given).details] and names[0] == "a"
+    for number, task in enumerate(found["tasks"], 1):
+        assert task["completeness_area"] > 0.95 and task["cell_m"] == 0.01 and task["le90_m"] < 0.01
+        assert (tmp_path / "run" / f"task_{number}" / "dem.tif").is_file()
+    plain = survey.run(scenario("plan.fill_gaps=false"), tmp_path / "plain", outputs=()).metrics
+    assert found["overlap"]["across_asked"] == plain["overlap"]["across_asked"]
+    assert found["overlap"]["across_median"] == pytest.approx(plain["overlap"]["across_median"], abs=0.02)
+    assert found["map"]["cell_m"] == plain["map"]["cell_m"] and plain["tasks"] == []

@@ -205,7 +205,7 @@ def _tasks(mission: Mission) -> list[str]:
     """Returns what is surveyed closely, and after which track, in words."""
     tasks, plan = {task.name: task for task in mission.scenario.tasks}, mission.plan
     texts = []
-    for detour in plan.detours:
+    for detour in sorted(plan.detours, key=lambda detour: detour.track):
         task, time_s = tasks[detour.name], plan.track_duration_s(detour.track)
         size = "{:g} m x {:g} m".format(*task.size_m)
         texts.append(f"{task.name}: {size} from {length(task.altitude_m)}, as track {detour.track}, {time_s:.0f} s")

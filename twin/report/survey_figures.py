@@ -202,7 +202,7 @@ def task_maps(run: Run) -> Figure | None:
     names = [name for name in run.rasters if name.startswith("task_") and name.endswith("/dem")]
     if not names:
         return None
-    figure = Figure(figsize=(WIDTH_IN, 3.4 * len(names)))
+    figure = Figure(figsize=(WIDTH_IN, 3.6 * len(names)))
     titles = [task["name"] for task in (run.metrics or {}).get("tasks", [])]
     for row, name in zip(figure.subplots(len(names), 2, squeeze=False), names, strict=True):
         number = int(name.removeprefix("task_").split("/")[0])

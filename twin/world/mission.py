@@ -137,7 +137,8 @@ class Mission:
     def details(self) -> tuple[Detail, ...]:
         """Returns the maps of the tasks, in the order in which they are flown."""
         tasks = {task.name: task for task in self.scenario.tasks}
-        return tuple(self._detail(tasks[detour.name], detour.track) for detour in self.plan.detours)
+        flown = sorted(self.plan.detours, key=lambda detour: detour.track)
+        return tuple(self._detail(tasks[detour.name], detour.track) for detour in flown)
 
     def _detail(self, task: TaskConfig, track: int) -> Detail:
         area = SurveyArea("rectangle", task.size_m, task.position_m, self.plan.area.heading)
