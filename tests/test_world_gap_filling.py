@@ -67,7 +67,7 @@ def test_a_task_that_cannot_be_flown_is_refused(task, line):
 
 def test_tasks_have_their_own_maps_in_the_order_of_flight(tmp_path):
     later, first = 'name="b",position_m=[0.5,0.3],altitude_m=1.0', 'name="a",position_m=[-0.5,0.0],altitude_m=1.0'
-    tasks = "tasks=[{%s},{%s,after_track=1}]" % (later, first)
+    tasks = "tasks=[{" + later + "},{" + first + ",after_track=1}]"
     given = scenario("plan.fill_gaps=false", tasks)
     found = survey.run(given, tmp_path / "run", outputs=()).metrics
     names = [task["name"] for task in found["tasks"]]
