@@ -18,15 +18,15 @@ NOISE = SensorNoise()
 class ScriptedVision:
     """Vision that tracks one reference: where blind, it predicts from a velocity; then it sees the pose again."""
 
-    def __init__(self, poses):
-        self.poses, self.k, self.believed = poses, -1, poses[0]
+    def __init__(self, poses, blind=BLIND):
+        self.poses, self.k, self.believed, self.blind = poses, -1, poses[0], blind
 
     def track_frame(self, frame):
         self.k += 1
         if self.k == 0:
             return Motion(np.eye(4), np.eye(6) * 1e-12, 0, 0.0), "ok"
         before = self.believed
-        if self.k in BLIND:
+        if self.k in self.blind:
             step = geometry.exp(np.array([0.0, 0.0, 0.004, 0.05, 0.0, 0.0]))  # not the true motion
             self.believed = before @ step
             return constant_velocity_motion(step), "too few points matched"
@@ -88,3 +88,20 @@ def test_the_steps_between_are_closed_on_the_measured_motion(flown):
     np.testing.assert_allclose(product, expected, atol=1e-8)
     assert np.linalg.norm(steps[BLIND.start : BLIND.stop + 1, 3:], axis=1).max() < 0.06
     assert navigator.log.n_lost == len(BLIND)
+
+
+def test_a_dvl_measures_the_first_blind_frame_after_a_seen_one():
+    """Else the noise of the pressure sensor determines its height, as a prediction is far less certain."""
+    poses, rng = path(), np.random.default_rng(1)
+    blind = [k for k in range(20, 40) if k % 3]
+    navigator = Navigator(RIG, start=poses[0], vision=ScriptedVision(poses, blind), readings_noise=NOISE)
+    image, errors = np.zeros((RIG.height_px, RIG.width_px, 3), np.uint8), []
+    bodies = poses @ geometry.inverse(RIG.body_from_camera)
+    for k, pose in enumerate(poses):
+        step = geometry.log(geometry.inverse(bodies[max(k - 1, 0)]) @ bodies[max(k, 1)])
+        pressure_m = pose[2, 3] + NOISE.pressure_m * rng.standard_normal()
+        readings = Readings(pressure_m, dvl_mps=step[3:] * RATE_HZ + NOISE.dvl_mps * rng.standard_normal(3))
+        found = navigator.update(Frame(k, k / RATE_HZ, image, None, readings, False)).world_from_camera
+        errors.append(found[:3, 3] - pose[:3, 3])
+    height_m = np.abs(np.array(errors)[blind, 2])
+    assert height_m.max() < 0.5 * NOISE.pressure_m

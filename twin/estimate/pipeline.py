@@ -150,9 +150,12 @@ class Navigator:
         self.log.n_lost += not measured
         last, rejected = self.filter.world_from_camera, self.filter.rejected
         blind = self._blindness(motion, measured)
+        velocity_mps = frame.readings.dvl_mps
         if measured and blind is not None:
             motion, frame, interval_s = self._after_blindness(blind, motion, frame)
         moved = self.filter.advance(motion, frame.readings, interval_s, measured)
+        if frame.readings.dvl_mps is None and velocity_mps is not None:
+            self.filter.dvl.resume(velocity_mps)
         self.filter.fuse_vertical(frame.readings)
         frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
         step = motion.a_from_b if measured else geometry.inverse(last) @ self.filter.world_from_camera

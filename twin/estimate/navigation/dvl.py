@@ -54,6 +54,10 @@ class DvlIntegrator:
         white_m2 = (self._noise.dvl_mps * interval_s) ** 2
         return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
 
+    def resume(self, velocity_mps: Array) -> None:
+        """Lets the integration of displacements start from a reading (3,) that was not fused."""
+        self.state.velocity[:] = velocity_mps
+
     def displacement_at_node(self, number: int) -> Displacement | None:
         """Returns the displacement since the last node, and restarts the integration; None if a reading is missing."""
         state, node, self._node = self.state, self._node, number
