@@ -57,7 +57,7 @@ MUTANTS = [
         ("controllers/survey_area.py", "return c * x + s * y, c * y - s * x", "return c * x - s * y, c * y + s * x", "controllers_area"),
         ("controllers/tracking.py", "Gains(proportional=w**2 + 2 * w * a, derivative=2 * w + a, integral=a * w**2)", "Gains(proportional=w**2 + 2 * w * a, derivative=2 * w + a, integral=a * w)", "controllers_tracking"),
         ("controllers/allocation.py", "return np.interp(thrusts / load, table, allocation.command_table), 1 / load", "return np.interp(thrusts, table, allocation.command_table), 1 / load", "controllers_tracking simulate_hydrodynamics"),
-        ("controllers/detours.py", "later * (d.track > leave.track)", "later * (d.track >= leave.track + later)", "controllers_detours"),
+        ("controllers/detours.py", "later * (d.track > leave.track)", "later * (d.track < leave.track)", "controllers_detours"),
         ("controllers/detours.py", "segment._replace(start=(x, y, z + by_m))", "segment._replace(start=(x, y, z - by_m))", "controllers_detours"),
         ("twin/simulate/tether.py", "(1 - share) * tether.drag", "tether.drag", "simulate_tether"),
         ("twin/simulate/tether.py", "wrench[1] += a[2] * force[0] - a[0] * force[2]", "wrench[1] += a[0] * force[2] - a[2] * force[0]", "simulate_tether"),

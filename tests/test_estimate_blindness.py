@@ -1,11 +1,14 @@
 """Blind frames: tracking that finds its points again measures the whole motion since, whatever was predicted."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from twin.core import geometry
+from twin.core.links import Link
 from twin.core.records import Frame, Readings, SensorNoise, StereoRig
-from twin.estimate.pipeline import Navigator
+from twin.estimate.pipeline import Navigator, _Blindness
 from twin.estimate.vision.f2f import constant_velocity_motion
 from twin.estimate.vision.two_view_motion import Motion
 
@@ -105,3 +108,19 @@ def test_a_dvl_measures_the_first_blind_frame_after_a_seen_one():
         errors.append(found[:3, 3] - pose[:3, 3])
     height_m = np.abs(np.array(errors)[blind, 2])
     assert height_m.max() < 0.5 * NOISE.pressure_m
+
+
+@pytest.mark.parametrize(("motion_sigma_m", "node_sigma_m", "kept"), [(0.05, 5e-4, 0.0), (1e-4, 0.05, 1.0)])
+def test_a_link_after_blindness_keeps_only_the_correction_of_the_last_node(motion_sigma_m, node_sigma_m, kept):
+    """Readings have corrected the pose by 20 mm: the error of the motion since the node, or that of the node."""
+    start, wrong, true = np.eye(4), np.array([0, 0, 0, 0.48, 0, 0.0]), np.array([0, 0, 0, 0.5, 0, 0.0])
+    navigator = Navigator(RIG, start=start, vision=ScriptedVision(path()), readings_noise=NOISE)
+    navigator.network.nodes.append(SimpleNamespace(world_from_camera=start))
+    pose = navigator.filter
+    pose.since_node, pose.since_node_cov = geometry.exp(wrong), np.eye(6) * motion_sigma_m**2
+    pose.cov_at_node, pose.world_from_camera = np.eye(6) * node_sigma_m**2, geometry.exp(true)
+    navigator._blind = _Blindness(pose.state, range(3, 5), np.eye(4))
+    node = SimpleNamespace(world_from_camera=None)
+    link = Link(0, 1, geometry.exp(true), np.eye(6) * 1e-8, 0.5, 100)
+    navigator._follow_chain(node, link)
+    assert node.world_from_camera[0, 3] == pytest.approx(0.5 + kept * 0.02, abs=1e-3)

@@ -268,11 +268,19 @@ class Navigator:
             keyframe.accumulated_cov = self.network.nodes[-1].accumulated_cov + to_world @ step_cov @ to_world.T
 
     def _follow_chain(self, node: Keyframe, chain: Link) -> None:
-        """Replaces the F2F motion since the last node by the more accurate link; corrections since then are kept."""
+        """Replaces the F2F motion since the last node by the more accurate link; corrections since then are kept.
+
+        After blind frames, of the corrections before them only the part is kept that belongs to the pose of the last
+        node; the rest belongs to the replaced motion, which may be far less certain.
+        """
         last = self.network.nodes[-1]
         if self._blind is not None:  # corrections since then refer to predicted motions
             self.filter.state = self._blind.state._replace(f2f=self.filter.f2f)
         correction = geometry.inverse(last.world_from_camera @ self.filter.since_node) @ self.filter.world_from_camera
+        if self._blind is not None:
+            at_node = geometry.transport_covariance(self.filter.cov_at_node, self.filter.since_node)
+            share = np.linalg.solve(at_node + self.filter.since_node_cov + np.eye(6) * 1e-14, at_node).T
+            correction = geometry.exp(np.asarray(share @ geometry.log(correction), np.float64))
         cov = geometry.transport_covariance(self.filter.cov_at_node, chain.i_from_j) + chain.cov
         self.filter.reset(last.world_from_camera @ chain.i_from_j @ correction, cov)
         node.world_from_camera = self.filter.world_from_camera
