@@ -41,7 +41,7 @@ MUTANTS = [
         ("twin/core/height_field.py", "south_m = grid.north_m - (grid.rows - 0.5) * grid.cell_m", "south_m = grid.north_m - grid.rows * grid.cell_m", "core_image_overlap world_coverage surrogate"),
         ("twin/core/height_field.py", "scale = depth / depth2", "scale = depth2 / depth", "core_image_overlap"),
         ("twin/core/georeference.py", "easting = self.easting + np.asarray(x_m, np.float64) / self.metres_per_unit", "easting = self.easting + np.asarray(x_m, np.float64) * self.metres_per_unit", "terrains_georeference"),
-        ("twin/core/records.py", "_WATER_KG_M3 * _GRAVITY_MPS2", "_WATER_KG_M3 / _GRAVITY_MPS2", "exchange_ros2"),
+        ("twin/core/records.py", "_WATER_KG_M3 * GRAVITY_MPS2", "_WATER_KG_M3 / GRAVITY_MPS2", "exchange_ros2"),
         ("twin/core/settings.py", "math.exp(-interval_s / BRAKING_S)", "math.exp(-interval_s * BRAKING_S / 2)", "session_mission_actions estimate_motion_filter"),
         ("twin/core/height_field.py", "return np.asarray(east, np.float64), -np.asarray(south, np.float64)", "return np.asarray(east, np.float64), np.asarray(south, np.float64)", "interpolation"),
         # terrains and their objects

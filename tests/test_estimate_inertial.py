@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from twin.core import geometry
-from twin.core.records import ImuErrorModel, ImuReadings, StereoRig
-from twin.estimate.vision.inertial_filter import GRAVITY_MPS2, InertialFilter
+from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings, StereoRig
+from twin.estimate.vision.inertial_filter import InertialFilter
 
 RATE_HZ, FRAME_HZ = 120.0, 30.0
 QUIET = ImuErrorModel(1e-5, 1e-7, 1e-4, 1e-6, 1e-4, 1e-3)

@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import chi2
 
 from twin.core import geometry
-from twin.core.records import ImuReadings
-from twin.estimate.navigation.vertical import GRAVITY_MPS2, InertialNoise, _filtered, verticals
+from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings
+from twin.estimate.navigation.vertical import _filtered, verticals
 
-NOISE = InertialNoise(1.7e-4, 2e-5, 2e-3)  # ADIS16448, as in EuRoC
+NOISE = ImuErrorModel(1.7e-4, 2e-5, 2e-3, 0.0, 0.0, 0.0)  # ADIS16448, as in EuRoC
 RATE_HZ = 50.0
 
 
@@ -44,7 +44,7 @@ def errors(found, up):
 
 
 def test_exact_readings_of_a_vehicle_without_acceleration_give_the_vertical():
-    readings, up = simulated(0, acceleration_mps2=0.0, bias_radps=0.0, noise=InertialNoise(0, 0, 0))
+    readings, up = simulated(0, acceleration_mps2=0.0, bias_radps=0.0, noise=ImuErrorModel(*[0.0] * 6))
     found, _ = verticals(readings, NOISE)
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1, atol=1e-12)
     assert errors(found, up).max() < 1e-4
@@ -52,7 +52,7 @@ def test_exact_readings_of_a_vehicle_without_acceleration_give_the_vertical():
 
 def test_the_bias_of_the_gyroscope_is_estimated():
     """A bias of 3 degrees per second and axis, 2.6 standard deviations, would turn the vertical by 90 degrees."""
-    readings, up = simulated(1, acceleration_mps2=0.0, bias_radps=0.0, noise=InertialNoise(0, 0, 0))
+    readings, up = simulated(1, acceleration_mps2=0.0, bias_radps=0.0, noise=ImuErrorModel(*[0.0] * 6))
     found, _ = verticals(readings._replace(rates_radps=readings.rates_radps + np.deg2rad([3, -3, 3])), NOISE)
     assert np.rad2deg(errors(found, up)).max() < 1.0
 

@@ -24,9 +24,10 @@ Depth = NDArray[np.float32]  #: (H, W) depth along the optical axis [m]; inf whe
 #: Linear signal of R, G and B per unit of radiance on the optical axis [1 / (cd/m2)]; see `Frame.exposure`.
 Exposure = tuple[float, float, float]
 
-_WATER_KG_M3, _GRAVITY_MPS2 = 1025.0, 9.81
+_WATER_KG_M3 = 1025.0
+GRAVITY_MPS2 = 9.81  #: strength of gravity in the estimators [m/s2]
 #: Increase of the pressure of sea water with depth [Pa/m].
-PASCAL_PER_METRE = _WATER_KG_M3 * _GRAVITY_MPS2
+PASCAL_PER_METRE = _WATER_KG_M3 * GRAVITY_MPS2
 
 
 @dataclass(frozen=True)

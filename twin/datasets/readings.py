@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.core.geometry import Array
-from twin.core.records import ImuErrorModel, ImuReadings
+from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings
 from twin.errors import TwinError
-from twin.estimate.navigation.vertical import GRAVITY_MPS2, InertialNoise, verticals
+from twin.estimate.navigation.vertical import verticals
 
 #: Smallest and largest allowed standard deviation of a reading, as fractions of the largest allowed value.
 _SIGMA_SHARES = 1e-12, 1e6
@@ -146,9 +146,6 @@ def vertical_series(
             f"gravity is {GRAVITY_MPS2} m/s2."
         )
         return None
-    up, sigma_rad = verticals(
-        ImuReadings(inertial.times_s, rates, forces),
-        InertialNoise(errors.rate_density, errors.rate_walk, errors.force_density),
-    )
+    up, sigma_rad = verticals(ImuReadings(inertial.times_s, rates, forces), errors)
     sigma = float(np.hypot(np.sqrt(np.mean(sigma_rad**2)), errors.force_bias / GRAVITY_MPS2))
     return SensorSeries(inertial.times_s, up @ body_from_sensor.T, np.array([sigma]))

@@ -11,9 +11,7 @@ from twin import terrains
 from twin.errors import TwinError
 from twin.scenario.model import Scenario, TerrainConfig
 from twin.terrains import Terrain
-from twin.world.planning import level_plan
-
-_SAMPLES = 20  # along each side of an image, for the mean height of the floor in it
+from twin.world.planning import level_plan, mean_height_m
 
 
 def chart_of(scenario: Scenario, floor: Terrain) -> Terrain:
@@ -27,9 +25,10 @@ def chart_of(scenario: Scenario, floor: Terrain) -> Terrain:
     if t.prior == "none":
         level = replace(floor, height_m=np.zeros_like(floor.height_m), known=None, filled=None)
         plan = level_plan(scenario, level)
-        east, north = np.meshgrid(*[np.linspace(-0.5, 0.5, _SAMPLES) * side for side in plan.request.footprint_m])
-        x, y, _ = plan.reference(1, 0.0).position
-        return replace(level, height_m=level.height_m + np.float32(floor.height_near(x + east, y + north).mean()))
+        x, y, _ = plan.reference(1, 0.0).position.tolist()
+        return replace(
+            level, height_m=level.height_m + np.float32(mean_height_m(floor, (x, y), plan.request.footprint_m))
+        )
     chart = floor if t.prior_file is None else _of_file(t, t.prior_file, floor)
     if not (t.prior_smoothing_m or t.prior_offset_m):
         return chart

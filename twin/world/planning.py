@@ -32,6 +32,7 @@ _TOLERANCE = 0.005  # of 1 - overlap, relative
 _LEAST_SCALE = 0.05  # of the spacing relative to that over the reference plane
 _ACROSS_SLOPE = 2.0  # greatest slope of a path that follows the floor across the legs, where it is flown more slowly
 UNKNOWN_SLOPE = 0.3  #: slope (rise over run) for which a survey over an unknown floor is spaced
+_MEAN_SAMPLES = 20  # of the height along each side of a rectangle
 _SPACING_POINTS = 200  #: largest number of points of `_leg_spacing` along the legs, and across them
 #: The spacing is chosen from all tracks that fill the area or, if they are more than this, from the tracks to fly.
 _MOST_TRACKS = 1000
@@ -76,13 +77,14 @@ def _with_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> Surve
         if not plan.inside_area(*task.position_m):
             position = "({:g}, {:g})".format(*task.position_m)
             raise TwinError(f"tasks.{k}.position_m", f"{position} lies outside the area", "a point in the asked area")
+    sides = [max(task.size_m) for task in scenario.tasks]
     tasks = [
         Task(
             task.name, task.position_m, task.size_m, task.altitude_m,
-            0.0 if plan.follows_floor else _mean_height_m(terrain, task.position_m, task.size_m),
+            0.0 if plan.follows_floor else mean_height_m(terrain, task.position_m, (side, side)),
             task.speed_mps, task.overlap_along, task.overlap_across, task.after_track, task.start_s,
         )
-        for task in scenario.tasks
+        for task, side in zip(scenario.tasks, sides, strict=True)
     ]  # fmt: skip
     for k, task in enumerate(tasks):
         try:
@@ -92,8 +94,9 @@ def _with_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> Surve
     return with_tasks(plan, tasks, hold_s)
 
 
-def _mean_height_m(terrain: Terrain, centre_m: tuple[float, float], size_m: tuple[float, float]) -> float:
-    east, north = np.meshgrid(*(np.linspace(-0.5, 0.5, 20) * max(size_m) for _ in range(2)))
+def mean_height_m(terrain: Terrain, centre_m: tuple[float, float], size_m: tuple[float, float]) -> float:
+    """Returns the mean height of a floor over a rectangle along x and y [m]."""
+    east, north = np.meshgrid(*(np.linspace(-0.5, 0.5, _MEAN_SAMPLES) * side for side in size_m))
     return float(terrain.height_near(centre_m[0] + east, centre_m[1] + north).mean())
 
 

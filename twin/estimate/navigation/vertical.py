@@ -10,31 +10,20 @@ R' a as noise: an acceleration of `_ACCELERATION_MPS2`, correlated over `_ACCELE
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import ImuReadings
+from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings
 from twin.kernels import kernel
 
-GRAVITY_MPS2 = 9.81
 _ACCELERATION_MPS2, _ACCELERATION_S = 0.1, 1.0  # standard deviation and correlation time of a vehicle's acceleration
 _GYROSCOPE_BIAS_RADPS = 0.02  # standard deviation of the bias at the start
 _JERK_RADPS3 = 5.0  # second derivative of the angular rates, which are interpolated linearly between readings
 _START_S = 1.0  # the mean specific force over this time gives the first attitude
 
 
-class InertialNoise(NamedTuple):
-    """Noise of an IMU in the terms of Kalibr; that of the accelerometer is far below the accelerations of a vehicle."""
-
-    rate_density: float  #: white noise of each angular rate [rad/s/sqrt(Hz)]
-    rate_walk: float  #: random walk of the bias of each angular rate [rad/s2/sqrt(Hz)]
-    force_density: float  #: white noise of each specific force [m/s2/sqrt(Hz)]
-
-
-def verticals(readings: ImuReadings, noise: InertialNoise) -> tuple[Array, Array]:
+def verticals(readings: ImuReadings, noise: ImuErrorModel) -> tuple[Array, Array]:
     """Returns upward unit vectors (n, 3) in the axes of the IMU, and standard deviations (n,) about each axis [rad].
 
     These include the noise of both sensors, the bias of the gyroscope and the accelerations of the vehicle, not the

@@ -6,10 +6,9 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import ImuErrorModel, ImuReadings, StereoRig
+from twin.core.records import GRAVITY_MPS2, ImuErrorModel, ImuReadings, StereoRig
 from twin.kernels import kernel
 
-GRAVITY_MPS2 = 9.81
 #: Standard deviations at the first reading: velocity [m/s], and acceleration of the vehicle [m/s2].
 _FIRST_VELOCITY, _FIRST_ACCELERATION = 1.0, 0.3
 _GRAVITY_SIGMA = 0.01  # of the strength of gravity, which varies over the Earth by more, but is not known better [m/s2]
