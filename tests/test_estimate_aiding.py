@@ -108,7 +108,7 @@ def fuse(dvl, motion, velocity):
     """Returns the motion of a frame fused with a velocity (None: no reading)."""
     reading = np.full(3, np.nan) if velocity is None else velocity
     gates = PoseFilter(POSE, RIG, NOISE).gates
-    fused, cov = fuse_dvl(dvl.state, dvl.model(1 / RIG.frame_rate_hz), motion.a_from_b, motion.cov, reading, gates)
+    fused, cov, *_ = fuse_dvl(dvl.state, dvl.model(1 / RIG.frame_rate_hz), motion.a_from_b, motion.cov, reading, gates)
     return motion._replace(a_from_b=fused, cov=cov)
 
 
@@ -366,7 +366,7 @@ def test_a_velocity_that_contradicts_vision_is_no_part_of_a_displacement_until_i
     fuse_dvl(dvl.state, model, motion, cov, velocity, gates)
     dvl.displacement_at_node(0)
     wrong = velocity + [1.0, 0.0, 0.0]
-    fused, fused_cov = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
+    fused, fused_cov, *_ = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
     np.testing.assert_array_equal(fused, motion)
     np.testing.assert_array_equal(fused_cov, cov)
     assert dvl.displacement_at_node(1) is None
@@ -375,7 +375,7 @@ def test_a_velocity_that_contradicts_vision_is_no_part_of_a_displacement_until_i
     assert gates.counts[2].tolist()[1:4] == [8, 0, 0]
     for _ in range(60):
         gates.add_prediction()
-        fused, _ = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
+        fused, *_ = fuse_dvl(dvl.state, model, motion, cov, wrong, gates)
     assert gates.counts[2, 3] > 0
     np.testing.assert_allclose(body_displacement(fused, MOUNT)[0], wrong / RIG.frame_rate_hz, rtol=0.05, atol=1e-4)
 

@@ -5,7 +5,7 @@ import pytest
 from twin.errors import ScenarioError
 from twin.scenario.file import dump_toml, load_scenario, read_toml, read_tree, with_values
 from twin.scenario.model import Source
-from twin.scenario.model_files import RIG
+from twin.scenario.model_files import NAVIGATION, RIG
 
 OWN = """
 title = "mine"
@@ -42,6 +42,16 @@ def test_every_rig_can_be_flown_in_every_scene_and_says_where_its_numbers_come_f
     tree, _ = read_toml(RIG.built_in()[name])
     for section in set(RIG.replaced) & tree.keys():
         assert any(key.split(".")[0] == section for key in tree["sources"]), section
+
+
+@pytest.mark.parametrize("name", NAVIGATION.built_in())
+def test_every_set_of_navigation_sensors_fits_every_scene_and_says_where_its_numbers_come_from(name):
+    for scene in ("reef", "paper"):
+        found = load_scenario(scene, [f"navigation.model={name}", "navigation.dvl_rate_hz=5"]).navigation
+        assert found.title and found.aiding and found.dvl_rate_hz == 5
+    tree, _ = read_toml(NAVIGATION.built_in()[name])
+    named = {key.strip() for keys in tree["sources"] for key in keys.split(",")}
+    assert named == {*tree["navigation"], *(["imu"] if "imu" in tree else [])}
 
 
 def test_a_rig_replaces_the_cameras_of_the_base_file_and_not_the_keys_beside_it(folder):

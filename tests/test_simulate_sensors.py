@@ -8,9 +8,12 @@ import pytest
 from scipy import signal
 
 from twin.core import geometry
-from twin.core.records import SensorNoise, StereoRig
+from twin.core.height_field import height_field
+from twin.core.records import Readings, SensorNoise, StereoRig
 from twin.scenario.model import NavigationConfig, VehicleConfig
+from twin.simulate.echo_sounders import BottomLock
 from twin.simulate.parameters import parameters_of
+from twin.simulate.reading_times import Delays
 from twin.simulate.sensors import NavigationSensors
 from twin.simulate.thrusters import lagged_thrusters, set_thruster_command, steady_thrust_n, step_thrusters
 
@@ -159,3 +162,61 @@ def test_acoustic_fixes_and_sightings_come_only_with_keyframes():
     readings = readings_of(SENSORS)
     assert [k for k, r in enumerate(readings) if r.usbl_m is not None] == [0, 30]
     assert [k for k, r in enumerate(readings) if r.beacons is not None] == list(range(0, 40, 5))
+
+
+@pytest.mark.parametrize(("rate_hz", "expected"), ((None, 90), (60.0, 90), (30.0, 90), (12.0, 36), (7.0, 21), (0.5, 2)))
+def test_a_sensor_of_a_rate_has_that_many_readings_with_the_numbers_of_those_frames(rate_hz, expected):
+    each, rare = (
+        sensors_of(("pressure", "ahrs", "dvl"), NOISE, dvl_rate_hz=rate, pressure_rate_hz=rate)
+        for rate in (None, rate_hz)
+    )
+    pairs = [[s.read(k / 30, POSE, np.zeros(6), None) for s in (each, rare)] for k in range(90)]
+    assert all(np.array_equal(one.ahrs_rpy_rad, other.ahrs_rpy_rad) for one, other in pairs)
+    for name in ("dvl_mps", "pressure_z_m"):
+        taken = [pair for pair in pairs if getattr(pair[1], name) is not None]
+        assert len(taken) == expected and taken[0] is pairs[0]
+        assert all(np.array_equal(getattr(one, name), getattr(other, name)) for one, other in taken)
+
+
+def test_heights_are_multiples_of_the_resolution_and_as_noisy_as_believed():
+    noise = SensorNoise(pressure_m=0.001, pressure_resolution_m=0.02)
+    z = np.linspace(1.0, 3.0, 3000)
+    poses = [geometry.pose(np.eye(3), np.array([0.0, 0.0, height])) for height in z]
+    sensors = sensors_of(("pressure",), noise)
+    read = np.array([sensors.read(k / 30, pose, np.zeros(6), None).pressure_z_m for k, pose in enumerate(poses)])
+    np.testing.assert_allclose(read / 0.02, np.round(read / 0.02), atol=1e-9)
+    assert (read - z - CAMERA[2, 3]).std() == pytest.approx(noise.height_sigma_m, rel=0.05)
+
+
+def test_a_delayed_reading_arrives_with_the_time_of_its_measurement():
+    delays, found = Delays({"usbl": 0.25, "pressure": 0.1}), []
+    for k in range(10):
+        fix = np.full(3, k) if k % 4 == 0 else None
+        arrived = delays.deliver(k / 10, Readings(pressure_z_m=float(k), ahrs_rpy_rad=np.zeros(3), usbl_m=fix))
+        assert arrived.pressure_z_m is None and arrived.usbl_m is None and arrived.ahrs_rpy_rad is not None
+        found += [(k, time_s, one) for time_s, one in arrived.late]
+    heights = [(k, time_s, one.pressure_z_m) for k, time_s, one in found if one.pressure_z_m is not None]
+    assert heights == [(k + 1, k / 10, float(k)) for k in range(9)]
+    fixes = [(k, time_s, one.usbl_m[0]) for k, time_s, one in found if one.usbl_m is not None]
+    assert fixes == [(3, 0.0, 0.0), (7, 0.4, 4.0)]
+
+
+def floor_with_slope(degrees):
+    x = np.arange(-20, 20.5, 0.5)
+    return height_field(np.tile(np.tan(np.deg2rad(degrees)) * x, (len(x), 1)), 0.5, -20.0, -20.0)
+
+
+def at_height(z):
+    return geometry.pose(np.eye(3), np.array([0.0, 0.0, z]))
+
+
+def test_bottom_lock_needs_three_beams_within_range():
+    level = BottomLock((0.5, 6.0), 30.0, floor_with_slope(0.0))
+    longest = 6.0 * np.cos(np.deg2rad(30.0))
+    heights = (0.4, 0.44, longest - 0.01, longest + 0.01)
+    assert [level.holds(at_height(z)) for z in heights] == [False, True, True, False]
+    # a slope g in x makes the beams h / (cos a -+ g sin a / sqrt 2): two of them too long
+    steep = BottomLock((0.5, 6.0), 30.0, floor_with_slope(45.0))
+    too_long = 6.0 * (np.cos(np.deg2rad(30.0)) - 0.5 / np.sqrt(2))
+    assert [steep.holds(at_height(z)) for z in (too_long - 0.01, too_long + 0.01)] == [True, False]
+    assert not level.holds(at_height(3.0) @ geometry.pose(geometry.rotation_from_rpy(np.pi, 0.0, 0.0), np.zeros(3)))

@@ -537,10 +537,10 @@ def test_water_without_matches_aborts_the_survey_with_a_reason(tmp_path):
     assert "9C" in metrics["reason"] and "too few points" in metrics["reason"]
 
 
-@pytest.mark.parametrize("aiding", ['["pressure", "ahrs", "dvl"]', "[]"])
-def test_the_compiled_loop_equals_the_loop_over_single_frames(aiding, monkeypatch):
+@pytest.mark.parametrize("settings", ['aiding=["pressure", "ahrs", "dvl"]', "aiding=[]", "dvl_rate_hz=8"])
+def test_the_compiled_loop_equals_the_loop_over_single_frames(settings, monkeypatch):
     """Both use the same steps and the same random numbers."""
-    flown = mission(f"navigation.aiding={aiding}", "plan.tracks=1")
+    flown = mission('navigation.aiding=["pressure", "ahrs", "dvl"]', f"navigation.{settings}", "plan.tracks=1")
 
     def fly():
         with open_world(flown, Stopwatch()) as world:

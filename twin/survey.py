@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 from twin.core.interrupts import StageGuard
@@ -71,7 +72,8 @@ def _run(
                 with guard.stage(), FrameRecorder(out, scenario.record if images else "none") as recorder:
 
                     def observe(estimate: Estimate, frame: Frame) -> None:
-                        recorder.add(frame, world.world_from_camera, world.vehicle.twist_body)
+                        taken = replace(frame, readings=world.measured)
+                        recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
                         monitor(estimate, frame)
 
                     gaps = fly(mission, world, navigator, observe, monitor.actions)
@@ -119,7 +121,8 @@ def fly(
         OSError: images could not be read or written.
     """
     pilot = make_pilot(mission)
-    by_frame = mission.scenario.control.height == "altimeter"  # its readings are used at every frame
+    scenario = mission.scenario
+    by_frame = scenario.control.height == "altimeter" or scenario.navigation.needs_every_frame
     flight = Flight(mission, world, None if by_frame else world.fast_forward(navigator, pilot))
     adapt = PathAdaptation(flight)
     frame = flight.start()

@@ -150,6 +150,13 @@ class SensorNoise:
     #: standard deviation of the direction of the vertical about each horizontal axis [rad], common to all readings.
     up_rad: float = float(np.deg2rad(1.2))
     imu: ImuErrorModel | None = None  #: noise of the IMU that predicts the motion between frames; None: it is not used
+    pressure_resolution_m: float = 0.0  #: step of the readings of the pressure sensor [m]
+    dvl_interval_s: float = 0.0  #: time between readings of the DVL [s]; 0: one at every frame
+
+    @property
+    def height_sigma_m(self) -> float:
+        """Returns the standard deviation of the height from pressure, with that of rounding to its steps."""
+        return float(np.hypot(self.pressure_m, self.pressure_resolution_m / np.sqrt(12)))
 
     @property
     def attitude_sigmas_rad(self) -> Array:
@@ -187,6 +194,8 @@ class Readings:
     imu: ImuReadings | None = None  #: readings of the IMU after the previous frame, up to the time of this frame
     #: (3,) unit vector that points vertically upwards, in body axes: an attitude without heading, as an IMU gives it.
     up: Array | None = None
+    #: (time [s], readings) of earlier times, which arrived after the previous frame: pressure, AHRS, USBL.
+    late: tuple[tuple[float, Readings], ...] = ()
 
 
 class Displacement(NamedTuple):

@@ -107,7 +107,7 @@ def _fits(
     yield "USBL", _absolute(position.reshape(-1, 3), across, along, noise.usbl_m)
     height = np.full((len(nodes), 3), np.nan)
     height[:, 2] = [np.nan if n.readings.pressure_z_m is None else n.readings.pressure_z_m for n in nodes]
-    yield "pressure", _absolute(height, across, along, noise.pressure_m)
+    yield "pressure", _absolute(height, across, along, noise.height_sigma_m)
 
 
 def _dvl(nodes: Sequence[Keyframe], steps: Sequence[Link | None], rig: StereoRig) -> _Fit | None:

@@ -6,7 +6,7 @@ measurement of links are done at keyframes, and the global alignment (GA) at the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -29,6 +29,7 @@ from twin.core.records import (
     Frame,
     Image,
     MapGrid,
+    Readings,
     SensorNoise,
     StereoRig,
     SurveyResult,
@@ -39,6 +40,7 @@ from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import StageTimer, Stopwatch
 from twin.estimate.calibration_errors import length_scales
+from twin.estimate.late_readings import ReadingsBetweenNodes, motion_since
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
 from twin.estimate.mapping.orthomosaic import Restore, Views, orthomosaic
 from twin.estimate.navigation.kalman import SENSORS
@@ -100,7 +102,7 @@ class Navigator:
         self.network = KeyframeNetwork(self.vision, rig, noise, self.settings, self.stopwatch)
         self._resources.callback(self.network.close)
         self.log = PoseLog()
-        self._watch = ReadingWatch()
+        self._watch, self._between = ReadingWatch(), ReadingsBetweenNodes(rig, noise)
         self._blind: _Blindness | None = None
 
     def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
@@ -144,6 +146,7 @@ class Navigator:
             OSError: images could not be read or written.
         """
         interval_s = self.interval_s(frame.time_s)
+        self._fuse_late(frame.readings.late)
         frame = replace(frame, readings=self._watch.fresh(frame.readings, frame.time_s))
         motion, status = self.vision.track_frame(frame)
         measured = is_measured(status)
@@ -170,11 +173,23 @@ class Navigator:
             self.log.append_after(blind.rows.start, frame.time_s, f2f, online, motion.a_from_b)
         else:
             self.log.append(frame.time_s, f2f, online, geometry.log(step), np.diag(motion.cov))
+        self._between.keep(frame.time_s, frame.readings)
+        self._between.give_to_nodes(self.network.nodes, self.log)
         if not measured and len(self.network.keyframes) > n_keyframes:
             self._blind = None  # tracking continues from the new keyframe
         sigma_m = float(np.sqrt(np.trace(self.filter.cov[3:, 3:])))
         velocity = geometry.log(moved) * (1 / interval_s)
         return Estimate(frame.time_s, online, f2f, velocity, sigma_m, status)
+
+    def _fuse_late(self, late: Sequence[tuple[float, Readings]]) -> None:
+        """Fuses readings of earlier times; they are also factors of the next node after their time."""
+        if not late or not len(self.log):
+            return
+        for time_s, readings in late:
+            motion, cov = motion_since(self.log, time_s)
+            readings = self.filter.fuse_earlier(self._watch.fresh(readings, time_s), motion, cov)
+            self._between.keep(time_s, readings)
+            self._between.give_to_nodes(self.network.nodes, self.log)
 
     def _blindness(self, motion: Motion, measured: bool) -> _Blindness | None:
         """Returns the blind frames up to this one, before the pose advances; None if there are none."""
@@ -195,6 +210,7 @@ class Navigator:
         count twice.
         """
         self.filter.state = blind.state
+        self.filter.dvl.interrupt()
         start_s = float(self.log.times_s.array[max(blind.rows.start - 1, 0)])
         readings = replace(frame.readings, dvl_mps=None)
         return (

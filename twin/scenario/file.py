@@ -224,7 +224,7 @@ def _merged(tree: dict[str, Any], base: dict[str, Any], source: Source) -> dict[
 
 
 def _take_models(tree: dict[str, Any], base: dict[str, Any], folder: Path, describe: Describe) -> None:
-    """Removes rig.model and vehicle.model from a tree; replaces the sections of `base` by those of the files they name.
+    """Removes the models (`KINDS`) from a tree; replaces the sections of `base` by those of the files they name.
 
     Raises ScenarioError if there is no such rig or vehicle, as `describe` words it, or if its file is invalid.
     """

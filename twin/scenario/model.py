@@ -722,22 +722,46 @@ class TetherConfig(Section):
 class NavigationConfig(Section):
     """Navigation sensors and their noise; the estimators receive only the readings of the sensors in `aiding`."""
 
+    model: ModelFile = Field(default=None, min_length=1, max_length=500)
+    """name of a set of sensors in scenes/navigations, or its file: this section and [imu]. They replace those of the
+    files that this file extends; further keys of this file change single values"""
+    title: str = Field(default="", max_length=80)
+    """name of the set of sensors, set by model"""
     aiding: tuple[AIDING, ...] = ()
     """sensors that aid vision; empty: vision only; imu: that of [imu] predicts the motion between frames"""
     pressure_sigma_m: float = Field(default=0.01, gt=0, le=10)
     """standard deviation of the height from the pressure sensor [m]"""
+    pressure_resolution_m: float = Field(default=0.0, ge=0, le=1)
+    """step of its readings [m]"""
+    pressure_rate_hz: float | None = Field(default=None, gt=0, le=1000)
+    """readings per second, each at a frame; default: one at every frame [Hz]"""
+    pressure_delay_s: float = Field(default=0.0, ge=0, le=10)
+    """time from its measurement to its arrival; the readings have the time of the measurement [s]"""
     attitude_sigma_deg: float = Field(default=0.2, gt=0, le=30)
     """standard deviation of roll and pitch from the AHRS [deg]"""
     heading_sigma_deg: float = Field(default=0.5, gt=0, le=90)
     """standard deviation of the heading from the AHRS [deg]"""
+    ahrs_rate_hz: float | None = Field(default=None, gt=0, le=1000)
+    """readings per second, as of the pressure sensor [Hz]"""
+    ahrs_delay_s: float = Field(default=0.0, ge=0, le=10)
+    """delay of its readings, as of the pressure sensor [s]"""
     dvl_sigma_mps: float = Field(default=SensorNoise.dvl_mps, gt=0, le=10)
     """standard deviation of each axis of the velocity over ground from the DVL [m/s]"""
     dvl_scale_sigma: float = Field(default=SensorNoise.dvl_scale, gt=0, le=0.1)
     """standard deviation of the relative scale error of the DVL velocity, constant during a survey"""
+    dvl_rate_hz: float | None = Field(default=None, gt=0, le=1000)
+    """readings per second, as of the pressure sensor; vision bridges the frames between them [Hz]"""
+    dvl_range_m: tuple[Metres, Metres] | None = None
+    """shortest and longest beam that returns an echo; without three of its four beams, which the slope of the floor
+    makes longer and shorter, the DVL has no bottom lock; default: it always has [m]"""
+    dvl_beam_deg: float = Field(default=22.5, gt=0, lt=60)
+    """angle between its beams and its axis, which points downwards; 22.5: Water Linked A50; 30: Teledyne [deg]"""
     usbl_sigma_m: float = Field(default=SensorNoise.usbl_m, gt=0, le=100)
     """standard deviation of each axis of an acoustic position fix [m]"""
     usbl_interval_s: float = Field(default=1.0, gt=0, le=3600)
     """shortest time between acoustic fixes, each taken at a keyframe [s]"""
+    usbl_delay_s: float = Field(default=0.0, ge=0, le=30)
+    """delay of its fixes, as of the pressure sensor [s]"""
     altimeter_range_m: tuple[Metres, Metres] = (0.3, 50.0)
     """nearest and farthest sea floor that the altimeter measures, for control.height = "altimeter"; 0.3: from there on
     the echo sounder Ping of Blue Robotics measures [m]"""
@@ -747,6 +771,18 @@ class NavigationConfig(Section):
     """standard deviation of its noise, a fraction of the range"""
     beacon_sigma_px: float = Field(default=SensorNoise.beacon_px, gt=0, le=50)
     """standard deviation of column and row of a beacon in the image [px]"""
+
+    @property
+    def delays_s(self) -> dict[str, float]:
+        """Returns the delays of the readings by the name of the sensor, without those that are zero."""
+        delays = {"pressure": self.pressure_delay_s, "ahrs": self.ahrs_delay_s, "usbl": self.usbl_delay_s}
+        return {name: delay_s for name, delay_s in delays.items() if delay_s}
+
+    @property
+    def needs_every_frame(self) -> bool:
+        """Returns whether a survey without images cannot skip the frames between keyframes."""
+        rates_hz = self.pressure_rate_hz, self.ahrs_rate_hz
+        return bool(self.delays_s) or self.dvl_range_m is not None or rates_hz != (None, None)
 
 
 class ImuConfig(Section):
@@ -1159,7 +1195,13 @@ class Scenario(Section):
             navigation.beacon_sigma_px,
             tuple(beacon.position_m for beacon in self.beacons),
             imu=self._imu_noise() if "imu" in navigation.aiding else None,
+            pressure_resolution_m=navigation.pressure_resolution_m,
+            dvl_interval_s=self._dvl_interval_s(),
         )
+
+    def _dvl_interval_s(self) -> float:
+        rate_hz = self.navigation.dvl_rate_hz
+        return 0.0 if rate_hz is None or rate_hz >= self.rig.frame_rate_hz else 1 / rate_hz
 
     def _imu_noise(self) -> ImuErrorModel | None:
         imu = self.imu

@@ -1,4 +1,4 @@
-"""Rigs and vehicles as files: the numbers of a published or own camera rig or vehicle, and their sources."""
+"""Rigs, vehicles, sets of navigation sensors as files: published or own numbers, and their sources."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from twin.core.user_files import is_file, resolved
 from twin.errors import TwinError, did_you_mean
 from twin.scenario.model import (
     CalibrationErrorConfig,
+    ImuConfig,
     LampConfig,
     LensConfig,
+    NavigationConfig,
     PortConfig,
     RigConfig,
     Section,
@@ -43,6 +45,16 @@ class VehicleFile(Section):
     sources: dict[str, str]
     """source of each key, e.g. "added_mass"; "not published" for an assumption"""
     vehicle: VehicleConfig
+
+
+class NavigationFile(Section):
+    """Contents of a file of navigation sensors: sections of a scenario, and where their numbers come from."""
+
+    title: str = Field(min_length=1, max_length=80)
+    sources: dict[str, str]
+    """source of each key, e.g. "dvl_sigma_mps"; "not published" for an assumption"""
+    navigation: NavigationConfig
+    imu: ImuConfig | None = None
 
 
 class ModelKind(NamedTuple):
@@ -81,4 +93,5 @@ class ModelKind(NamedTuple):
 
 RIG = ModelKind("rig", RigFile, ("rig", "sensor", "lens", "port", "calibration_error"), ("lamps",))
 VEHICLE = ModelKind("vehicle", VehicleFile, ("vehicle",))
-KINDS = (RIG, VEHICLE)
+NAVIGATION = ModelKind("navigation", NavigationFile, ("navigation",), ("imu",))
+KINDS = (RIG, VEHICLE, NAVIGATION)

@@ -10,14 +10,13 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.height_field import HeightField, cast_camera_ray
 from twin.core.records import BeaconDetection, Depth, ImuReadings, Readings, SensorNoise, StereoRig
 from twin.errors import TwinError
 from twin.kernels import kernel
 from twin.scenario.model import ImuConfig, NavigationConfig
 from twin.simulate.hydrodynamics import GRAVITY_MPS2
+from twin.simulate.reading_times import is_due
 
-_BEAM_RINGS, _BEAM_RAYS = 2, 8  # rays of the altimeter's beam: one on its axis, and rings around it
 _BEACON_HEIGHT_M = 0.05  # a beacon that is at least this far behind the surface in the image is occluded
 
 
@@ -26,6 +25,7 @@ class PerFrameSensors(NamedTuple):
 
     body_from_camera: Array  #: (4, 4) pose of the left camera in the body
     pressure_sigma_m: float  #: standard deviation of the height from pressure
+    pressure_resolution_m: float  #: step of this height; 0: none
     attitude_sigmas_rad: Array  #: (3,) standard deviations of roll, pitch and yaw
     dvl_gain: float  #: 1 + scale error of the DVL, which is constant over a survey
     dvl_sigma_mps: float  #: standard deviation of each component of the DVL velocity
@@ -33,31 +33,6 @@ class PerFrameSensors(NamedTuple):
     has_pressure: bool
     has_ahrs: bool
     has_dvl: bool
-
-
-class Altimeter:
-    """Echo sounder at the left camera that looks along its optical axis; it returns the nearest echo within its beam.
-
-    Args:
-        floor: true floor, with its objects.
-    """
-
-    def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
-        self._settings, self._floor, self._rng = settings, floor, rng
-        rings = np.tan(np.deg2rad(settings.altimeter_beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
-        angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
-        ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-        self._rays = np.concatenate([np.zeros((1, 2)), *(radius * ring for radius in rings)])
-
-    def read(self, world_from_camera: Array) -> float | None:
-        """Returns the distance to the floor [m]; None outside the range of the sensor."""
-        number = float(self._rng.standard_normal())
-        depths = [cast_camera_ray(self._floor, world_from_camera, a, b) for a, b in self._rays.tolist()]
-        distance_m = float(np.min(np.array(depths) * np.sqrt(1 + (self._rays**2).sum(axis=1))))
-        nearest_m, farthest_m = self._settings.altimeter_range_m
-        if not nearest_m <= distance_m <= farthest_m:
-            return None
-        return distance_m * (1 + self._settings.altimeter_sigma * number)
 
 
 class NavigationSensors:
@@ -84,8 +59,10 @@ class NavigationSensors:
         gain = 1 + noise.dvl_scale * float(rng["dvl"].standard_normal())
         used = (name in settings.aiding for name in ("pressure", "ahrs", "dvl"))
         self.per_frame = PerFrameSensors(
-            rig.body_from_camera, noise.pressure_m, noise.attitude_sigmas_rad, gain, noise.dvl_mps, *used
-        )
+            rig.body_from_camera, noise.pressure_m, noise.pressure_resolution_m, noise.attitude_sigmas_rad, gain,
+            noise.dvl_mps, *used,
+        )  # fmt: skip
+        self._frame_rate_hz, self._n_frames = rig.frame_rate_hz, 0
 
     def read(
         self, time_s: float, world_from_body: Array, twist_body: Array, depth_m: Callable[[], Depth] | None
@@ -104,17 +81,27 @@ class NavigationSensors:
             fix = self._acoustic_fix(time_s, world_from_camera[:3, 3])
             beacons = self._detect_beacons(world_from_camera, depth_m()) if "beacons" in aiding else None
         return Readings(
-            pressure_z_m=height if sensors.has_pressure else None,
-            ahrs_rpy_rad=angles if sensors.has_ahrs else None,
-            dvl_mps=velocity if sensors.has_dvl else None,
+            pressure_z_m=None if np.isnan(height) else height,
+            ahrs_rpy_rad=None if np.isnan(angles).any() else angles,
+            dvl_mps=None if np.isnan(velocity).any() else velocity,
             usbl_m=fix if "usbl" in aiding else None,
             beacons=beacons,
             imu=None if self._imu is None else self._imu.read(),
         )
 
     def draw_noise(self, n_frames: int) -> tuple[Array, Array]:
-        """Samples standard normal numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the DVL."""
-        return self._rng["navigation"].standard_normal((n_frames, 4)), self._rng["dvl"].standard_normal((n_frames, 3))
+        """Samples standard normal numbers (n_frames, 4) for pressure and attitude, and (n_frames, 3) for the DVL.
+
+        They are NaN at frames without a reading, for the next `n_frames` frames.
+        """
+        navigation = self._rng["navigation"].standard_normal((n_frames, 4))
+        dvl, settings = self._rng["dvl"].standard_normal((n_frames, 3)), self._settings
+        frames, self._n_frames = self._n_frames + np.arange(n_frames), self._n_frames + n_frames
+        numbers = navigation[:, :1], navigation[:, 1:], dvl
+        rates_hz = settings.pressure_rate_hz, settings.ahrs_rate_hz, settings.dvl_rate_hz
+        for rate_hz, of_sensor in zip(rates_hz, numbers, strict=True):
+            of_sensor[~is_due(rate_hz, frames, self._frame_rate_hz)] = np.nan
+        return navigation, dvl
 
     def _acoustic_fix(self, time_s: float, position_m: Array) -> Array | None:
         """Returns the ultra-short-baseline (USBL) position (3,) of the left camera; None within the interval."""
@@ -147,6 +134,8 @@ def read_per_frame_sensors(sensors, world_from_body, twist_body, numbers, dvl_nu
     up, arm = world_from_body[2], sensors.body_from_camera[:3, 3]
     height = (up[0] * arm[0] + up[2] * arm[2]) + (up[1] * arm[1] + up[3])
     height += sensors.pressure_sigma_m * numbers[0]
+    if sensors.pressure_resolution_m > 0:
+        height = np.round(height / sensors.pressure_resolution_m) * sensors.pressure_resolution_m
     angles = geometry.rpy_from_rotation(world_from_body[:3, :3]) + sensors.attitude_sigmas_rad * numbers[1:]
     velocity = sensors.dvl_gain * twist_body[3:] + sensors.dvl_sigma_mps * dvl_numbers
     unused = np.full(3, np.nan)

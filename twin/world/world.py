@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 from twin.controllers.camera_surface import surface_above_floor
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.core.records import Exposure, Frame, Image, MapGrid, StereoRig, Trajectory, Truth
+from twin.core.records import Exposure, Frame, Image, MapGrid, Readings, StereoRig, Trajectory, Truth
 from twin.core.series import GrowingArray
 from twin.core.timing import StageTimer
 from twin.errors import TwinError
 from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.echo_sounders import Altimeter, BottomLock
 from twin.simulate.faults import Faults
 from twin.simulate.kinematic_vehicle import KinematicVehicle
-from twin.simulate.sensors import Altimeter, NavigationSensors
+from twin.simulate.reading_times import Delays
+from twin.simulate.sensors import NavigationSensors
 from twin.terrains import Terrain
 from twin.world.mission import Detail, FrameSequence, Mission, Step
 from twin.world.observed_cells import seen_over
@@ -56,7 +58,12 @@ class CameraImages(NamedTuple):
 
 
 class World(ABC):
-    """Simulated world of a mission, a context manager; `warnings` states its limitations, for log and report."""
+    """Simulated world of a mission, a context manager.
+
+    Attributes:
+        warnings: limitations, for log and report.
+        measured: readings taken at the last frame, some of which arrive later.
+    """
 
     warnings: tuple[str, ...] = ()
 
@@ -66,10 +73,15 @@ class World(ABC):
         duration_s = 2 * mission.n_frames / mission.rig.frame_rate_hz  # also of a survey that is slowed
         rng, floor_m = streams(scenario.seed)["faults"], scenario.plan.altitude_m
         self.faults = Faults(scenario.faults, duration_s, rng, mission.rig, floor_m)
-        self._altimeter = None
+        self._altimeter = self._bottom_lock = None
+        navigation = scenario.navigation
         if scenario.control.height == "altimeter":
             floor = field_of(self.true_floor())
-            self._altimeter = Altimeter(scenario.navigation, floor, streams(scenario.seed)["altimeter"])
+            self._altimeter = Altimeter(navigation, floor, streams(scenario.seed)["altimeter"])
+        if navigation.dvl_range_m is not None:
+            floor = field_of(self.true_floor())
+            self._bottom_lock = BottomLock(navigation.dvl_range_m, navigation.dvl_beam_deg, floor)
+        self._delays, self.measured = Delays(navigation.delays_s), Readings()
         self._true_poses = GrowingArray(4, 4)
         self._sequences: list[FrameSequence] = []
 
@@ -115,10 +127,14 @@ class World(ABC):
         left, right = self.faults.images(images.left, images.right)
         assert left is not None
         depth_m = images.depth_m if step.keyframe else None
-        readings = self.sensors.read(time_s, self.vehicle.world_from_body, self.vehicle.twist_body, depth_m)
+        body = self.vehicle.world_from_body
+        readings = self.sensors.read(time_s, body, self.vehicle.twist_body, depth_m)
+        if readings.dvl_mps is not None and self._bottom_lock is not None and not self._bottom_lock.holds(body):
+            readings = replace(readings, dvl_mps=None)
         if self._altimeter is not None:
             readings = replace(readings, altitude_m=self._altimeter.read(self.world_from_camera))
-        readings = self.faults.readings(readings)
+        self.measured = self.faults.readings(readings)
+        readings = self._delays.deliver(time_s, self.measured)
         return Frame(index, time_s, left, right, readings, step.keyframe, images.exposure)
 
     def act(self, command: Array) -> None:

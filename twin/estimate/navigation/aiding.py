@@ -22,7 +22,7 @@ from twin.kernels import kernel
 def unary_factors(nodes: Sequence[Keyframe], rig: StereoRig, noise: SensorNoise) -> list[UnaryFactors]:
     """Returns the factors of pressure, attitude, position fixes, beacons and verticals of nodes in their order."""
     return [
-        _coordinate_factors(nodes, "pressure_z_m", 2, noise.pressure_m),
+        _coordinate_factors(nodes, "pressure_z_m", 2, noise.height_sigma_m),
         _attitude_factors(nodes, rig, noise),
         _coordinate_factors(nodes, "usbl_m", 0, noise.usbl_m),
         _beacon_factors(nodes, rig, noise),

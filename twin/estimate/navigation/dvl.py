@@ -12,6 +12,10 @@ from twin.core.records import Displacement, Mask, SensorNoise, StereoRig
 from twin.estimate.navigation.kalman import DVL, fuse_reading
 from twin.kernels import kernel
 
+_MOST_INTERVALS = 2.5  # between readings of a slow DVL, of which one may be missing
+#: Standard deviation of the rate of change of the acceleration: the trapezoidal rule is wrong by T^3 / 12 times that.
+_JERK_MPS3 = 0.5
+
 
 class DvlModel(NamedTuple):
     """Error model of the DVL."""
@@ -20,6 +24,7 @@ class DvlModel(NamedTuple):
     step_s: float  #: time since the previous frame [s]
     white_m2: float  #: variance of each component of a frame's displacement due to white noise [m^2]
     scale_variance: float  #: variance of the scale error (a relative error of the velocity)
+    longest_gap_s: float  #: longest time between readings that vision bridges [s]; 0: each frame has a reading
 
 
 class DvlState(NamedTuple):
@@ -36,6 +41,23 @@ class DvlState(NamedTuple):
     cov: Array
     path_m: Array  #: (1,) path length since the node [m]
     complete: Mask  #: (1,) false if the reading at the node or at a frame after it is missing
+    #: since_reading, since_reading_cov: (4, 4), (6, 6) visual motion since the last reading or node, if later, and its
+    #: covariance; valid if `gap_s` is not zero.
+    since_reading: Array
+    since_reading_cov: Array
+    gap_s: Array  #: (1,) time since the last reading or node, up to the last frame [s]
+
+
+class MotionUpdate(NamedTuple):
+    """Motion of a frame after fusion with the DVL."""
+
+    motion: Array  #: (4, 4) motion since the previous frame or, if the reading is the first one for a while, since then
+    cov: Array  #: (6, 6) its covariance
+    #: replaced, replaced_cov: (4, 4), (6, 6) visual motion of the frames before this one that `motion` replaces, and
+    #: its covariance.
+    replaced: Array
+    replaced_cov: Array
+    duration_s: float  #: time of `motion`
 
 
 class DvlIntegrator:
@@ -48,19 +70,29 @@ class DvlIntegrator:
     def __init__(self, rig: StereoRig, noise: SensorNoise):
         self._rig, self._noise, self._node = rig, noise, 0
         displacement = np.zeros(3), np.zeros((3, 3)), np.zeros(1)
-        self.state = DvlState(np.full(3, np.nan), np.eye(3), np.zeros((3, 3)), *displacement, np.ones(1, np.bool_))
+        since_reading = np.eye(4), np.zeros((6, 6)), np.zeros(1)
+        self.state = DvlState(
+            np.full(3, np.nan), np.eye(3), np.zeros((3, 3)), *displacement, np.ones(1, np.bool_), *since_reading
+        )
 
     def model(self, interval_s: float) -> DvlModel:
-        white_m2 = (self._noise.dvl_mps * interval_s) ** 2
-        return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2)
+        white_m2, gap_s = (self._noise.dvl_mps * interval_s) ** 2, _MOST_INTERVALS * self._noise.dvl_interval_s
+        return DvlModel(self._rig.body_from_camera, interval_s, white_m2, self._noise.dvl_scale**2, gap_s)
+
+    def interrupt(self) -> None:
+        """Ends the integration, because the motion since the last reading is not known."""
+        self.state.velocity[:], self.state.gap_s[:], self.state.complete[:] = np.nan, 0.0, False
 
     def resume(self, velocity_mps: Array) -> None:
         """Lets the integration of displacements start from a reading (3,) that was not fused."""
-        self.state.velocity[:] = velocity_mps
+        self.state.velocity[:], self.state.gap_s[:] = velocity_mps, 0.0
 
     def displacement_at_node(self, number: int) -> Displacement | None:
         """Returns the displacement since the last node, and restarts the integration; None if a reading is missing."""
         state, node, self._node = self.state, self._node, number
+        if state.gap_s[0] > 0:
+            accumulate_visual(state, self._rig.body_from_camera, state.since_reading, state.since_reading_cov)
+            state.velocity[:], state.gap_s[:] = np.nan, 0.0  # vision alone up to the next reading
         complete = state.complete[0]
         displacement = Displacement(node, state.displacement_m.copy(), _displacement_cov(state)) if complete else None
         state.node_from_body[:], state.complete[:] = np.eye(3), True
@@ -88,28 +120,58 @@ def body_displacement(a_from_b: Array, body_from_camera: Array) -> tuple[Array, 
 
 @kernel
 def fuse_dvl(state, model, a_from_b, cov, velocity, gates):
-    """Fuses the visual motion since the previous frame with the DVL readings, and adds it to the integration.
+    """Fuses the visual motion since the last reading with the DVL readings, and adds it to the integration.
 
-    Returns the fused motion (4, 4) and its covariance (6, 6). If the reading of this frame, `velocity` (3,) in body
-    axes [m/s], or of the previous one is NaN, or if they contradict the visual motion, these are `a_from_b` and `cov`
-    unchanged, and the integration becomes incomplete.
+    The reading of this frame, `velocity` (3,) in body axes [m/s], is NaN if there is none. Returns a `MotionUpdate`,
+    `a_from_b` and `cov` unchanged if there is no reading, or if it contradicts the visual motion. The integration
+    becomes incomplete if it does, or if the last reading is too long ago.
     """
+    nothing = np.eye(4), np.zeros((6, 6))
+    before, before_cov, motion, motion_cov, duration_s = nothing[0], nothing[1], a_from_b, cov, model.step_s
+    if state.gap_s[0] > 0:
+        before, before_cov = state.since_reading.copy(), state.since_reading_cov.copy()
+        motion = geometry.compose(before, a_from_b)
+        motion_cov = geometry.transport_covariance(before_cov, a_from_b) + cov
+        duration_s = state.gap_s[0] + model.step_s
+    visual = MotionUpdate(a_from_b, cov, nothing[0], nothing[1], model.step_s)
+    if np.isnan(velocity[0]) and duration_s < model.longest_gap_s:
+        geometry.copy_into(state.since_reading, motion)
+        geometry.copy_into(state.since_reading_cov, motion_cov)
+        state.gap_s[0] = duration_s
+        return visual
     last = state.velocity.copy()
     geometry.copy_into(state.velocity, velocity)
-    if np.isnan(last[0]) or np.isnan(velocity[0]):
-        state.complete[0] = False
-        return a_from_b, cov
-    rotation, step = _body_motion(a_from_b, model.body_from_camera), np.empty(3)
+    state.gap_s[0] = 0.0
+    if np.isnan(velocity[0]) or np.isnan(last[0]):
+        if np.isnan(velocity[0]) or model.longest_gap_s == 0:
+            state.complete[0] = False
+        else:
+            accumulate_visual(state, model.body_from_camera, motion, motion_cov)
+        return visual
+    rotation, step = _body_motion(motion, model.body_from_camera), np.empty(3)
     for i in range(3):
         now = rotation[i, 0] * velocity[0] + rotation[i, 1] * velocity[1] + rotation[i, 2] * velocity[2]
-        step[i] = (last[i] + now) / 2 * model.step_s
-    step_cov = _step_cov(state, model, step)
-    fused, fused_cov, used = fuse_displacement(a_from_b, cov, step, step_cov, model.body_from_camera, gates)
+        step[i] = (last[i] + now) / 2 * duration_s
+    white_m2 = model.white_m2
+    if duration_s > model.step_s:
+        white_m2 = white_m2 * (duration_s / model.step_s) ** 2 + (_JERK_MPS3 * duration_s**3 / 12) ** 2
+    step_cov = _step_cov(state, model.scale_variance, white_m2, step)
+    fused, fused_cov, used = fuse_displacement(motion, motion_cov, step, step_cov, model.body_from_camera, gates)
     if not used:
         state.velocity[:], state.complete[0] = np.nan, False
-        return a_from_b, cov
-    _accumulate(state, model, step, fused, fused_cov)
-    return fused, fused_cov
+        return visual
+    state.path_m[0] += _length(step)
+    _accumulate(state, model.body_from_camera, step, white_m2 * np.eye(3), fused, fused_cov)
+    return MotionUpdate(fused, fused_cov, before, before_cov, duration_s)
+
+
+@kernel
+def accumulate_visual(state, body_from_camera, motion, cov):
+    """Adds a visual motion (4, 4), with covariance (6, 6), that no readings enclose to the integration."""
+    step, by_motion = body_displacement(motion, body_from_camera)
+    step_cov = geometry.product(geometry.product(by_motion, cov), by_motion.T)
+    in_node = geometry.product(geometry.product(state.node_from_body, step_cov), state.node_from_body.T)
+    _accumulate(state, body_from_camera, step, in_node, motion, cov)
 
 
 @kernel
@@ -123,7 +185,7 @@ def _length(step):
 
 
 @kernel
-def _step_cov(state, model, step):
+def _step_cov(state, scale_variance, white_m2, step):
     """Returns the covariance (3, 3) [m^2] of a frame's displacement `step` (3,) due to white noise and scale error.
 
     The scale error s accumulates: a displacement l after a path L adds s^2 ((L + l)^2 - L^2) along its direction.
@@ -132,23 +194,26 @@ def _step_cov(state, model, step):
     growth, cov = (2 * state.path_m[0] + length) / length, np.empty((3, 3))
     for i in range(3):
         for k in range(3):
-            cov[i, k] = model.scale_variance * growth * step[i] * step[k] + (model.white_m2 if i == k else 0.0)
+            cov[i, k] = scale_variance * growth * step[i] * step[k] + (white_m2 if i == k else 0.0)
     return cov
 
 
 @kernel
-def _accumulate(state, model, step, a_from_b, cov):
-    """Adds a frame, with displacement `step` (3,) in the body axes at the previous frame [m], to the integration."""
-    state.path_m[0] += _length(step)
+def _accumulate(state, body_from_camera, step, step_cov, a_from_b, cov):
+    """Adds a motion, with displacement `step` (3,) in the body axes before it [m], to the integration.
+
+    `step_cov` (3, 3) is the covariance of its white noise in the axes at the node.
+    """
     node_from_body = state.node_from_body
     for i in range(3):
         state.displacement_m[i] += (
             node_from_body[i, 0] * step[0] + node_from_body[i, 1] * step[1] + node_from_body[i, 2] * step[2]
         )
-        state.cov[i, i] += model.white_m2
-    rotation = _body_motion(a_from_b, model.body_from_camera)[:3, :3]
+        for k in range(3):
+            state.cov[i, k] += step_cov[i, k]
+    rotation = _body_motion(a_from_b, body_from_camera)[:3, :3]
     geometry.copy_into(node_from_body, geometry.product(node_from_body, rotation))
-    node_from_camera = geometry.product(node_from_body, model.body_from_camera[:3, :3])
+    node_from_camera = geometry.product(node_from_body, body_from_camera[:3, :3])
     added = geometry.product(geometry.product(node_from_camera, cov[:3, :3]), node_from_camera.T)
     geometry.copy_into(state.rotation_cov, state.rotation_cov + added)
 

@@ -76,19 +76,39 @@ def dead_reckon(
     rpy_rad: Array,
     velocity_mps: Array,
 ) -> tuple[DeadReckoningState, Array]:
-    """Advances by a frame with a visual motion and readings; also returns the motion (4, 4) fused with the DVL."""
-    motion, motion_cov = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)
-    online, online_cov = predict(last.online, last.cov, motion, motion_cov)
+    """Advances by a frame with a visual motion and readings; also returns the motion (4, 4) fused with the DVL.
+
+    If the DVL has readings at some frames only, that is its mean per frame since the last one.
+    """
+    update = fuse_dvl(aiding.dvl_state, aiding.dvl, a_from_b, cov, velocity_mps, aiding.gates)
+    online, online_cov, since_node, since_node_cov = last.online, last.cov, last.since_node, last.since_node_cov
+    moved = update.motion
+    if update.duration_s > aiding.dvl.step_s:
+        online, online_cov = undo(online, online_cov, update.replaced, update.replaced_cov)
+        since_node, since_node_cov = undo(since_node, since_node_cov, update.replaced, update.replaced_cov)
+        moved = geometry.exp(geometry.log(moved) * (aiding.dvl.step_s / update.duration_s))
+    online, online_cov = predict(online, online_cov, update.motion, update.cov)
     online, online_cov = fuse_pressure_ahrs(online, online_cov, aiding, height_m, rpy_rad)
-    since_node, since_node_cov = predict(last.since_node, last.since_node_cov, motion, motion_cov)
+    since_node, since_node_cov = predict(since_node, since_node_cov, update.motion, update.cov)
     f2f = geometry.compose(last.f2f, a_from_b)
-    return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), motion
+    return DeadReckoningState(f2f, online, online_cov, since_node, since_node_cov), moved
 
 
 @kernel
 def predict(world_from_camera, cov, a_from_b, motion_cov):
     """Returns the pose (4, 4) and its covariance (6, 6) after a motion, eqs. (3) to (5) of the paper."""
     return geometry.compose(world_from_camera, a_from_b), geometry.transport_covariance(cov, a_from_b) + motion_cov
+
+
+@kernel
+def undo(world_from_camera, cov, motion, motion_cov):
+    """Returns the pose (4, 4) and covariance (6, 6) before a motion and its noise, as corrected since then.
+
+    What corrections have taken from the noise of the motion is not taken again.
+    """
+    back = geometry.inverse(motion)
+    before = cov - clip_covariance(motion_cov, cov, 0.0, 1.0)
+    return geometry.compose(world_from_camera, back), geometry.transport_covariance(before, back)
 
 
 @kernel
@@ -131,7 +151,7 @@ class PoseFilter:
         self.f2f: Array = world_from_camera.copy()
         self.since_node, self.since_node_cov, self.cov_at_node = np.eye(4), np.zeros((6, 6)), np.zeros((6, 6))
         self.rig, self.noise = rig, noise
-        self._pressure_ahrs = geometry.inverse(rig.body_from_camera), noise.pressure_m**2, noise.attitude_sigmas_rad
+        self._pressure_ahrs = geometry.inverse(rig.body_from_camera), noise.height_sigma_m**2, noise.attitude_sigmas_rad
         self.gates = open_gates()
         self.dvl = DvlIntegrator(rig, noise)
 
@@ -174,6 +194,16 @@ class PoseFilter:
             return None
         self.reset(pose, self.cov - decrease)
         return decrease
+
+    def fuse_earlier(self, readings: Readings, motion: Array, motion_cov: Array) -> Readings:
+        """Fuses readings taken before a motion (4, 4) of this covariance (6, 6); returns those not rejected."""
+        rejected, motion_cov = self.rejected, clip_covariance(motion_cov, self.cov, 0.0, 1.0)
+        earlier = undo(self.world_from_camera, self.cov, motion, motion_cov)
+        height_m, rpy_rad, _ = readings_as_arrays(readings)
+        self.world_from_camera, self.cov = fuse_pressure_ahrs(*earlier, self.aiding(1.0), height_m, rpy_rad)
+        readings = self.fuse_position_fixes(readings)
+        self.reset(*predict(self.world_from_camera, self.cov, motion, motion_cov))
+        return self.without_rejected(readings, rejected)
 
     def fuse_position_fixes(self, readings: Readings) -> Readings:
         """Fuses the readings that are taken only at keyframes, position fix and beacons; returns those not rejected."""

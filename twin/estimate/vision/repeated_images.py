@@ -60,7 +60,7 @@ def _moved(readings: list[Readings], noise: SensorNoise) -> bool:
     if velocities:
         ratios += list(np.abs(np.mean(velocities, axis=0)) / max(noise.dvl_mps / len(velocities) ** 0.5, _TINY))
     if first.pressure_z_m is not None and last.pressure_z_m is not None:
-        ratios.append(abs(last.pressure_z_m - first.pressure_z_m) / max(noise.pressure_m * 2**0.5, _TINY))
+        ratios.append(abs(last.pressure_z_m - first.pressure_z_m) / max(noise.height_sigma_m * 2**0.5, _TINY))
     if first.ahrs_rpy_rad is not None and last.ahrs_rpy_rad is not None:
         turned = np.abs(np.angle(np.exp(1j * (last.ahrs_rpy_rad - first.ahrs_rpy_rad))))
         ratios += list(turned / np.maximum(noise.attitude_sigmas_rad * 2**0.5, _TINY))

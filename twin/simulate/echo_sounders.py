@@ -1,0 +1,58 @@
+"""Beams that the floor reflects: the altimeter, and the bottom lock of the Doppler velocity log (DVL)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from twin.core.geometry import Array
+from twin.core.height_field import HeightField, cast_camera_ray, cast_ray
+from twin.scenario.model import NavigationConfig
+
+_BEAM_RINGS, _BEAM_RAYS = 2, 8  # rays of the altimeter's beam: one on its axis, and rings around it
+_LEAST_BEAMS = 3  # of the DVL, which determine a velocity
+
+
+class Altimeter:
+    """Echo sounder at the left camera that looks along its optical axis; it returns the nearest echo within its beam.
+
+    Args:
+        floor: true floor, with its objects.
+    """
+
+    def __init__(self, settings: NavigationConfig, floor: HeightField, rng: np.random.Generator):
+        self._settings, self._floor, self._rng = settings, floor, rng
+        rings = np.tan(np.deg2rad(settings.altimeter_beam_deg / 2)) * np.arange(1, _BEAM_RINGS + 1) / _BEAM_RINGS
+        angles = np.arange(_BEAM_RAYS) * (2 * np.pi / _BEAM_RAYS)
+        ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        self._rays = np.concatenate([np.zeros((1, 2)), *(radius * ring for radius in rings)])
+
+    def read(self, world_from_camera: Array) -> float | None:
+        """Returns the distance to the floor [m]; None outside the range of the sensor."""
+        number = float(self._rng.standard_normal())
+        depths = [cast_camera_ray(self._floor, world_from_camera, a, b) for a, b in self._rays.tolist()]
+        distance_m = float(np.min(np.array(depths) * np.sqrt(1 + (self._rays**2).sum(axis=1))))
+        nearest_m, farthest_m = self._settings.altimeter_range_m
+        if not nearest_m <= distance_m <= farthest_m:
+            return None
+        return distance_m * (1 + self._settings.altimeter_sigma * number)
+
+
+class BottomLock:
+    """Bottom lock of a DVL at the origin of the body, with four beams around its downward axis (Janus configuration).
+
+    Args:
+        floor: true floor, with its objects.
+    """
+
+    def __init__(self, range_m: tuple[float, float], beam_deg: float, floor: HeightField):
+        self._range_m, self._floor = range_m, floor
+        azimuths, tilt = np.deg2rad([45.0, 135.0, 225.0, 315.0]), np.deg2rad(beam_deg)
+        across = np.sin(tilt) * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
+        self._beams = np.column_stack([across, np.full(4, -np.cos(tilt))])
+
+    def holds(self, world_from_body: Array) -> bool:
+        """Returns whether enough beams return an echo at a true pose (4, 4)."""
+        directions, (x, y, z) = self._beams @ world_from_body[:3, :3].T, world_from_body[:3, 3]
+        lengths_m = np.array([cast_ray(self._floor, x, y, z, *direction) for direction in directions])
+        nearest_m, farthest_m = self._range_m
+        return int(((nearest_m <= lengths_m) & (lengths_m <= farthest_m)).sum()) >= _LEAST_BEAMS
