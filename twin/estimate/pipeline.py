@@ -98,7 +98,7 @@ class Navigator:
         self._resources.enter_context(one_blas_thread())
         self.vision = vision or self._image_vision(folder, noise)
         self.filter = PoseFilter((_DEFAULT_START if start is None else start).copy(), rig, noise)
-        self._f2f_at_pair = self.filter.f2f
+        self._f2f_at_pair = self._f2f_at_node = self.filter.f2f
         self.network = KeyframeNetwork(self.vision, rig, noise, self.settings, self.stopwatch)
         self._resources.callback(self.network.close)
         self.log = PoseLog()
@@ -251,6 +251,7 @@ class Navigator:
             return NO_STEREO
         if (tracking_cov := self.vision.tracking_cov()) is not None:
             self.network.history.frame_sigmas_m.append(float(np.sqrt(np.trace(tracking_cov[3:, 3:]))))
+        velocity = None  # measured otherwise than by tracking
         number, depth_m = len(self.network.keyframes), float(np.median(points.xyz[:, 2]))
         keyframe = Keyframe(
             number, len(self.log), track, self.filter.world_from_camera, points, frame.readings, depth_m, frame.exposure
@@ -264,8 +265,9 @@ class Navigator:
         chain = None if attempt is None else attempt.link
         if chain is not None:
             self._follow_chain(keyframe, chain)
-            if status != "ok" and self.settings.wide_search:
-                self.log.n_lost, status = self.log.n_lost - 1, "ok"  # the motion was measured after all
+            if status != "ok" and self.settings.wide_search:  # the motion was measured after all
+                velocity = self._measured_velocity(frame.time_s, chain)
+                self.log.n_lost, status = self.log.n_lost - 1, "ok"
         # after `_follow_chain`, to correct its error too
         keyframe.readings = self.filter.fuse_position_fixes(frame.readings)
         with self.stopwatch("f2m"):
@@ -274,8 +276,14 @@ class Navigator:
             self.vision.add_to_mosaic(keyframe.number, keyframe.world_from_camera)
         if is_node:
             self._connect(keyframe, attempt)
-        self.vision.restart_tracking()
+        self.vision.restart_tracking(velocity)
         return status
+
+    def _measured_velocity(self, time_s: float, chain: Link) -> Array:
+        """Returns the mean velocity (6,) since the last node by the link from it, which also becomes part of F2F."""
+        last = self.network.nodes[-1]
+        self.filter.f2f = self._f2f_at_node @ chain.i_from_j
+        return geometry.log(chain.i_from_j) / (time_s - float(self.log.times_s.array[last.row]))
 
     def _accumulate(self, keyframe: Keyframe, step_cov: Array) -> None:
         """Sets `accumulated_cov` of a keyframe from that of the last node and `step_cov` (6, 6) since then."""
@@ -328,6 +336,7 @@ class Navigator:
             cov = self.filter.since_node_cov + np.eye(6) * 1e-10
             bridge = Link(self.network.nodes[-1].number, node.number, self.filter.since_node, cov, 0.0, 0)
         self.network.connect(node, chain, bridge, self.filter.start_from_node(node.number))
+        self._f2f_at_node = self.filter.f2f
         if self.rig.yaw_sigma_rad:
             self.vision.correct_yaw(*self.network.yaw_rad())
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from twin.core.quality import EstimationQuality, Finding
+from twin.core.quality import DisparityOffset, EstimationQuality, Finding
 from twin.core.records import ElevationMap, StereoRig, SurveyResult
 
 MAX_FRAMES_LOST = 0.02  # fraction of the frames
@@ -122,7 +122,11 @@ def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
     if epipolar is None:
         return
     yaw, sigma = float(epipolar.estimate[1]) - result.quality.calibration.yaw_rad, float(epipolar.sigma[1])
-    if abs(yaw) > _SIGNIFICANT * sigma:
+    pattern = epipolar.pattern
+    if _contradicted(yaw, result.quality.disparity_offset):
+        corner = np.array([damage.rig.width_px, damage.rig.height_px]) / 2 / damage.rig.focal_px
+        pattern = float(np.hypot(pattern, yaw * np.prod(corner) / 3))  # RMS of yaw x y over the image
+    elif abs(yaw) > _SIGNIFICANT * sigma:
         text = (
             f"row differences imply a yaw of {np.rad2deg(yaw):+.3f} deg between the cameras, or a distortion error:"
             f" disparities may be off by {abs(yaw) * focal_px:.1f} px"
@@ -131,10 +135,15 @@ def _rectification(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:
         expected_px = 0.0 if result.quality.calibration.cov.any() else _COVERED * damage.rig.yaw_sigma_rad * focal_px
         yield from damage.check("yaw", yaw, max(MAX_YAW_PX, expected_px), text)
     text = (
-        f"row differences of stereo matches vary systematically over the image by {epipolar.pattern * focal_px:.2f} px,"
+        f"row differences of stereo matches vary systematically over the image by {pattern * focal_px:.2f} px,"
         " which no rotation of a camera explains: the distortion or the port is not as calibrated"
     )
-    yield from damage.check("row_pattern", epipolar.pattern, MAX_ROW_PATTERN_PX, text)
+    yield from damage.check("row_pattern", pattern, MAX_ROW_PATTERN_PX, text)
+
+
+def _contradicted(yaw_rad: float, offset: DisparityOffset | None) -> bool:
+    """Returns whether the motions of near and far points exclude the offset of disparities that a yaw causes."""
+    return offset is not None and abs(offset.estimate) + _SIGNIFICANT * offset.sigma < abs(yaw_rad)
 
 
 def _consistency(result: SurveyResult, damage: _Damage) -> Iterator[Finding]:

@@ -34,7 +34,7 @@ from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_quality import contrast, repetition, saturated_fraction
 from twin.estimate.vision.image_spool import ImageSpool
 from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
-from twin.estimate.vision.mosaic import Mosaic, Registration, viewing_plane
+from twin.estimate.vision.mosaic import Mosaic, Registration, can_represent, viewing_plane
 from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
 from twin.estimate.vision.repeated_images import RepeatedImages
 from twin.estimate.vision.stereo import Keyframe, StereoPoints
@@ -181,12 +181,14 @@ class StereoVision:
     def tracking_cov(self) -> Array | None:
         return None if self.f2f.reference is None else self.f2f.cov_since_keyframe
 
-    def restart_tracking(self) -> None:
+    def restart_tracking(self, velocity: Array | None = None) -> None:
         if self._points is not None:
-            self.f2f.restart(self._image, self._points)
+            self.f2f.restart(self._image, self._points, velocity)
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
         assert self._points is not None
+        if not can_represent(self._depth_m):
+            return None
         half_m = half_window_m(self._points, self.rig)
         return self.mosaic.register(self._image, self._depth_m, self._on_plane(world_from_camera), half_m, self.rig)
 
@@ -197,13 +199,16 @@ class StereoVision:
         return self._plane_from_world @ world_from_camera
 
     def add_to_mosaic(self, number: int, world_from_camera: Array) -> None:
+        if not can_represent(self._depth_m):
+            return
         self.mosaic.add(number, self._image, self._depth_m, self._on_plane(world_from_camera), self.rig)
         self._depth_of_keyframe[number] = self._depth_m.astype(np.float16)
 
     def rebuild_mosaic(self, keyframes: Sequence[Keyframe]) -> None:
         self.mosaic.cells.clear()
-        self._depth_of_keyframe = {k.number: self._depth_of_keyframe[k.number] for k in keyframes}
-        for key in keyframes:
+        shown = [key for key in keyframes if key.number in self._depth_of_keyframe]
+        self._depth_of_keyframe = {key.number: self._depth_of_keyframe[key.number] for key in shown}
+        for key in shown:
             image = matching.normalise(self.spool.gray(key.row)[0])
             depth_m = self._depth_of_keyframe[key.number].astype(np.float32)
             self.mosaic.add(key.number, image, depth_m, self._on_plane(key.world_from_camera), self.rig)

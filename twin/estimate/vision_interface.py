@@ -39,7 +39,7 @@ class Vision(Protocol):
         """
         ...
 
-    def restart_tracking(self) -> None:
+    def restart_tracking(self, velocity: Array | None = None) -> None:
         """Restarts F2F tracking from the latest keyframe."""
         ...
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from twin.core.records import Array, ElevationMap, SurveyResult, Truth
@@ -21,33 +22,36 @@ def consistency_metrics(result: SurveyResult, elevation: ElevationMap | None, tr
     two sigma 0.954. `nees_position_low` and `_high` are those of `nees_interval`. `within_2sigma_position` is over the
     three camera axes of the keyframes, `within_2sigma_map` over the map cells with an error.
     """
-    error, cov = _keyframe_errors(result, truth)
+    frames = result.keyframe_rows[1 : min(len(result.keyframe_rows), len(result.node_cov))]
+    final, true = result.final.world_from_camera, truth.trajectory.world_from_camera
+    start = anchor(final[0], true[0]) if len(frames) else np.eye(4)
+    cells = np.zeros(0) if elevation is None else normalised_error(elevation, truth)
+    positions = position_consistency(result, start @ final[frames], true[frames], np.arange(1, len(frames) + 1))
+    return positions | {"within_2sigma_map": mean(np.abs(cells) <= 2)}
+
+
+def position_consistency(
+    result: SurveyResult, moved: Array, true: Array, keyframes: NDArray[np.int64]
+) -> dict[str, float | None]:
+    """Returns the metrics of positions for poses (n, 4, 4) of keyframes, moved to the truth, and true poses (n, 4, 4).
+
+    `keyframes` (n,) are their numbers.
+    """
+    error, cov = _errors_in_camera(moved, true, result.node_cov[keyframes, 3:, 3:])
     low, high = nees_interval(result.quality.independent_errors) or (None, None)
     sigma = np.sqrt(np.diagonal(cov, axis1=1, axis2=2))
-    cells = np.zeros(0) if elevation is None else normalised_error(elevation, truth)
     return {
         "nees_position_mean": mean(nees(error, cov)),
         "nees_position_low": low,
         "nees_position_high": high,
         "within_2sigma_position": mean(np.abs(error) <= 2 * sigma),
-        "within_2sigma_map": mean(np.abs(cells) <= 2),
     }
 
 
-def _keyframe_errors(result: SurveyResult, truth: Truth) -> tuple[Array, Array]:
-    """Returns errors (n, 3) [m] and estimated covariances (n, 3, 3) of the final keyframes, both in camera axes.
-
-    Without the first keyframe, anchored at the truth, and those without a positive definite covariance.
-    """
-    n = min(len(result.keyframe_rows), len(result.node_cov))
-    frames = result.keyframe_rows[1:n]
-    if len(frames) == 0:
-        return np.zeros((0, 3)), np.zeros((0, 3, 3))
-    final, true = result.final.world_from_camera, truth.trajectory.world_from_camera
-    anchored = anchor(final[0], true[0]) @ final[frames]
-    in_world = anchored[:, :3, 3] - true[frames, :3, 3]
-    in_camera = np.einsum("nji,nj->ni", anchored[:, :3, :3], in_world)
-    cov = np.asarray(result.node_cov)[1:n, 3:, 3:]
+def _errors_in_camera(moved: Array, true: Array, cov: Array) -> tuple[Array, Array]:
+    """Returns errors of positions (n, 3) [m] and covariances (n, 3, 3), both in camera axes; positive definite ones."""
+    in_world = moved[:, :3, 3] - true[:, :3, 3]
+    in_camera = np.einsum("nji,nj->ni", moved[:, :3, :3], in_world)
     finite = np.asarray(np.isfinite(cov).all(axis=(1, 2)))
     usable = np.linalg.eigvalsh(np.where(finite[:, None, None], cov, 0.0))[:, 0] > 0
     return in_camera[usable], cov[usable]

@@ -18,6 +18,7 @@ from twin.judge.orthomosaic_errors import OrthomosaicJudge
 from twin.judge.recorded import (
     RecordedTruth,
     associate,
+    recorded_consistency,
     recorded_errors,
     recorded_map_metrics,
     truth_warnings,
@@ -131,7 +132,9 @@ def _replay_sections(survey: EvaluationInput, truth: RecordedTruth) -> dict[str,
     heights = {"cell_m": None if elevation is None else elevation.grid.cell_m}
     if elevation is not None and truth.heights_m is not None:
         heights = recorded_map_metrics(elevation, truth.heights_m)
+    judged = {} if true is None else recorded_consistency(result, true, truth.alignment)
     return {
+        "consistency": empty["consistency"] | judged,
         "trajectory": empty["trajectory"] | {name: trajectory_metrics(error) for name, error in errors.items()},
         "map": empty["map"] | heights,
         "links": empty["links"] | {"bridged": int((result.links.n_points == 0).sum())},

@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
 from twin.core import geometry
-from twin.core.records import Array, ElevationMap, MapGrid, Trajectory, Truth
+from twin.core.records import Array, ElevationMap, MapGrid, SurveyResult, Trajectory, Truth
 from twin.core.series import nearest_index
+from twin.judge.consistency import position_consistency
 from twin.judge.map_error import KEYS, map_metrics
 from twin.judge.trajectory_errors import PathErrors, anchor, pose_errors
 
@@ -89,6 +90,23 @@ def recorded_errors(estimate: Trajectory, truth: Trajectory, alignment: Alignmen
     if len(a) < _MIN_ASSOCIATED:
         return pose_errors(np.zeros((0, 4, 4)), np.zeros((0, 4, 4)))
     return pose_errors(true_from_world(estimate, truth, alignment) @ a.world_from_camera, b.world_from_camera)
+
+
+def recorded_consistency(result: SurveyResult, truth: Trajectory, alignment: AlignmentName) -> dict[str, float | None]:
+    """Returns `consistency.*` of the positions of the keyframes that have a true pose.
+
+    Errors are those after the alignment: without the keyframe at which it was done for "first", and smaller than
+    before for "se3", as it takes a part of them. Errors of the truth count as errors of the estimate.
+    """
+    n, final = min(len(result.keyframe_rows), len(result.node_cov)), result.final
+    rows = associate(final.times_s, truth.times_s)
+    used = np.flatnonzero(np.isin(result.keyframe_rows[:n], rows.estimate))
+    used = used[1:] if alignment == "first" else used
+    frames, order = result.keyframe_rows[used], np.argsort(rows.estimate)
+    true = truth.world_from_camera[rows.truth[order][np.searchsorted(rows.estimate, frames, sorter=order)]]
+    return position_consistency(
+        result, true_from_world(final, truth, alignment) @ final.world_from_camera[frames], true, used
+    )
 
 
 def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:

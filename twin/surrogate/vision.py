@@ -251,7 +251,7 @@ class SurrogateVision:
     def tracking_cov(self) -> Array | None:
         return self._tracking_cov
 
-    def restart_tracking(self) -> None:
+    def restart_tracking(self, velocity: Array | None = None) -> None:
         model = self.model
         if model.rematched(self.latest.bound_px) * self.latest.clear_share < MIN_MATCHED:
             return  # vision is lost until the next keyframe

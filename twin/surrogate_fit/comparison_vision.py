@@ -97,9 +97,9 @@ class ComparisonVision:
     def tracking_cov(self) -> Array | None:
         return self.images.tracking_cov()
 
-    def restart_tracking(self) -> None:
-        self.images.restart_tracking()
-        self.surrogate.restart_tracking()
+    def restart_tracking(self, velocity: Array | None = None) -> None:
+        self.images.restart_tracking(velocity)
+        self.surrogate.restart_tracking(velocity)
 
     def register_with_mosaic(self, world_from_camera: Array) -> Registration | None:
         measured = self.images.register_with_mosaic(world_from_camera)

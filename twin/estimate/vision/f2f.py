@@ -76,8 +76,13 @@ class FrameToFrame:
         self._reference_cov = np.zeros((6, 6))  # of the pose of the reference in the last keyframe
         self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 
-    def restart(self, image: matching.Image, points: StereoPoints) -> None:
-        """Makes a new keyframe, with its normalised left image, the reference, with the strongest of its points."""
+    def restart(self, image: matching.Image, points: StereoPoints, velocity: Array | None = None) -> None:
+        """Makes a new keyframe, with its normalised left image, the reference, with the strongest of its points.
+
+        A `velocity` (6,) of the camera [rad/s, m/s] that was measured otherwise replaces that of the filter.
+        """
+        if velocity is not None and isinstance(self.filter, MotionFilter):
+            self.filter.set_velocity(velocity)
         strongest = slice(MAX_POINTS)
         measured, cov = _at_left_pixels(points, self.rig)
         measured = at_mid_exposure(measured, self.filter.velocity, self.rig)

@@ -27,19 +27,22 @@ def contrast(levels: Gray) -> float:
 
 
 def repetition(image: Image, patch_px: int) -> float:
-    """Returns the largest autocorrelation of a normalised image at shifts of at least one patch side.
+    """Returns the highest peak of the autocorrelation of a normalised image at shifts of at least one patch side.
 
+    A peak is the largest value within a patch, so shadows and bright areas that are larger than a patch are none.
     Natural texture stays below 0.4; repetitive texture, whose matches are ambiguous, comes close to 1.
     """
     taper, weight = _taper(*image.shape)
     correlation = _autocorrelation((image.astype(np.float64) - image.mean()) * taper)
     if correlation[0, 0] <= 0:
         return 0.0
-    rows, columns = np.mgrid[: weight.shape[0], : weight.shape[1]]
-    columns = np.minimum(columns, weight.shape[1] - columns)
-    shifted = (np.hypot(rows, columns) >= patch_px) & (weight > _SMALLEST_WEIGHT * weight[0, 0])
-    ratio = correlation[shifted] / weight[shifted] * (weight[0, 0] / correlation[0, 0])
-    return float(np.clip(ratio.max(initial=0.0), 0.0, 1.0))
+    known = weight > _SMALLEST_WEIGHT * weight[0, 0]
+    ratio = np.where(known, correlation, 0.0) / np.where(known, weight, 1.0) * (weight[0, 0] / correlation[0, 0])
+    ahead = np.fft.fftshift(ratio, axes=1)[:, 1:] if ratio.shape[1] % 2 == 0 else np.fft.fftshift(ratio, axes=1)
+    both = np.vstack([ahead[patch_px:0:-1, ::-1], ahead]).astype(np.float32)  # symmetric about the zero shift
+    rows, columns = np.nonzero(both == cv2.dilate(both, np.ones((patch_px | 1, patch_px | 1), np.uint8)))
+    far = np.hypot(rows - patch_px, columns - (ahead.shape[1] // 2)) >= patch_px
+    return float(np.clip(both[rows[far], columns[far]].max(initial=0.0), 0.0, 1.0))
 
 
 @lru_cache(maxsize=4)

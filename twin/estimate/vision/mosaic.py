@@ -27,6 +27,9 @@ _MIN_GRADIENT = 4.0  # grey levels per cell
 _MAX_RESIDUAL = 40.0  # grey levels; residuals of inliers are far smaller (standard deviation of a normalised image: 36)
 _ITERATIONS = 8
 _BLOCKS = (6, 8)  # rows and columns of image blocks; a block is about as wide as the normalisation window
+#: Largest ratio of the 99th percentile and the median of depths: cells of the median's resolution would else have to
+#: cover more than 25 times the area of an image, as where a camera looks along a floor.
+_MOST_DEPTH_RATIO = 5.0
 #: Largest angle of the optical axis from straight down for which heights are measured along z of the world.
 _MAX_TILT_RAD = np.deg2rad(45.0)
 
@@ -44,6 +47,12 @@ def viewing_plane(world_from_camera: Array) -> Array:
     length = np.linalg.norm(turn)
     direction = np.array([1.0, 0.0, 0.0]) if length < 1e-9 else turn / length  # straight up: any horizontal axis
     return geometry.pose(geometry.so3_exp(direction * angle), np.zeros(3))
+
+
+def can_represent(depth_m: Map) -> bool:
+    """Returns whether a mosaic can represent the scene of an image, from its depths (H, W) [m], NaN where unknown."""
+    known = depth_m[np.isfinite(depth_m)]
+    return known.size > 0 and bool(np.quantile(known, 0.99) <= _MOST_DEPTH_RATIO * np.median(known))
 
 
 class Registration(NamedTuple):
@@ -66,10 +75,11 @@ class Mosaic:
         self.cell_m, self.cells = cell_m, TiledRaster(3, folder)
 
     def add(self, number: int, image: matching.Image, depth_m: Map, world_from_camera: Array, rig: StereoRig) -> None:
-        """Fills empty cells from a keyframe with a normalised image and depth (H, W) [m]. Raises OSError."""
+        """Fills empty cells from a keyframe with a normalised image and depth (H, W) [m]. Raises OSError.
+
+        The mosaic must be able to represent them (`can_represent`).
+        """
         known = depth_m[np.isfinite(depth_m)]
-        if known.size == 0:
-            return
         farthest_m = 1.2 * float(np.quantile(known, 0.99))  # the maximum may be a mismatch
         reach_m = farthest_m * np.hypot(rig.width_px, rig.height_px) / rig.focal_px / 2
         row, col, side = self._window(world_from_camera[:3, 3], reach_m)

@@ -35,6 +35,12 @@ class MotionFilter:
     def cov(self) -> Array:
         return self._cov[:6, :6]
 
+    def set_velocity(self, velocity: Array) -> None:
+        """Sets the velocity (6,), as uncertain as before the first measurement."""
+        self.velocity, self._blind_s = velocity, 0.0
+        self._cov[6:], self._cov[:, 6:] = 0.0, 0.0
+        self._cov[6:, 6:] = np.diag(_FIRST_VELOCITY**2)
+
     def restart(self) -> None:
         """Makes the last frame the reference: its pose becomes the identity, exactly; the velocity remains."""
         self.pose = np.eye(4)
