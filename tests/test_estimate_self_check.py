@@ -11,7 +11,7 @@ from twin.core import geometry
 from twin.core.quality import CalibrationEstimate, DisparityOffset, EpipolarError, EstimationQuality
 from twin.core.records import StereoObservation, StereoRig
 from twin.estimate.calibration_errors import disparity_offset, mean_views
-from twin.estimate.self_check import check_survey
+from twin.estimate.self_check import check_survey, with_length_error
 from twin.estimate.vision import matching
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.image_quality import repetition
@@ -141,6 +141,12 @@ def test_repetition_distinguishes_a_tiled_from_a_random_texture():
     assert repetition(np.full((240, 320), 128, np.uint8), 11) == 0.0
 
 
+def test_bright_and_dark_areas_as_large_as_a_patch_are_no_repetition():
+    """Their autocorrelation exp(-d^2 / 4 s^2) is 0.62 at a distance of one patch, without a peak there."""
+    areas = gaussian_filter(np.random.default_rng(4).normal(size=(480, 640)), 8.0)
+    assert repetition((128 + 40 * areas / areas.std()).clip(0, 255).astype(np.uint8), 11) < 0.35
+
+
 OBSERVATION = StereoObservation(0, 400, 0.2, 0.0, 0.0, 0.04, 0.05, 0.2)
 
 
@@ -200,6 +206,41 @@ def test_an_error_of_the_rectification_is_judged_by_its_effect_in_millimetres():
     sharp = replace(elevation, sigma_m=elevation.sigma_m * np.float32(0.5))
     (high,) = check_survey(result, RIG, sharp)
     assert high.value == pytest.approx(0.0186, rel=0.01) and "19 mm at 2 m, their standard" in high.sentence
+
+
+def test_a_yaw_that_the_motions_exclude_is_judged_as_a_distortion():
+    """0.04 deg moves rows by 0.19 px times x y, in RMS over the image 0.016 px."""
+    for offset, expected in ((DisparityOffset(1e-4, 1e-4), []), (DisparityOffset(5e-4, 2e-4), ["yaw"])):
+        known = quality(epipolar=YAW, disparity_offset=offset)
+        result = replace(survey_result(), quality=known, stereo_observations=[OBSERVATION])
+        assert [finding.check for finding in check_survey(result, RIG)] == expected
+    large = YAW._replace(estimate=YAW.estimate * 15)
+    known = quality(epipolar=large, disparity_offset=DisparityOffset(1e-4, 1e-4))
+    result = replace(survey_result(), quality=known, stereo_observations=[OBSERVATION])
+    (finding,) = check_survey(result, RIG)
+    corner = np.array([320, 240]) / 2 / RIG.focal_px
+    share = YAW.estimate[1] * 15 * np.prod(corner) / 3 * 2.0 / RIG.baseline_m
+    assert finding.check == "row_pattern" and finding.length_error == pytest.approx(share, rel=1e-6)
+
+
+def test_an_error_of_all_lengths_is_part_of_the_covariances():
+    result, elevation = (
+        replace(survey_result(), quality=quality(epipolar=YAW), stereo_observations=[OBSERVATION]),
+        survey()[1],
+    )
+    findings = check_survey(result, RIG, elevation)
+    inflated, higher = with_length_error(result, elevation, findings)
+    share, poses = findings[0].length_error, result.final.world_from_camera[result.keyframe_rows]
+    assert share == pytest.approx(0.0093, rel=0.01)
+    added_m2 = np.trace((inflated.node_cov - result.node_cov)[:, 3:, 3:], axis1=1, axis2=2)
+    np.testing.assert_allclose(added_m2, (share * np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1)) ** 2)
+    scaled = poses[:, :3, 3] + share * (poses[:, :3, 3] - poses[0, :3, 3])  # the error that the covariance describes
+    error = np.einsum("nji,nj->ni", poses[:, :3, :3], scaled - poses[:, :3, 3])[1:]
+    added = (inflated.node_cov - result.node_cov)[1:, 3:, 3:]
+    np.testing.assert_allclose(added, error[:, :, None] * error[:, None, :], atol=1e-12)
+    known = np.isfinite(elevation.sigma_m)
+    np.testing.assert_allclose((higher.sigma_m**2 - elevation.sigma_m**2)[known], (share * 2.0) ** 2, rtol=1e-4)
+    assert with_length_error(result, elevation, [])[0] is result
 
 
 def test_an_uncertain_position_is_a_finding():

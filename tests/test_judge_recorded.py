@@ -9,8 +9,8 @@ from evo.core import sync
 from evo.core.trajectory import PoseTrajectory3D
 
 from twin.core import geometry
-from twin.core.records import Trajectory
-from twin.judge.recorded import associate, recorded_errors, rigid_alignment, truth_warnings
+from twin.core.records import SurveyResult, Trajectory
+from twin.judge.recorded import associate, recorded_consistency, recorded_errors, rigid_alignment, truth_warnings
 from twin.judge.trajectory_errors import trajectory_metrics
 
 RNG = np.random.default_rng(2)
@@ -129,3 +129,23 @@ def test_too_few_true_poses_give_no_error(pair):
     estimate, truth = pair
     few = Trajectory(truth.times_s[:2], truth.world_from_camera[:2])
     assert trajectory_metrics(recorded_errors(estimate, few, "se3"))["ate_rmse_m"] is None
+
+
+def test_errors_against_a_recorded_truth_are_judged_by_their_covariances():
+    """Positions with errors of the claimed covariance have a mean NEES of 3, in camera axes that turn."""
+    rng, n, cov = np.random.default_rng(6), 4000, np.diag([4e-6, 1e-6, 9e-6])
+    poses = np.array([geometry.exp(np.array([0.3, -0.2, 1.0, 0.5, 0.2, 0.1]) * 0.01 * k) for k in range(n)])
+    errors = rng.normal(size=(n, 3)) * np.sqrt(np.diag(cov))
+    errors[0] = 0.0
+    estimate = poses.copy()
+    estimate[:, :3, 3] += np.einsum("nij,nj->ni", poses[:, :3, :3], errors)
+    times_s, rows = np.arange(n) / 10, np.arange(0, n, 2)
+    path, node_cov = Trajectory(times_s, estimate), np.tile(np.diag([1e-8] * 3 + list(np.diag(cov))), (len(rows), 1, 1))
+    result = SurveyResult(path, path, path, rows, np.zeros_like(rows), node_cov)
+    moved = geometry.exp(np.array([0.1, 0.2, -0.3, 4.0, 5.0, 6.0]))
+    for every, alignment in ((1, "first"), (3, "first"), (1, "none")):
+        true = Trajectory(times_s[::every], (np.eye(4) if alignment == "none" else moved) @ poses[::every])
+        found = recorded_consistency(result, true, alignment)
+        n_errors = len(rows) / every  # their mean chi-square of 3 has the standard deviation sqrt(6 / n)
+        assert found["nees_position_mean"] == pytest.approx(3.0, abs=4 * np.sqrt(6 / n_errors)), (every, alignment)
+        assert found["within_2sigma_position"] == pytest.approx(0.954, abs=0.02)

@@ -118,6 +118,8 @@ class Finding(NamedTuple):
     value: float  #: measured value
     limit: float  #: largest (or smallest) value that passes the check
     sentence: str  #: the finding in words
+    #: standard deviation of the relative error that all lengths may have because of it; 0: not determined.
+    length_error: float = 0.0
 
 
 class Energy(NamedTuple):

@@ -6,7 +6,8 @@ The limits lie between the values of ordinary surveys and those of surveys with 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,27 @@ def check_survey(result: SurveyResult, rig: StereoRig, elevation: ElevationMap |
     return [finding for findings in checks for finding in findings]
 
 
+def with_length_error(
+    result: SurveyResult, elevation: ElevationMap | None, findings: Sequence[Finding]
+) -> tuple[SurveyResult, ElevationMap | None]:
+    """Returns the results with covariances that include the errors of all lengths which the findings imply.
+
+    With a relative error s, a position at a distance d from the first keyframe is off by s d along d, and a height by s
+    times the depth of the floor. Unchanged if no finding implies such an error.
+    """
+    share = float(np.sqrt(sum(finding.length_error**2 for finding in findings)))
+    rows = result.keyframe_rows[: len(result.node_cov)]
+    if not share or not len(rows):
+        return result, elevation
+    poses, cov = result.final.world_from_camera[rows], result.node_cov.copy()
+    offsets_m = np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3] - poses[0, :3, 3])  # in camera axes
+    cov[:, 3:, 3:] += share**2 * offsets_m[:, :, None] * offsets_m[:, None, :]
+    if elevation is not None:
+        depth_m = np.float32(share * np.median(result.keyframe_depth_m))
+        elevation = replace(elevation, sigma_m=np.hypot(elevation.sigma_m, depth_m))
+    return replace(result, node_cov=cov), elevation
+
+
 def _above(check: str, value: float | None, limit: float, text: str) -> list[Finding]:
     return [] if value is None or value <= limit else [Finding(check, value, limit, text)]
 
@@ -53,16 +75,20 @@ class _Damage(NamedTuple):
         if not abs(error) * self.rig.focal_px > limit_px or not len(self.result.keyframe_depth_m):
             return []
         error_m, limit_m, effect = max(self._effects(abs(error)), key=lambda one: one[0] / max(one[1], 1e-9))
-        return _above(check, error_m, limit_m, f"{text}; {effect}")
+        found = _above(check, error_m, limit_m, f"{text}; {effect}")
+        return [finding._replace(length_error=self._share(abs(error))) for finding in found]
+
+    def _share(self, error: float) -> float:
+        """Returns the relative error of lengths by an error of all disparities [focal lengths], Z e / b."""
+        return error * float(np.median(self.result.keyframe_depth_m)) / self.rig.baseline_m
 
     def _effects(self, error: float) -> Iterator[tuple[float, float, str]]:
         """Yields the effects of an error e: depths Z = b / d, and all lengths, change by Z e / b.
 
         An effect is the error of positions or of heights, its largest tolerable value [m], and both in words.
         """
-        result, rig, elevation = self
-        depth_m = float(np.median(result.keyframe_depth_m))
-        share = error * depth_m / rig.baseline_m
+        result, _, elevation = self
+        depth_m, share = float(np.median(result.keyframe_depth_m)), self._share(error)
         positions = result.final.positions[result.keyframe_rows]
         reach_m = float(np.linalg.norm(positions - positions[0], axis=1).max())
         effects = [("positions", share * reach_m, _largest_sigma_m(result, 0.0), f"over {reach_m:.3g} m")]

@@ -17,6 +17,7 @@ from twin.core.quality import Finding
 from twin.core.records import ElevationMap, MapGrid, SurveyResult
 from twin.core.timing import Stopwatch, timing_summary
 from twin.errors import SurveyAborted
+from twin.estimate.self_check import with_length_error
 from twin.judge.metrics import EvaluationInput, evaluate, unevaluated
 from twin.report.run_result import RunResult
 from twin.report.run_writer import RunFolder, SurveyRecord
@@ -85,6 +86,8 @@ def conclude(estimation: Estimation, run: RunKind) -> tuple[RunResult, Evaluatio
     findings = run.findings(result, maps.elevation)
     for finding in findings:
         folder.log("finding", **finding._asdict())
+    result, elevation = with_length_error(result, maps.elevation, findings)
+    maps = maps._replace(elevation=elevation)
     survey = run.evaluation(result, maps)
     timing = timing_summary(survey.timing["simulated_s"], time.perf_counter() - start_s, stopwatch)
     identity = dict(survey.identity) | status(guard.reason, findings)
