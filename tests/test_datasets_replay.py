@@ -26,7 +26,7 @@ from twin.exchange.geotiff import write_elevations
 from twin.plugin import loading
 from twin.recordings import opened_dataset, preview, replay
 from twin.recordings.frames import RecordedFrames
-from twin.recordings.replay import ReplayOptions, alignment_name, bayer_pattern, open_dataset
+from twin.recordings.replay import ReplayOptions, alignment_name, bayer_pattern, frame_numbers, open_dataset
 from twin.report import recording, survey_page
 from twin.report.run_folder import load_run
 
@@ -459,6 +459,7 @@ def test_pairs_too_far_apart_for_tracking_are_linked_directly(tmp_path):
     found = twin.replay(folder, tmp_path / "run", ReplayOptions(truth=tmp_path / "truth.tum", outputs=()))
     assert found.metrics["links"]["bridged"] == 0 and found.metrics["timing"]["keyframes"] == 6
     assert found.metrics["trajectory"]["final"]["ate_max_m"] < 0.006
+    assert found.metrics["trajectory"]["f2f"]["ate_max_m"] < 0.02  # the links continue it, and give it the velocity
 
 
 def test_the_truth_is_sorted_and_of_equal_times_the_first_pose_counts():
@@ -487,3 +488,22 @@ def test_a_recording_of_one_place_with_a_noisy_truth_is_complete_without_a_warni
     np.savetxt(tmp_path / "truth.txt", rows, fmt="%.9f")
     found = twin.replay(folder, tmp_path / "out", ReplayOptions(outputs=(), truth=tmp_path / "truth.txt")).metrics
     assert found["status"] == "complete" and not [one for one in found["warnings"] if "truth" in one]
+
+
+def test_a_range_of_frames_is_replayed_with_its_own_times_and_true_poses(euroc, replayed, tmp_path):
+    part = twin.replay(euroc, tmp_path / "run", ReplayOptions(frames=frame_numbers("2::3"), outputs=()))
+    whole, n = replayed.result.final, len(PATH[2::3])
+    assert part.metrics["timing"]["frames"] == part.metrics["replay"]["frames_with_truth"] == n
+    np.testing.assert_allclose(part.result.final.times_s, whole.times_s[2::3] - whole.times_s[2], atol=1e-6)
+    assert part.metrics["trajectory"]["final"]["ate_max_m"] < 0.003
+
+
+@pytest.mark.parametrize("text", ["3", "a:b", "1:2:3:4", "-1:3", "0:9:0"])
+def test_a_text_that_is_no_range_of_frames_is_one_line(text):
+    with pytest.raises(TwinError, match="--frames: .* is no range of frames"):
+        frame_numbers(text)
+
+
+def test_a_range_without_frames_is_one_line(euroc):
+    with pytest.raises(TwinError, match="no frame of the data set is in this range"):
+        open_dataset(euroc, ReplayOptions(frames=slice(100, 200)))

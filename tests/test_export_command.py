@@ -295,6 +295,29 @@ def recorded(tmp_path_factory):
     return folder
 
 
+def test_right_images_between_keyframes_are_recorded_without_an_effect_on_any_other_image():
+    from twin.world.mission import prepare
+    from twin.world.rendered_world import RenderedWorld
+
+    mission, found = prepare(Scenario.model_validate(SCENARIO)), []
+    for records in (False, True):
+        with RenderedWorld(mission, Stopwatch()) as world:
+            sequence, images = mission.planned_frames(1), []
+            world.start_sequence(sequence)
+            for k in range(3):
+                frame = world.observe(sequence[k]._replace(keyframe=k == 2))
+                if frame.right is None and records:
+                    pair = world.extra_pair()
+                    right = world.right_image()
+                    difference = np.abs(right.astype(int) - pair[1].astype(int))
+                    assert difference.mean() < 3.5  # grey levels: independent noise of about 2 in each
+                    assert np.abs(right.astype(int) - frame.left.astype(int)).mean() > 4 * difference.mean()
+                images += [frame.left] if frame.right is None else [frame.left, frame.right]
+                world.act(np.array([1.0, 0.1, 0.0, 0.2]))
+            found.append(images)
+    assert all(np.array_equal(one, other) for one, other in zip(*found, strict=True)) and len(found[0]) == 4
+
+
 def test_the_world_rendered_again_gives_the_recorded_images_and_their_truth(recorded, tmp_path):
     export(recorded, ["truth"], tmp_path)
     folder = tmp_path / "truth"

@@ -404,6 +404,9 @@ def replay(
             "Standard deviation of the rotation between the cameras since the calibration; estimates the yaw.", "DEG"
         ),
     ] = None,
+    frames: Annotated[
+        str | None, option("Frames of the data set to use, numbered from 0. Default: all.", "FIRST:END[:STEP]")
+    ] = None,
     baseline_sigma: Annotated[
         float | None, option("The same of the distance between the cameras; estimates the baseline.", "MM")
     ] = None,
@@ -420,6 +423,7 @@ def replay(
         calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer),
         topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
         rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma, imu=imu,
+        frames=recorded.frame_numbers(frames),
     )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:

@@ -73,6 +73,8 @@ def _run(
 
                     def observe(estimate: Estimate, frame: Frame) -> None:
                         taken = replace(frame, readings=world.measured)
+                        if scenario.record == "all" and frame.right is None:
+                            taken = replace(taken, right=world.right_image())
                         recorder.add(taken, world.world_from_camera, world.vehicle.twist_body)
                         monitor(estimate, frame)
 

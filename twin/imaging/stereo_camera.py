@@ -74,8 +74,8 @@ class StereoCamera:
         self._camera_from_body_twist = [geometry.adjoint(geometry.inverse(pose)) for pose in body_from_cameras]
         self._sensor, self._psf = sensor_of(scenario, self._cameras.raw_rig), LensPsf(scenario, rig)
         self._focal_px, self._linear = rig.focal_px, scenario.delivers_linear_images
-        self._rngs = (left_rng, right_rng)
-        self._n_captures = 0
+        self._rngs, self._rng_apart = (left_rng, right_rng), copy.deepcopy(right_rng)
+        self._n_captures, self._last_setting = 0, self._sensor.setting
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
         """Returns the image of the left camera and, if `stereo`, of the right one; advances the time by one frame.
@@ -98,8 +98,17 @@ class StereoCamera:
             if metered:
                 self._sensor.meter(light)
             depths = [self._cameras.crop(view.depth) for view in views]
+        self._last_setting = setting
         exposure = self._sensor.signal_per_cd(setting)
         return StereoCapture(left, right, depths[0], depths[1] if stereo else None, exposure)
+
+    def right_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> Image:
+        """Returns the right image (H, W, 3) at the time and exposure of the last capture, with a noise of its own."""
+        view = self._render(StampedPose(world_from_left, (self._n_captures - 1) / self._frame_rate_hz), 1)
+        with self._stopwatch("optics"):
+            assert self._last_setting is not None
+            light = self._at_raw_pixels(view, self._sensor, twist_body, self._last_setting)
+            return self._cameras.rectify(self._sensor.image(light, self._last_setting, self._rng_apart))
 
     def capture_apart(self, world_from_left: Array, twist_body: Array = AT_REST) -> tuple[Image, Image]:
         """Returns both images (H, W, 3) at the time of the last capture, with the noise of the next."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -58,6 +58,7 @@ class ReplayOptions:
         rotation_sigma_deg, baseline_sigma_mm: standard deviations of the rotation between the cameras (about each axis)
             and of the baseline since the calibration; above 0, yaw and baseline are estimated. None: those of the data
             set, which are 0 unless the twin exported it.
+        frames: frames of the data set that are used, by their numbers from 0 in the order of its list.
     """
 
     calibration: Path | None = None
@@ -74,6 +75,7 @@ class ReplayOptions:
     rotation_sigma_deg: float | None = None
     baseline_sigma_mm: float | None = None
     imu: bool = False
+    frames: slice = field(default_factory=lambda: slice(None))
 
     def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
         """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
@@ -125,7 +127,10 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
     if calibration is None:
         raise TwinError(str(folder), "has no calibration", f"--calibration FILE: {READ}")
-    frames = RecordedFrames(dataset, options.with_sigmas(_sound(calibration)), options.bayer)
+    used = replace(dataset, images=dataset.images[options.frames])
+    if not used.images:
+        raise TwinError("--frames", "no frame of the data set is in this range", f"0 to {len(dataset.images) - 1}")
+    frames = RecordedFrames(used, options.with_sigmas(_sound(calibration)), options.bayer)
     truth = _truth(dataset, frames, None if in_bag else options.truth)
     pair = inspect_pair(frames.first_pair(), frames.rectification.rig, options.settings)
     if pair.swapped:
@@ -174,7 +179,7 @@ def _truth(dataset: Dataset, frames: RecordedFrames, file: Path | None) -> Traje
     truth = _ordered(truth, source)
     poses = truth.world_from_camera @ frames.rectification.left_from_rectified
     moved = Trajectory(truth.times_s - frames.start_s, poses)
-    times_s = np.array([frame.time_s for frame in dataset.images]) - frames.start_s
+    times_s = np.array([frame.time_s for frame in frames.dataset.images]) - frames.start_s
     if len(times_s) > 1 and len(associate(times_s, moved.times_s).estimate) == 0:
         span = f"{truth.times_s.min():.3f} to {truth.times_s.max():.3f} s"
         given = f"{frames.start_s:.3f} to {frames.start_s + times_s.max():.3f} s"

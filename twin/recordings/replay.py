@@ -232,6 +232,21 @@ def bayer_pattern(name: str | None) -> Bayer | None:
     return None if name is None else _one_of(BAYER, name, "--bayer", "a Bayer pattern")
 
 
+def frame_numbers(text: str | None) -> slice:
+    """Returns the slice of the text FIRST:END or FIRST:END:STEP, any of them empty; all frames for None."""
+    if text is None:
+        return slice(None)
+    try:
+        parts = [int(part) if part.strip() else None for part in text.split(":")]
+    except ValueError:
+        parts = []
+    if len(parts) not in (2, 3) or any(part is not None and part < 0 for part in parts) or parts[2:] == [0]:
+        raise TwinError(
+            "--frames", f"{text[:40]!r} is no range of frames", "FIRST:END or FIRST:END:STEP, e.g. 100:400:2"
+        )
+    return slice(*parts)
+
+
 def _one_of(allowed: Sequence[T], name: str, option: str, what: str) -> T:
     for value in allowed:
         if value == name:

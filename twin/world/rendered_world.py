@@ -81,6 +81,9 @@ class RenderedWorld(World):
     def extra_pair(self) -> tuple[Image, Image]:
         return self.camera.capture_apart(self.world_from_camera, self.vehicle.twist_body)
 
+    def right_image(self) -> Image:
+        return self.camera.right_apart(self.world_from_camera, self.vehicle.twist_body)
+
     def true_surface(self) -> TopSurface:
         return super().true_surface() if self._surface is None else self._surface
 

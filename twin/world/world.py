@@ -103,6 +103,13 @@ class World(ABC):
         """Returns a left and a right image (H, W, 3) at the current pose, without an effect on later frames."""
         raise TwinError("imaging.fidelity", "the surrogate has no images", '"rendered"')
 
+    def right_image(self) -> Image | None:
+        """Returns the right image (H, W, 3) of the last frame if it was captured without one; affects no other image.
+
+        None in a world without images.
+        """
+        return None
+
     @abstractmethod
     def seen(self) -> NDArray[np.bool_]:
         """Returns for each cell of the map (rows, cols) whether both cameras observed it in at least one keyframe."""
