@@ -407,13 +407,8 @@ def replay(
     baseline_sigma: Annotated[
         float | None, option("The same of the distance between the cameras; estimates the baseline.", "MM")
     ] = None,
-    baseline: Annotated[
-        float | None, option("Distance between the cameras, for a calibration in other units than metres.", "M")
-    ] = None,
-    field: Annotated[
-        float | None,
-        option("Horizontal field of view of the rectified images. Default: 80 % of the central resolution.", "DEG"),
-    ] = None,
+    baseline: Annotated[float | None, option("Distance between the cameras. Default: the calibration's.", "M")] = None,
+    field: Annotated[float | None, option("Horizontal field of view of the rectified images.", "DEG")] = None,
     as_json: MetricsJson = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
@@ -427,7 +422,7 @@ def replay(
         calibration, truth, recorded.alignment_name(align), recorded.bayer_pattern(bayer),
         topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
         rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma, imu=imu,
-        baseline_m=baseline, field_deg=field,
+        baseline_m=baseline, fov_deg=field,
     )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:

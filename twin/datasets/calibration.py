@@ -18,19 +18,15 @@ from twin.errors import TwinError
 SIGMAS = {"rotation_sigma_deg": 2.0, "baseline_sigma_mm": 20.0}
 _MOST_PX = 16384  # largest side of an image
 _BELIEVED_M = 0.01, 1.0  # shortest and longest baseline whose unit need not be stated
-_BASELINES_M = 0.001, 10.0
+_POSSIBLE_M = 0.001, 10.0  # the same of any baseline
 _SHORTEST_FOCAL = 0.05  # smallest focal length as a fraction of the image size; a fisheye lens of 180 degrees has 0.3
 _ORTHONORMAL = 1e-3  # largest deviation of a rotation matrix from an orthonormal one (calibration files round)
 _SKEW_PX = 0.01  # largest skew of a camera matrix, which the camera models do not have
 _OFF_CENTRE = 0.1  # largest distance of a principal point from the image centre, if no image size is stated [sides]
 _FISHEYE = ("fisheye", "equidistant", "equi", "kannalabrandt", "kannala_brandt")
-_RADTAN = (
-    "radtan", "plumb_bob", "radial-tangential", "radialtangential", "radialtangential8", "rational_polynomial",
-    "pinhole", "none", "opencv",
-)  # fmt: skip
+_RADTAN = ("radtan", "plumb_bob", "radialtangential", "rational_polynomial", "pinhole", "none", "opencv")
 #: Numbers of coefficients of distortion.
 _COUNTS = {"fisheye": (0, 4), "radtan": (0, 4, 5, 8, 12, 14), "double_sphere": (2,)}
-LensModel = Literal["radtan", "fisheye", "double_sphere"]
 
 
 @dataclass(frozen=True)
@@ -42,7 +38,7 @@ class RecordedCamera:
     distortion: Array  #: (n,) coefficients in the order of OpenCV; empty or zero for images without distortion
     #: "radtan" (k1, k2, p1, p2, k3, ...: the pinhole model of OpenCV), "fisheye" (k1 to k4: equidistant, as Kalibr) or
     #: "double_sphere" (xi, alpha; with xi = 0, it is the unified camera model)
-    kind: LensModel = "radtan"
+    kind: Literal["radtan", "fisheye", "double_sphere"] = "radtan"
 
     def project(self, points_m: Array) -> Array:
         """Returns the pixels (n, 2) of points (n, 3) in camera axes.
@@ -110,12 +106,13 @@ class StereoCalibration:
 
         Raises TwinError for an impossible one, and for one of its own without a stated unit beyond `_BELIEVED_M`.
         """
-        shortest, longest = _BASELINES_M if self.unit == "stated" or baseline_m is not None else _BELIEVED_M
+        shortest, longest = _POSSIBLE_M if self.unit == "stated" or baseline_m is not None else _BELIEVED_M
         length_m = self.baseline_m if baseline_m is None else baseline_m
         if not shortest <= length_m <= longest or (baseline_m is None and self.unit == "unknown"):
-            problem = f"the baseline is {length_m:g} m (or in mm, inches or squares of a board?)"
+            unit = "in an unknown unit" if self.unit == "unknown" else "m (or in mm, inches or squares of a board?)"
             allowed = f"{shortest:g} to {longest:g} m; --baseline states it, or T_unit in a file of OpenCV"
-            raise TwinError(str(self.file) if baseline_m is None else "--baseline", problem, allowed)
+            source = str(self.file) if baseline_m is None else "--baseline"
+            raise TwinError(source, f"the baseline is {length_m:g} {unit}", allowed)
         pose = self.right_from_left.copy()
         pose[:3, 3] *= length_m / self.baseline_m
         return replace(self, right_from_left=pose)
@@ -156,30 +153,24 @@ def _misfit(name: str, camera: RecordedCamera, size: tuple[int, int]) -> tuple[s
 
 def checked(calibration: StereoCalibration) -> StereoCalibration:
     """Returns the calibration with an orthonormal rotation; raises TwinError, naming the file, for a wrong value."""
-    pose = calibration.right_from_left
-    faults = [_impossible(name, camera) for name, camera in calibration.sides]
-    if not is_rigid(pose):
-        faults.append(("the rotation between the cameras is not a rotation matrix", ""))
-    else:
-        faults.append(_wrong_baseline(pose))
+    pose = rigid(calibration.right_from_left, "the rotation between the cameras", calibration.file)
+    faults = [*(_impossible(name, camera) for name, camera in calibration.sides), _wrong_baseline(pose)]
     for key, most in SIGMAS.items():
         if not 0 <= (sigma := getattr(calibration, key)) <= most:
             faults.append((f"{key}: {sigma:g}", f"0 to {most:g}"))
     if fault := next(filter(None, faults), None):
         raise TwinError(str(calibration.file), *fault)
-    return replace(calibration, right_from_left=geometry.nearest_rigid(pose))
-
-
-def is_rigid(pose: Array) -> bool:
-    """Returns whether a pose (4, 4) is finite and has a rotation matrix, up to the rounding of calibration files."""
-    deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
-    return bool(deviation < _ORTHONORMAL and np.linalg.det(pose[:3, :3]) > 0)
+    return replace(calibration, right_from_left=pose)
 
 
 def rigid(pose: Array, key: str, file: Path) -> Array:
-    """Returns a pose (4, 4) with an orthonormal rotation; raises TwinError, naming `key`, unless it is rigid."""
-    if not is_rigid(pose):
-        raise TwinError(str(file), f"{key} is not a rigid motion", "a rotation matrix and a translation [m]")
+    """Returns a pose (4, 4) with an orthonormal rotation; raises TwinError, naming `key`, for no rotation matrix.
+
+    The rounding of calibration files is allowed.
+    """
+    deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
+    if not (deviation < _ORTHONORMAL and np.linalg.det(pose[:3, :3]) > 0):
+        raise TwinError(str(file), f"{key} is not a rotation matrix", "a rotation matrix; a pose has a translation [m]")
     return geometry.nearest_rigid(pose)
 
 
@@ -222,7 +213,7 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
 
 def distortion_kind(name: Any, file: Path) -> Any:
     """Returns "radtan" or "fisheye" for a lens model such as "plumb_bob"; raises TwinError if it is not supported."""
-    text = str(name).lower()
+    text = str(name).lower().replace("radial-t", "radialt").replace("tial8", "tial")  # OKVIS: of 8 coefficients
     if text in _FISHEYE or text in _RADTAN:
         return "fisheye" if text in _FISHEYE else "radtan"
     raise TwinError(str(file), f"distortion model {text[:40]!r} is not supported", "radtan or equidistant (fisheye)")

@@ -34,17 +34,9 @@ def read_calibration(file: Path) -> StereoCalibration:
     whose name has "right" in place of "left". Raises TwinError if the file cannot be read, is of an unknown kind, has
     an unknown key, or its values are impossible.
     """
-    if file.suffix.lower() == ".mat":
-        raise TwinError(str(file), "is a MAT-file, which is not read", "JSON: jsonencode(toStruct(stereoParams))")
     if file.suffix == ".txt":
         return checked(colmap.read_rig(file))
-    if file.suffix.lower() == ".xml":
-        root = _xml_root(file)
-        if root.tag in metashape.ROOTS:
-            return checked(metashape.read_cameras(root, file))
-        tree = _storage(root, file)
-    else:
-        tree = read_yaml(file)  # JSON is YAML
+    tree = _read_tree(file)
     for key, read in _PROGRAMS.items():
         if key in tree:
             return checked(read(tree, file))
@@ -54,7 +46,12 @@ def read_calibration(file: Path) -> StereoCalibration:
     return checked(opencv_calibration.read_opencv(tree, file))
 
 
-def _xml_root(file: Path) -> ElementTree.Element:
+def _read_tree(file: Path) -> Mapping[Any, Any]:
+    """Returns the keys and values of a file; the root element of an XML file of Metashape has the key `Element`."""
+    if file.suffix.lower() == ".mat":
+        raise TwinError(str(file), "is a MAT-file, which is not read", "JSON: jsonencode(toStruct(stereoParams))")
+    if file.suffix.lower() != ".xml":
+        return read_yaml(file)  # JSON is YAML
     text = read_text(file, 2**20)
     try:
         root = None if "<!" in text.replace("<!--", "") else ElementTree.fromstring(text)
@@ -62,11 +59,8 @@ def _xml_root(file: Path) -> ElementTree.Element:
         root = None
     if root is None or root.tag not in ("opencv_storage", *metashape.ROOTS):
         raise TwinError(str(file), "is not valid XML of OpenCV or Metashape", "XML without a document type")
-    return root
-
-
-def _storage(root: ElementTree.Element, file: Path) -> Mapping[str, Any]:
-    """Returns the keys and values of an XML file of OpenCV."""
+    if root.tag in metashape.ROOTS:
+        return {ElementTree.Element: root}
     values = {child.tag: (child.findtext("data") or child.text or "").split() for child in root}
     refuse_unknown([child.tag for child in root][len(values) :], file)  # not empty if tags are repeated
     return {key: value[0] if len(value) == 1 else value for key, value in values.items()}
@@ -97,6 +91,7 @@ _PROGRAMS = {
     "cam0": kalibr.read_camchain, "projection_matrix": read_pair, "Camera1.fx": vio_calibration.read_orbslam,
     "cameras": vio_calibration.read_okvis, "body_T_cam0": vio_calibration.read_vins,
     "value0": vio_calibration.read_basalt, "CameraParameters1": matlab_calibration.read_struct,
+    ElementTree.Element: lambda tree, file: metashape.read_cameras(tree[ElementTree.Element], file),
 }  # fmt: skip
 
 

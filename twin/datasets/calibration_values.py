@@ -12,10 +12,7 @@ from twin.core.geometry import Array
 from twin.errors import TwinError
 
 #: Calibration files that are read.
-READ = (
-    "OpenCV (YAML, XML, JSON), Kalibr camchain, ROS camera_info pair, ORB-SLAM3, OKVIS, VINS-Fusion, Basalt, MATLAB "
-    "toStruct (JSON), Metashape cameras (XML), COLMAP cameras.txt and rigs.txt"
-)
+READ = "OpenCV, Kalibr, ROS camera_info pair, ORB-SLAM3, OKVIS, VINS-Fusion, Basalt, MATLAB (JSON), Metashape, COLMAP"
 _UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "meters": 1.0, "millimeters": 0.001, "inches": 0.0254}
 _LARGEST = 1e12  # largest absolute value of a number in a calibration file
 

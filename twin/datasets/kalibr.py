@@ -26,9 +26,9 @@ _IRRELEVANT = (
 
 
 def read_camchain(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of a camchain; raises TwinError without cam1, or if a camera or a pose is wrong.
+    """Returns the calibration of a camchain, by T_cn_cnm1 or, without it, by T_imu_cam of both cameras (OpenVINS).
 
-    Without T_cn_cnm1, the pose of the right camera follows from T_imu_cam of both cameras (OpenVINS).
+    Raises TwinError without cam1, or if a camera or a pose is wrong.
     """
     if "cam1" not in tree:
         raise TwinError(str(file), "has one camera only, so it has no baseline", "cam0 and cam1 with T_cn_cnm1")
@@ -51,13 +51,12 @@ def camera_of(table: Any, file: Path) -> RecordedCamera:
     coefficients = next((table[name] for name in _COEFFICIENTS if name in table), None)
     refuse_unknown((key for key in table if key not in _READ + _IRRELEVANT), file)
     size = size_of(table.get("resolution"), file)
-    if (model := table.get("camera_model", "pinhole")) == "ds":
-        xi, alpha, *pinhole = numbers_of(table.get("intrinsics"), file, "intrinsics", (6,))
-        return RecordedCamera(size, camera_matrix(*pinhole), np.array([xi, alpha]), "double_sphere")
-    if model != "pinhole":
+    if (model := str(table.get("camera_model", "pinhole"))) not in ("pinhole", "ds"):
         allowed = "pinhole with radtan or equidistant, ds"
-        raise TwinError(str(file), f"camera model {str(model)[:40]!r} is not supported", allowed)
-    fx, fy, cx, cy = numbers_of(table.get("intrinsics"), file, "intrinsics", (4,))
+        raise TwinError(str(file), f"camera model {model[:40]!r} is not supported", allowed)
+    *sphere, fx, fy, cx, cy = numbers_of(table.get("intrinsics"), file, "intrinsics", (6 if model == "ds" else 4,))
+    if sphere:
+        return RecordedCamera(size, camera_matrix(fx, fy, cx, cy), np.array(sphere), "double_sphere")
     distortion = numbers_of([] if coefficients is None else coefficients, file, "distortion_coeffs").ravel()
     kind = distortion_kind(table.get("distortion_model", "radtan"), file)
     return RecordedCamera(size, camera_matrix(fx, fy, cx, cy), distortion, kind)

@@ -29,9 +29,8 @@ def read_struct(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 def _camera(table: Mapping[str, Any], file: Path) -> RecordedCamera:
     """Returns a camera of MATLAB, where the centre of the first pixel is at (1, 1)."""
     key = "K" if "K" in table else "IntrinsicMatrix"  # K: since R2022b; the other one is transposed
-    matrix = numbers_of(table.get(key), file, key, (3, 3))
-    matrix = matrix if key == "K" else matrix.T
-    matrix[:2, 2] -= 1
+    given = numbers_of(table.get(key), file, key, (3, 3))
+    matrix = (given if key == "K" else given.T) - [[0, 0, 1], [0, 0, 1], [0, 0, 0]]
     radial = numbers_of(table.get("RadialDistortion"), file, "RadialDistortion").ravel()
     p1, p2 = numbers_of(table.get("TangentialDistortion"), file, "TangentialDistortion", (2,))
     height, width = numbers_of(table.get("ImageSize"), file, "ImageSize", (2,)).astype(int).tolist()

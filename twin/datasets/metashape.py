@@ -42,10 +42,9 @@ def _camera(sensor: Element, file: Path) -> RecordedCamera:
 
     The corner of the first pixel is at (0, 0), and cx, cy count from the image centre. Other coefficients must be 0.
     """
-    found = {one.get("class"): one for one in sensor.findall("calibration")}
-    table, resolution = found.get("adjusted", found.get("initial")), sensor.find("resolution")
-    if table is None or resolution is None or sensor.get("type") != "frame" or table.get("type") != "frame":
-        raise TwinError(str(file), "has a sensor without a calibration of type frame", "an adjusted frame camera")
+    table, resolution = sensor.find("calibration[@class='adjusted'][@type='frame']"), sensor.find("resolution")
+    if table is None or resolution is None:
+        raise TwinError(str(file), "has a sensor without an adjusted calibration of type frame", "two frame cameras")
     size = size_of([resolution.get("width"), resolution.get("height")], file) or (0, 0)
     texts = {one.tag: one.text for one in table if one.tag not in ("resolution", "date")}
     values = {key: float(numbers_of(text, file, key, ())) for key, text in texts.items()}

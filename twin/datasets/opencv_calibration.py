@@ -71,10 +71,9 @@ def read_opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
     rotation = geometry.so3_exp(rotation.ravel()) if rotation.size == 3 else rotation
     if rotation.size != 9:
         raise TwinError(str(file), f"R has {rotation.size} numbers", "a rotation matrix or a rotation vector")
-    translation, unit = numbers_of(value["T"], file, "T", (3,)), value["unit"]
-    metres = 1.0 if unit is None else metres_of(unit, "T_unit", file)
-    pose = geometry.pose(rotation.reshape(3, 3), translation * metres)
-    return StereoCalibration(cameras[0], cameras[1], pose, file, unit="assumed" if unit is None else "stated")
+    metres, unit = (1.0, "assumed") if found["unit"] is None else (metres_of(value["unit"], "T_unit", file), "stated")
+    pose = geometry.pose(rotation.reshape(3, 3), metres * numbers_of(value["T"], file, "T", (3,)))
+    return StereoCalibration(cameras[0], cameras[1], pose, file, unit=unit)
 
 
 def _ask_for_model(cameras: list[RecordedCamera], file: Path) -> None:

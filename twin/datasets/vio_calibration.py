@@ -37,8 +37,7 @@ _ORBSLAM = (
 _OKVIS = "T_SC|image_dimension|distortion_(coefficients|type)|focal_length|principal_point|camera_type|slam_use"
 _CAMODOCAL = "model_type|camera_name|image_(width|height)|(projection|distortion)_parameters"
 _BASALT = "T_imu_(cam|marker)|intrinsics|resolution|(calib|imu|accel|gyro|mocap|T_mocap)_.*|vignette|cam_time.*|view_.*"
-_IRRELEVANT = "|overlapping(Begin|End)|rpmax"  # keys of a camera of ORB-SLAM3 and of Basalt
-_POSE = ("px", "py", "pz", "qw", "qx", "qy", "qz")
+_IRRELEVANT = ("overlapping(Begin|End)", "rpmax")  # in a camera of ORB-SLAM3 or Basalt
 
 
 def read_orbslam(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
@@ -86,18 +85,19 @@ def read_basalt(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
     for camera, size, pose in zip(*found, strict=True):
         table = table_of(camera, file)
         cameras.append(_camera(table.get("camera_type"), table_of(table.get("intrinsics"), file), size, file))
-        values = numbers_of([table_of(pose, file).get(key) for key in _POSE], file, "T_imu_cam", (7,))
+        numbers = [table_of(pose, file).get(key) for key in ("px", "py", "pz", "qw", "qx", "qy", "qz")]
+        values = numbers_of(numbers, file, "T_imu_cam", (7,))
         if not are_rotations(values[3:]):
-            raise TwinError(str(file), "T_imu_cam has a quaternion that is not of unit length", ", ".join(_POSE))
+            raise TwinError(str(file), "T_imu_cam has a quaternion that is not of unit length", "qx, qy, qz, qw")
         poses.append(geometry.pose(geometry.rotation_from_wxyz(values[3:]), values[:3]))
     return rig_of(cameras, poses, "T_imu_cam", file)
 
 
 def _camera(model: Any, values: Mapping[str, Any], size: Any, file: Path) -> RecordedCamera:
-    if model not in _MODELS:
-        raise TwinError(str(file), f"camera model {str(model)[:40]!r} is not supported", ", ".join(_MODELS))
-    kind, matrix, lens = _MODELS[model]
-    _refuse_others(values, "|".join(matrix + lens) + _IRRELEVANT, file)
+    if (name := str(model)) not in _MODELS:
+        raise TwinError(str(file), f"camera model {name[:40]!r} is not supported", ", ".join(_MODELS))
+    kind, matrix, lens = _MODELS[name]
+    _refuse_others(values, "|".join(matrix + lens + _IRRELEVANT), file)
     numbers = [float(numbers_of(values.get(key), file, key, ())) for key in matrix + lens]
     return RecordedCamera(size_of(size, file), camera_matrix(*numbers[:4]), np.array(numbers[4:]), kind)
 

@@ -35,16 +35,12 @@ class RecordedFrames:
     """
 
     def __init__(
-        self,
-        dataset: Dataset,
-        calibration: StereoCalibration,
-        bayer: Bayer | None = None,
-        field_deg: float | None = None,
+        self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None, fov_deg: float | None = None
     ):
         self.dataset = dataset
         self.size_px = _usual_size(dataset)
         sized = calibration.for_images(*self.size_px)
-        self.rectification: Rectification = rectification(sized, _frame_rate_hz(dataset), field_deg)
+        self.rectification: Rectification = rectification(sized, _frame_rate_hz(dataset), fov_deg)
         sources = [*(frame.left for frame in dataset.images), *(f.right for f in dataset.images if f.right is not None)]
         self._format = image_format(sources, self.size_px, bayer)
         self._in_order = increasing(np.array([frame.time_s for frame in dataset.images]))

@@ -61,7 +61,7 @@ class ReplayOptions:
             and of the baseline since the calibration; above 0, yaw and baseline are estimated. None: those of the data
             set, which are 0 unless the twin exported it.
         baseline_m: distance between the cameras, for a calibration in other units than metres; None: its own.
-        field_deg: horizontal field of view of the rectified images; None: that of `rectification`.
+        fov_deg: horizontal field of view of the rectified images; None: that of `rectification`.
     """
 
     calibration: Path | None = None
@@ -79,7 +79,7 @@ class ReplayOptions:
     baseline_sigma_mm: float | None = None
     imu: bool = False
     baseline_m: float | None = None
-    field_deg: float | None = None
+    fov_deg: float | None = None
 
     def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
         """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
@@ -142,7 +142,7 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     if calibration is None:
         raise TwinError(str(folder), "has no calibration", f"--calibration FILE: {READ}")
     calibration = options.with_sigmas(_sound(calibration).with_baseline(options.baseline_m))
-    frames = RecordedFrames(dataset, calibration, options.bayer, field_deg=options.field_deg)
+    frames = RecordedFrames(dataset, calibration, options.bayer, options.fov_deg)
     truth = _truth(dataset, frames, None if in_bag else options.truth)
     pair = inspect_pair(frames.first_pair(), frames.rectification.rig, options.settings)
     plane = floor_plane(pair.points)
@@ -182,9 +182,9 @@ def _fits_exchanged(frames: RecordedFrames, calibration: StereoCalibration, opti
     """Returns whether the first pair is matched if each image is rectified as that of the other camera."""
     images = [StereoImages(one.time_s, one.right, one.left) for one in frames.dataset.images if one.right is not None]
     dataset = replace(frames.dataset, images=images)
-    exchanged = RecordedFrames(dataset, calibration, options.bayer, field_deg=options.field_deg)
-    pair = inspect_pair(exchanged.first_pair(), exchanged.rectification.rig, options.settings)
-    return floor_plane(pair.points) is not None
+    exchanged = RecordedFrames(dataset, calibration, options.bayer, options.fov_deg)
+    rig = exchanged.rectification.rig
+    return floor_plane(inspect_pair(exchanged.first_pair(), rig, options.settings).points) is not None
 
 
 def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:

@@ -47,36 +47,33 @@ class Rectification(NamedTuple):
         return rectified
 
 
-def rectification(
-    calibration: StereoCalibration, frame_rate_hz: float, field_deg: float | None = None
-) -> Rectification:
+def rectification(calibration: StereoCalibration, frame_rate_hz: float, fov_deg: float | None = None) -> Rectification:
     """Returns the rectification for a calibration that states the size of the images.
 
     For a pair that was recorded rectified (`is_rectified`), the camera matrix is that of its left camera. Otherwise,
     the rotations are those of `cv2.stereoRectify` (Bouguet's method). The common camera matrix is that of the same
     function with alpha = 0 (all pixels of a rectified image lie in the recorded image) or, for other lenses than
-    "radtan" or with `field_deg`, the horizontal field of view of the rectified images, that of `_wide_matrix`. Raises
+    "radtan" or with `fov_deg`, the horizontal field of view of the rectified images, that of `_wide_matrix`. Raises
     TwinError if the views of the cameras do not overlap, or the field of view is not allowed.
     """
     left, right = calibration.left, calibration.right
     assert left.size_px is not None
-    if is_rectified(calibration):
-        if field_deg is not None:
-            raise TwinError("--field", "the images were recorded rectified", "images with distortion, or no --field")
+    recorded_deg, as_recorded = _field_deg(left), is_rectified(calibration)
+    if fov_deg is not None and (as_recorded or not 5 <= fov_deg <= min(recorded_deg, 160)):
+        allowed = "no value for a pair recorded rectified" if as_recorded else f"5 to {min(recorded_deg, 160):.0f} deg"
+        raise TwinError("--field", f"{fov_deg:g} deg", allowed)
+    if as_recorded:
         rig = _rig(left.matrix, calibration, left.size_px, frame_rate_hz)
         equal = np.abs(left.matrix - right.matrix).max() < _EQUAL_PX
         return Rectification(rig, np.eye(4), (None, None if equal else _maps(right, np.eye(3), rig)))
-    recorded_deg = _field_deg(left)
-    if field_deg is not None and not 5 <= field_deg <= min(recorded_deg, 160):
-        raise TwinError("--field", f"{field_deg:g} deg", f"5 to {min(recorded_deg, 160):.0f} deg")
-    wide = field_deg is not None or left.kind != "radtan" or right.kind != "radtan"
+    wide = fov_deg is not None or left.kind != "radtan" or right.kind != "radtan"
     lenses = [np.zeros(5) if wide else camera.distortion for camera in (left, right)]  # without effect on rotations
     turns = cv2.stereoRectify(
         left.matrix, lenses[0], right.matrix, lenses[1], left.size_px, calibration.right_from_left[:3, :3].copy(),
         calibration.right_from_left[:3, 3:].copy(), flags=cv2.CALIB_ZERO_DISPARITY, alpha=0.0,
     )[:3]  # fmt: skip
     left_turn, right_turn, projection = (np.asarray(turn, np.float64) for turn in turns)
-    matrix = _wide_matrix(calibration, (left_turn, right_turn), field_deg) if wide else projection[:, :3]
+    matrix = _wide_matrix(calibration, (left_turn, right_turn), fov_deg) if wide else projection[:, :3]
     if not (np.isfinite(matrix).all() and matrix[0, 0] > 1):
         raise TwinError(str(calibration.file), "the views of the two cameras do not overlap", "a stereo pair")
     rig = _rig(matrix, calibration, left.size_px, frame_rate_hz)
@@ -86,7 +83,7 @@ def rectification(
     return Rectification(rig, geometry.pose(left_turn.T, np.zeros(3)), maps, kept)
 
 
-def _wide_matrix(calibration: StereoCalibration, turns: tuple[Array, Array], field_deg: float | None) -> Array:
+def _wide_matrix(calibration: StereoCalibration, turns: tuple[Array, Array], fov_deg: float | None) -> Array:
     """Returns the common camera matrix (3, 3) of lenses of any model; not finite if the views do not overlap.
 
     By default, the focal length keeps `_KEPT` of the resolution at the centre (an image of the same size that holds all
@@ -106,8 +103,8 @@ def _wide_matrix(calibration: StereoCalibration, turns: tuple[Array, Array], fie
         pixels = np.vstack([camera.project(rays @ turn) for camera, turn in zip(cameras, turns, strict=True)])
         return bool(((pixels > -0.5) & (pixels < [width_px - 0.5, height_px - 0.5])).all())
 
-    if field_deg is not None:
-        return matrix(width_px / 2 / math.tan(math.radians(field_deg) / 2))
+    if fov_deg is not None:
+        return matrix(width_px / 2 / math.tan(math.radians(fov_deg) / 2))
     focals_px = max(map(_centre_focal_px, cameras)) * np.geomspace(_KEPT, 4, 200)
     return matrix(next(filter(inside, focals_px.tolist()), math.nan))
 
