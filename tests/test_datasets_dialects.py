@@ -380,8 +380,9 @@ def test_the_lens_models_are_those_of_opencv(kind):
     lens = np.array(RADTAN8 if kind == "radtan" else FISHEYE)
     project = cv2.projectPoints if kind == "radtan" else cv2.fisheye.projectPoints
     expected = project(points()[:, None], np.zeros(3), np.zeros(3), MATRICES[0], lens)[0].reshape(-1, 2)
-    found = RecordedCamera(SIZE, MATRICES[0], lens, kind).project(points())
-    np.testing.assert_allclose(found, expected, atol=1e-9)
+    camera = RecordedCamera(SIZE, MATRICES[0], lens, kind)
+    np.testing.assert_allclose(camera.project(points()), expected, atol=1e-9)
+    assert camera.project(np.zeros((0, 3))).shape == (0, 2)
 
 
 def wide_rig(kind="fisheye", across_deg=170.0, lens=(0.0, 0.0, 0.0, 0.0)):

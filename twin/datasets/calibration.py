@@ -47,9 +47,9 @@ class RecordedCamera:
         (double sphere); the last two also hold beyond 90 degrees from the optical axis.
         """
         if self.kind == "radtan":
-            zero, points = np.zeros(3), np.ascontiguousarray(points_m)
-            pixels = cv2.projectPoints(points, zero, zero, self.matrix, self.distortion)[0]
-            return np.asarray(pixels, np.float64).reshape(-1, 2)
+            points = np.vstack([points_m, [0, 0, 1]])  # OpenCV needs at least one
+            pixels = cv2.projectPoints(points, np.zeros(3), np.zeros(3), self.matrix, self.distortion)[0]
+            return np.asarray(pixels, np.float64).reshape(-1, 2)[:-1]
         x, y, z = points_m.T
         r = np.hypot(x, y)
         if self.kind == "fisheye":
