@@ -337,6 +337,12 @@ def text(name, content):
     return write
 
 
+def without(key, file):
+    """Removes the lines of a key from a file."""
+    file.write_text(re.sub(rf"(?m)^( *){key}:.*\n(\1( +|- ).*\n)*", "", file.read_text()))
+    return file
+
+
 REFUSED = {
     "VINS MEI": (lambda folder: vins(folder, "radtan", model_type="MEI"), "camera model 'MEI'"),
     "VINS with a mirror": (lambda folder: vins(folder, "radtan", mirror_parameters={"xi": 1.9}), "'mirror_parameters'"),
@@ -346,6 +352,14 @@ REFUSED = {
     "Kalibr key": (lambda folder: kalibr(folder, "radtan", line_delay=1e-5), "'line_delay'"),
     "OKVIS key": (lambda folder: okvis(folder, "radtan", xi=1.0), "'xi'"),
     "OKVIS pose": (lambda folder: okvis(folder, "radtan", T_SC=[2.0] + [0.0] * 15), "T_SC is not a rotation matrix"),
+    "OKVIS by columns": (
+        lambda folder: okvis(folder, "radtan", T_SC=BODY_FROM_LEFT.T.ravel().tolist()), "T_SC .*no pose by rows",
+    ),
+    "OKVIS without a model": (lambda folder: okvis(folder, "fisheye", distortion_type=None), "model 'missing'"),
+    "Kalibr without a model": (lambda folder: without("distortion_model", kalibr(folder, "fisheye")), "without a mod"),
+    "Kalibr without a lens": (lambda folder: without("distortion_coeffs", kalibr(folder, "radtan")), "without coeffi"),
+    "ROS without a model": (lambda folder: without("distortion_model", ros(folder, "fisheye")), "model 'missing'"),
+    "a number of 400 digits": (lambda folder: okvis(folder, "radtan", T_SC=[10**400] * 16), "T_SC is missing"),
     "maplab": (text("a.yaml", "cameras:\n- camera: {type: pinhole}\n- camera: {}"), "'camera'"),
     "Basalt eucm": (lambda folder: basalt(folder, "ds", "eucm", ("alpha", "beta")), "camera model 'eucm'"),
     "Basalt key": (lambda folder: basalt(folder, "none", "pinhole", (), scale=2), "'scale'"),

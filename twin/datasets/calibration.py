@@ -169,8 +169,9 @@ def rigid(pose: Array, key: str, file: Path) -> Array:
     The rounding of calibration files is allowed.
     """
     deviation = np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() if np.isfinite(pose).all() else np.inf
+    deviation = max(deviation, np.abs(pose[3] - [0, 0, 0, 1]).max())
     if not (deviation < _ORTHONORMAL and np.linalg.det(pose[:3, :3]) > 0):
-        raise TwinError(str(file), f"{key} is not a rotation matrix", "a rotation matrix; a pose has a translation [m]")
+        raise TwinError(str(file), f"{key} is not a rotation matrix, or no pose by rows", "[R, t], [0, 0, 0, 1]")
     return geometry.nearest_rigid(pose)
 
 
@@ -213,7 +214,9 @@ def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> Array:
 
 def distortion_kind(name: Any, file: Path) -> Any:
     """Returns "radtan" or "fisheye" for a lens model such as "plumb_bob"; raises TwinError if it is not supported."""
-    text = str(name).lower().replace("radial-t", "radialt").replace("tial8", "tial")  # OKVIS: of 8 coefficients
+    text = (
+        "missing" if name is None else str(name).lower().replace("radial-t", "radialt").replace("tial8", "tial")
+    )  # OKVIS: of 8 coefficients
     if text in _FISHEYE or text in _RADTAN:
         return "fisheye" if text in _FISHEYE else "radtan"
     raise TwinError(str(file), f"distortion model {text[:40]!r} is not supported", "radtan or equidistant (fisheye)")

@@ -35,7 +35,7 @@ def numbers_of(value: Any, file: Path, key: str, shape: tuple[int, ...] | None =
     value = value.get("data") if isinstance(value, Mapping) else value
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.array(np.nan)
     count = None if shape is None else int(np.prod(shape))
     if value is None or not (np.abs(array) < _LARGEST).all() or (count is not None and array.size != count):

@@ -48,6 +48,9 @@ def rig_of(cameras: Sequence[RecordedCamera], poses: Sequence[Any], key: str, fi
 def camera_of(table: Any, file: Path) -> RecordedCamera:
     """Returns the camera in a table of a camchain or EuRoC sensor.yaml; raises TwinError for a wrong value or model."""
     table = table_of(table, file)
+    if ("distortion_model" in table) != any(name in table for name in _COEFFICIENTS):
+        problem = "has a distortion model without coefficients, or coefficients without a model"
+        raise TwinError(str(file), problem, "both or none of distortion_model and distortion_coeffs")
     coefficients = next((table[name] for name in _COEFFICIENTS if name in table), None)
     refuse_unknown((key for key in table if key not in _READ + _IRRELEVANT), file)
     size = size_of(table.get("resolution"), file)

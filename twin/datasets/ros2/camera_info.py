@@ -96,6 +96,6 @@ def _read_message(file: Path) -> SimpleNamespace:
     numbers = {name: numbers_of(tree.get(key), file, key, shape).ravel() for name, (key, shape) in _NUMBERS.items()}
     width, height = numbers_of([tree.get(key) for key in _SIZE_KEYS], file, "the image size", (2,)).astype(int)
     return SimpleNamespace(
-        **numbers, width=width, height=height, distortion_model=tree.get("distortion_model"),
+        **numbers, width=width, height=height, distortion_model=tree.get("distortion_model") or "missing",
         roi=SimpleNamespace(width=0, height=0), binning_x=0, binning_y=0,
     )  # fmt: skip
