@@ -196,7 +196,7 @@ def test_an_attitude_precedes_an_imu_and_heights_need_either(tmp_path):
         (r"gyroscope_noise_density: .*", "", "The readings in imu0 are not used: .* `gyroscope_noise_density`"),
         (r"gyroscope_random_walk: .*", "gyroscope_random_walk: -1", r"gyroscope_random_walk: '-1' is not .* 0 to"),
         (r"accelerometer_bias_sigma: .*", "accelerometer_bias_sigma: big", r"accelerometer_bias_sigma: 'big' is not"),
-        (r"data: \[1.0", "data: [3.0", r"T_BS: is not a rigid motion"),
+        (r"data: \[1.0", "data: [3.0", r"T_BS is not a rotation matrix"),
     ],
 )  # fmt: skip
 def test_a_bad_description_of_an_imu_is_named(tmp_path, old, new, message):

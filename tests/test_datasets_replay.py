@@ -282,6 +282,56 @@ def test_swapped_images_and_swapped_calibrations_are_named(frames, tmp_path):
         open_dataset(folder, ReplayOptions(calibration=turned))
 
 
+def recorded_unrectified(frame, folder):
+    """Writes a pair as two tilted cameras with distortion record it, and their calibration."""
+    lens, tilts = np.array([-0.2, 0.05, 0.0, 0.0, 0.0]), [geometry.so3_exp(np.array([s, 0, 0])) for s in (0.03, -0.03)]
+    images = []
+    for image, tilt in zip((frame.left, frame.right), tilts, strict=True):
+        pixels = np.indices(image.shape[:2])[::-1].reshape(2, 1, -1).T.astype(np.float32)
+        at = cv2.undistortPoints(pixels, RIG.matrix, lens, R=tilt.T, P=RIG.matrix).reshape(*image.shape[:2], 2)
+        images.append(cv2.remap(image, at, None, cv2.INTER_CUBIC))
+    recorded.write_folder(folder, [replace(frame, left=images[0], right=images[1])])
+    rotation = tilts[1] @ tilts[0].T
+    shift = tilts[1] @ np.array([[-RIG.baseline_m], [0], [0]])
+    recorded.write_opencv(folder / "calibration.yaml", D1=lens, D2=lens, R=rotation, T=shift)
+    return folder
+
+
+def test_swapped_images_of_an_unrectified_rig_are_named(frames, tmp_path):
+    folder = recorded_unrectified(frames[0], tmp_path / "set")
+    assert len(open_dataset(folder, ReplayOptions()).pair.points.xyz) > 100
+    (folder / "left").rename(folder / "other")
+    (folder / "right").rename(folder / "left")
+    (folder / "other").rename(folder / "right")
+    with pytest.raises(TwinError, match="the left and the right images are swapped"):
+        open_dataset(folder, ReplayOptions())
+
+
+def test_a_list_in_reverse_order_is_replayed_in_the_order_of_time(euroc, tmp_path):
+    folder = tmp_path / "set"
+    shutil.copytree(euroc, folder)
+    for camera in ("cam0", "cam1"):
+        file = folder / "mav0" / camera / "data.csv"
+        header, *rows = file.read_text().splitlines()
+        file.write_text("\n".join([header, *rows[::-1], ""]))
+    opened, expected = (open_dataset(one, ReplayOptions()) for one in (folder, euroc))
+    assert "reverse order" in opened.dataset.notes[-1]
+    for found, given in zip(opened.frames, expected.frames, strict=True):
+        assert found.time_s == given.time_s and np.array_equal(found.left, given.left)
+
+
+def test_a_baseline_in_the_wrong_unit_is_asked_for_and_a_depth_of_another_scale_remarked(frames, tmp_path):
+    folder = recorded.write_folder(tmp_path / "set", frames[:1])
+    recorded.write_opencv(folder / "calibration.yaml", T=np.array([-150 / 25.4, 0, 0]))  # in inches
+    with pytest.raises(TwinError, match=r"calibration.yaml: the baseline is 5.9.* m .*--baseline"):
+        open_dataset(folder, ReplayOptions())
+    opened = open_dataset(folder, ReplayOptions(baseline_m=RIG.baseline_m))
+    assert opened.frames.rectification.rig.baseline_m == pytest.approx(RIG.baseline_m) and opened.depth_note == ""
+    far = open_dataset(folder, ReplayOptions(baseline_m=RIG.baseline_m / 0.0254))
+    table = {row[0]: row[1:] for row in preview.rows(far, preview.light_of(far))}
+    assert "implausible under water" in table["depth"][1] and "--baseline" in table["depth"][1]
+
+
 @pytest.mark.parametrize("damage", ["not a calibration", "negative baseline", "two files"])
 def test_a_given_calibration_replaces_one_of_the_folder_that_cannot_be_used(frames, tmp_path, damage):
     folder = recorded.write_folder(tmp_path / "set", frames[:1])

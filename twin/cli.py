@@ -410,6 +410,8 @@ def replay(
     baseline_sigma: Annotated[
         float | None, option("The same of the distance between the cameras; estimates the baseline.", "MM")
     ] = None,
+    baseline: Annotated[float | None, option("Distance between the cameras. Default: the calibration's.", "M")] = None,
+    field: Annotated[float | None, option("Horizontal field of view of the rectified images.", "DEG")] = None,
     as_json: MetricsJson = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
@@ -424,6 +426,7 @@ def replay(
         topics=recorded.image_topics(topics), estimator=estimator, aiding=aiding, true_map=true_map,
         rotation_sigma_deg=rotation_sigma, baseline_sigma_mm=baseline_sigma, imu=imu,
         frames=recorded.frame_numbers(frames),
+        baseline_m=baseline, fov_deg=field,
     )  # fmt: skip
     name = outputs.path_stem(dataset)
     if preview:

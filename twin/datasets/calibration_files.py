@@ -1,22 +1,18 @@
-"""Calibration files of other programs: OpenCV, Kalibr camchain, ROS camera_info, ORB-SLAM3, COLMAP cameras.txt.
+"""Calibration files of other programs (`READ`): the file is recognised by its suffix and its keys.
 
 An unknown key is refused: a dropped one (a distortion under another name) leaves a wrong calibration that looks right.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-
-from twin.core import geometry
-from twin.datasets import colmap, kalibr, opencv_calibration
-from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix, checked, distortion_kind
-from twin.datasets.calibration_values import READ, numbers_of, refuse_unknown, size_of
+from twin.datasets import colmap, kalibr, matlab_calibration, metashape, opencv_calibration, vio_calibration
+from twin.datasets.calibration import StereoCalibration, checked
+from twin.datasets.calibration_values import READ, refuse_unknown
 from twin.datasets.ros2.camera_info import read_pair
 from twin.datasets.run_contents import RunContents
 from twin.datasets.text_files import read_text, read_yaml
@@ -24,21 +20,11 @@ from twin.errors import TwinError
 
 #: Keys by which files of other programs are recognised that are not read.
 _DIALECTS = {
-    "projection_parameters": "VINS (CamOdoCal)",
-    "body_T_cam0": "VINS",
-    "parameters": "Calibmar",
+    "projection_parameters": "one camera of VINS (CamOdoCal); give the file with body_T_cam0 and body_T_cam1",
+    "parameters": "one camera of Calibmar",
     "Camera.fx": "ORB-SLAM2 or a single camera of ORB-SLAM3",
     "T_BS": "one camera of an ASL data set (sensor.yaml)",
 }
-#: Lens models of ORB-SLAM3 by Camera.type, with their coefficients.
-_ORBSLAM = {
-    "PinHole": ("radtan", ("k1", "k2", "p1", "p2", "k3")),
-    "KannalaBrandt8": ("fisheye", ("k1", "k2", "k3", "k4")),
-}
-_ORBSLAM_IRRELEVANT = re.compile(
-    r"(File|IMU|ORBextractor|Viewer|System|LoopClosing)\..*|loopClosing|Stereo\.ThDepth|Camera\.(fps|RGB|imageScale"
-    r"|newWidth|newHeight)|Camera[12]\.overlapping(Begin|End)"
-)
 
 
 def read_calibration(file: Path) -> StereoCalibration:
@@ -60,7 +46,10 @@ def read_calibration(file: Path) -> StereoCalibration:
     return checked(opencv_calibration.read_opencv(tree, file))
 
 
-def _read_tree(file: Path) -> Mapping[str, Any]:
+def _read_tree(file: Path) -> Mapping[Any, Any]:
+    """Returns the keys and values of a file; the root element of an XML file of Metashape has the key `Element`."""
+    if file.suffix.lower() == ".mat":
+        raise TwinError(str(file), "is a MAT-file, which is not read", "JSON: jsonencode(toStruct(stereoParams))")
     if file.suffix.lower() != ".xml":
         return read_yaml(file)  # JSON is YAML
     text = read_text(file, 2**20)
@@ -68,8 +57,10 @@ def _read_tree(file: Path) -> Mapping[str, Any]:
         root = None if "<!" in text.replace("<!--", "") else ElementTree.fromstring(text)
     except ElementTree.ParseError:
         root = None
-    if root is None or root.tag != "opencv_storage":
-        raise TwinError(str(file), "is not valid XML of OpenCV", "<opencv_storage> without a document type")
+    if root is None or root.tag not in ("opencv_storage", *metashape.ROOTS):
+        raise TwinError(str(file), "is not valid XML of OpenCV or Metashape", "XML without a document type")
+    if root.tag in metashape.ROOTS:
+        return {ElementTree.Element: root}
     values = {child.tag: (child.findtext("data") or child.text or "").split() for child in root}
     refuse_unknown([child.tag for child in root][len(values) :], file)  # not empty if tags are repeated
     return {key: value[0] if len(value) == 1 else value for key, value in values.items()}
@@ -95,27 +86,13 @@ def find_calibration(folder: Path) -> Path | None:
     return found[0] if found else None
 
 
-def _orbslam(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of an ORB-SLAM3 file; Stereo.T_c1_c2 is the pose of the right camera in the left one."""
-    if (model := str(tree.get("Camera.type"))) not in _ORBSLAM:
-        raise TwinError(str(file), f"Camera.type {model[:40]!r} is not supported", ", ".join(_ORBSLAM))
-    kind, names = _ORBSLAM[model]
-    keys = [[f"Camera{k}.{name}" for name in ("fx", "fy", "cx", "cy", *names)] for k in (1, 2)]
-    size = ["Camera.width", "Camera.height"]
-    known = {*keys[0], *keys[1], *size, "Camera.type", "Stereo.T_c1_c2"}
-    refuse_unknown((key for key in tree if key not in known and not _ORBSLAM_IRRELEVANT.fullmatch(str(key))), file)
-    size_px = size_of([tree.get(key) for key in size], file)
-    cameras = []
-    for camera in keys:
-        fx, fy, cx, cy, *lens = (float(numbers_of(tree.get(key, 0.0), file, key, ())) for key in camera)
-        matrix = camera_matrix(fx, fy, cx, cy)
-        cameras.append(RecordedCamera(size_px, matrix, np.array(lens), distortion_kind(kind, file)))
-    left_from_right = numbers_of(tree.get("Stereo.T_c1_c2"), file, "Stereo.T_c1_c2", (4, 4))
-    return StereoCalibration(cameras[0], cameras[1], geometry.inverse(left_from_right), file)
-
-
 #: Readers of files, by a key by which each is recognised.
-_PROGRAMS = {"cam0": kalibr.read_camchain, "projection_matrix": read_pair, "Camera1.fx": _orbslam}
+_PROGRAMS = {
+    "cam0": kalibr.read_camchain, "projection_matrix": read_pair, "Camera1.fx": vio_calibration.read_orbslam,
+    "cameras": vio_calibration.read_okvis, "body_T_cam0": vio_calibration.read_vins,
+    "value0": vio_calibration.read_basalt, "CameraParameters1": matlab_calibration.read_struct,
+    ElementTree.Element: lambda tree, file: metashape.read_cameras(tree[ElementTree.Element], file),
+}  # fmt: skip
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:

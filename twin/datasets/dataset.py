@@ -127,7 +127,8 @@ def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple
     """Returns the frames of two cameras with a common clock, and the number of right images that belong to no frame.
 
     There is one frame per left image, in their order. Its right image is the one nearest in time, if the times differ
-    by at most 10 ms and by at most a quarter of the median interval between left images; otherwise it has none.
+    by at most 10 ms and by at most a quarter of the median interval between left images; otherwise it has none. Raises
+    TwinError if no left image has one.
     """
     if not left or not right:
         return [StereoImages(*one, None) for one in left], len(right)
@@ -136,7 +137,11 @@ def pair_by_time(left: Sequence[ImageTime], right: Sequence[ImageTime]) -> tuple
     nearest = order[nearest_index(right_s[order], left_s)]
     intervals = np.abs(np.diff(left_s))
     limit_s = min(_PAIR_MOST_S, _PAIR_SHARE * float(np.median(intervals)) if len(intervals) else _PAIR_MOST_S)
-    paired = np.abs(right_s[nearest] - left_s) <= limit_s
+    gaps_s = np.abs(right_s[nearest] - left_s)
+    paired = gaps_s <= limit_s
+    if not paired.any():
+        problem = f"those of the two cameras differ by {1000 * np.median(gaps_s):.4g} ms (median)"
+        raise TwinError("times of the images", problem, f"stereo pairs with times up to {1000 * limit_s:.4g} ms apart")
     frames = [
         StereoImages(one.time_s, one.file, right[int(k)].file if ok else None)
         for one, k, ok in zip(left, nearest, paired, strict=True)

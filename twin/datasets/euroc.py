@@ -16,7 +16,7 @@ import numpy as np
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import StereoRig, Trajectory
-from twin.datasets.calibration import SIGMAS, StereoCalibration, checked, is_rigid
+from twin.datasets.calibration import SIGMAS, StereoCalibration, checked, rigid
 from twin.datasets.calibration_values import numbers_of, table_of
 from twin.datasets.dataset import Dataset, ImageTime, pair_by_time, trajectory_of, value_or_error
 from twin.datasets.image_copy import copy_images
@@ -112,10 +112,7 @@ def _body_from_left(root: Path) -> Array | None:
     file = root / "cam0" / "sensor.yaml"
     if not file.is_file():
         return None
-    pose = pose_of(read_yaml(file), "T_BS", file)
-    if not is_rigid(pose):
-        raise TwinError(str(file), "T_BS is not a rigid motion", "a rotation matrix and a translation [m]")
-    return geometry.nearest_rigid(pose)
+    return rigid(pose_of(read_yaml(file), "T_BS", file), "T_BS", file)
 
 
 def export(contents: RunContents, folder: Path) -> list[Path]:

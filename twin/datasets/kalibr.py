@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix, distortion_kind
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, camera_matrix, distortion_kind, rigid
 from twin.datasets.calibration_values import numbers_of, refuse_unknown, size_of, table_of
 from twin.datasets.run_contents import RecordedImu
 from twin.errors import TwinError
@@ -19,31 +20,49 @@ from twin.errors import TwinError
 _COEFFICIENTS = "distortion_coeffs", "distortion_coefficients"  # of Kalibr, and of sensor.yaml in EuRoC folders
 _READ = ("camera_model", "intrinsics", "distortion_model", "resolution", *_COEFFICIENTS)
 _IRRELEVANT = (
-    "cam_overlaps", "rostopic", "T_cam_imu", "timeshift_cam_imu", "sensor_type", "comment", "camera_id", "rate_hz",
-    "T_BS", "T_cn_cnm1",
+    "cam_overlaps", "rostopic", "T_cam_imu", "T_imu_cam", "timeshift_cam_imu", "sensor_type", "comment", "camera_id",
+    "rate_hz", "T_BS", "T_cn_cnm1",
 )  # fmt: skip
 
 
 def read_camchain(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
-    """Returns the calibration of a camchain; raises TwinError without cam1, or if a camera or T_cn_cnm1 is wrong."""
+    """Returns the calibration of a camchain, by T_cn_cnm1 or, without it, by T_imu_cam of both cameras (OpenVINS).
+
+    Raises TwinError without cam1, or if a camera or a pose is wrong.
+    """
     if "cam1" not in tree:
         raise TwinError(str(file), "has one camera only, so it has no baseline", "cam0 and cam1 with T_cn_cnm1")
     refuse_unknown((key for key in tree if not re.fullmatch(r"cam\d", str(key))), file)
     left, right = (camera_of(tree[name], file) for name in ("cam0", "cam1"))
+    if "T_cn_cnm1" not in tree["cam1"] and "T_imu_cam" in tree["cam1"]:
+        return rig_of([left, right], [tree[name].get("T_imu_cam") for name in ("cam0", "cam1")], "T_imu_cam", file)
     return StereoCalibration(left, right, pose_of(tree["cam1"], "T_cn_cnm1", file), file)
+
+
+def rig_of(cameras: Sequence[RecordedCamera], poses: Sequence[Any], key: str, file: Path) -> StereoCalibration:
+    """Returns the rig of two cameras, given the pose of each in common axes, under `key` in the file."""
+    left, right = (rigid(numbers_of(pose, file, key, (4, 4)), key, file) for pose in poses)
+    return StereoCalibration(cameras[0], cameras[1], geometry.inverse(right) @ left, file)
 
 
 def camera_of(table: Any, file: Path) -> RecordedCamera:
     """Returns the camera in a table of a camchain or EuRoC sensor.yaml; raises TwinError for a wrong value or model."""
     table = table_of(table, file)
-    if (model := table.get("camera_model", "pinhole")) != "pinhole":
-        raise TwinError(str(file), f"camera model {model!r} is not supported", "pinhole with radtan or equidistant")
+    if ("distortion_model" in table) != any(name in table for name in _COEFFICIENTS):
+        problem = "has a distortion model without coefficients, or coefficients without a model"
+        raise TwinError(str(file), problem, "both or none of distortion_model and distortion_coeffs")
     coefficients = next((table[name] for name in _COEFFICIENTS if name in table), None)
     refuse_unknown((key for key in table if key not in _READ + _IRRELEVANT), file)
-    fx, fy, cx, cy = numbers_of(table.get("intrinsics"), file, "intrinsics", (4,))
+    size = size_of(table.get("resolution"), file)
+    if (model := str(table.get("camera_model", "pinhole"))) not in ("pinhole", "ds"):
+        allowed = "pinhole with radtan or equidistant, ds"
+        raise TwinError(str(file), f"camera model {model[:40]!r} is not supported", allowed)
+    *sphere, fx, fy, cx, cy = numbers_of(table.get("intrinsics"), file, "intrinsics", (6 if model == "ds" else 4,))
+    if sphere:
+        return RecordedCamera(size, camera_matrix(fx, fy, cx, cy), np.array(sphere), "double_sphere")
     distortion = numbers_of([] if coefficients is None else coefficients, file, "distortion_coeffs").ravel()
     kind = distortion_kind(table.get("distortion_model", "radtan"), file)
-    return RecordedCamera(size_of(table.get("resolution"), file), camera_matrix(fx, fy, cx, cy), distortion, kind)
+    return RecordedCamera(size, camera_matrix(fx, fy, cx, cy), distortion, kind)
 
 
 def pose_of(table: Any, key: str, file: Path) -> Array:

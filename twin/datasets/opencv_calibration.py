@@ -14,9 +14,8 @@ import cv2
 import numpy as np
 
 from twin.core import geometry
-from twin.core.geometry import Array
 from twin.datasets.calibration import RecordedCamera, StereoCalibration, distortion_kind
-from twin.datasets.calibration_values import numbers_of, refuse_unknown, size_of
+from twin.datasets.calibration_values import metres_of, numbers_of, refuse_unknown, size_of
 from twin.errors import TwinError
 
 
@@ -40,8 +39,6 @@ _IRRELEVANT = re.compile(
     "[rp][12]|[qef]|(valid)?(pix)?roi[12]?|.*(rms|errors?)|residual.*|.*date|.*time|comment|flags?(value)?|n(r?of)?frames.*|board.*"
     "|square.*"
 )
-_UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254}
-_LONGEST_UNASKED_M = 1.0  # longest baseline of a file without T_unit: its T may be in squares of the board
 _TANGENTIAL = 0.05  # largest tangential coefficients of a lens without a stated model, as a fraction of k1
 
 
@@ -50,7 +47,7 @@ def read_opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
 
     R may be a rotation matrix or a rotation vector; without R, the cameras are parallel; without D1 or D2, its camera
     has no distortion. T is in metres or in T_unit. Raises TwinError if M1, M2 or T is missing, a key is unknown, a
-    value is not of the expected form, the lens model is not supported or has to be stated, or T may have another unit.
+    value is not of the expected form, or the lens model is not supported or has to be stated.
     """
     keys = {re.sub(r"[\W_]", "", str(key)).lower(): key for key in tree}
     found = {role: next((keys.pop(name) for name in names if name in keys), None) for role, names in _KEYS.items()}
@@ -74,8 +71,9 @@ def read_opencv(tree: Mapping[str, Any], file: Path) -> StereoCalibration:
     rotation = geometry.so3_exp(rotation.ravel()) if rotation.size == 3 else rotation
     if rotation.size != 9:
         raise TwinError(str(file), f"R has {rotation.size} numbers", "a rotation matrix or a rotation vector")
-    translation = _in_metres(numbers_of(value["T"], file, "T", (3,)), value["unit"], file)
-    return StereoCalibration(cameras[0], cameras[1], geometry.pose(rotation.reshape(3, 3), translation), file)
+    metres, unit = (1.0, "assumed") if found["unit"] is None else (metres_of(value["unit"], "T_unit", file), "stated")
+    pose = geometry.pose(rotation.reshape(3, 3), metres * numbers_of(value["T"], file, "T", (3,)))
+    return StereoCalibration(cameras[0], cameras[1], pose, file, unit=unit)
 
 
 def _ask_for_model(cameras: list[RecordedCamera], file: Path) -> None:
@@ -86,16 +84,6 @@ def _ask_for_model(cameras: list[RecordedCamera], file: Path) -> None:
             if not 0 < tangential <= _TANGENTIAL * abs(camera.distortion[0]):
                 problem = "four coefficients of distortion may be those of a fisheye lens (k1 to k4) or k1, k2, p1, p2"
                 raise TwinError(str(file), problem, "a key distortion_model: fisheye or radtan")
-
-
-def _in_metres(translation: Array, unit: Any, file: Path) -> Array:
-    if unit is not None and str(unit) not in _UNITS_M:
-        raise TwinError(str(file), f"T_unit {str(unit)[:40]!r} is not known", ", ".join(_UNITS_M))
-    length_m = float(np.linalg.norm(translation))
-    if unit is None and length_m > _LONGEST_UNASKED_M:
-        allowed = f"up to {_LONGEST_UNASKED_M:g} m; units are metres, or those of a key T_unit: {', '.join(_UNITS_M)}"
-        raise TwinError(str(file), f"the baseline is {length_m:g} m (in mm, inches or squares of a board?)", allowed)
-    return translation * _UNITS_M[str(unit or "m")]
 
 
 def write_opencv(file: Path, rig: StereoCalibration) -> None:

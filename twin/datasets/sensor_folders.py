@@ -16,6 +16,7 @@ import yaml
 from twin.core.geometry import Array
 from twin.core.records import ImuErrorModel
 from twin.datasets import readings
+from twin.datasets.calibration import rigid
 from twin.datasets.kalibr import pose_of
 from twin.datasets.readings import RecordedReadings, SensorQuantity, SensorSeries
 from twin.datasets.run_contents import RecordedImu, RunContents
@@ -112,9 +113,7 @@ def _read_imu(folder: Path, notes: list[str]) -> tuple[SensorSeries, Array, ImuE
     rate, walk, force = (_deviation(tree, name, description) for name in _DENSITIES)
     bias = readings.USUAL_BIAS_MPS2 if tree.get(_BIAS) is None else _deviation(tree, _BIAS, description)
     walks = readings.USUAL_FORCE_WALK if tree.get(_WALK) is None else _deviation(tree, _WALK, description)
-    pose = pose_of(tree, "T_BS", description) if "T_BS" in tree else np.eye(4)
-    if not np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-3):
-        raise TwinError(f"{description}: T_BS", "is not a rigid motion", "a rotation matrix and a translation [m]")
+    pose = rigid(pose_of(tree, "T_BS", description), "T_BS", description) if "T_BS" in tree else np.eye(4)
     inertial = _read_csv(file, readings.INERTIAL, np.ones(readings.INERTIAL.n), notes)
     if inertial is None:
         return None

@@ -30,15 +30,17 @@ class RecordedFrames:
     are skipped (`increasing`). `skipped` counts frames and right images that could not be used, by reason, while they
     are read.
 
-    Raises TwinError if no left image can be read, the calibration does not fit the images or cannot be rectified, or a
-    Bayer pattern is given for images that have colours.
+    Raises TwinError if no left image can be read, the calibration does not fit the images or cannot be rectified with
+    the field of view, or a Bayer pattern is given for images that have colours.
     """
 
-    def __init__(self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None):
+    def __init__(
+        self, dataset: Dataset, calibration: StereoCalibration, bayer: Bayer | None = None, fov_deg: float | None = None
+    ):
         self.dataset = dataset
         self.size_px = _usual_size(dataset)
         sized = calibration.for_images(*self.size_px)
-        self.rectification: Rectification = rectification(sized, _frame_rate_hz(dataset))
+        self.rectification: Rectification = rectification(sized, _frame_rate_hz(dataset), fov_deg)
         sources = [*(frame.left for frame in dataset.images), *(f.right for f in dataset.images if f.right is not None)]
         self._format = image_format(sources, self.size_px, bayer)
         self._in_order = increasing(np.array([frame.time_s for frame in dataset.images]))

@@ -16,7 +16,7 @@ from twin.core.user_files import is_file, resolved
 from twin.datasets.calibration import SIGMAS, StereoCalibration
 from twin.datasets.calibration_files import read_calibration
 from twin.datasets.calibration_values import READ
-from twin.datasets.dataset import Dataset
+from twin.datasets.dataset import Dataset, StereoImages
 from twin.datasets.image_files import Bayer
 from twin.datasets.readers import read_dataset
 from twin.datasets.ros2.bag import is_bag
@@ -25,10 +25,12 @@ from twin.datasets.truth_files import read_true_map, read_truth
 from twin.errors import TwinError
 from twin.estimate.first_pair import FloorPlane, PairInspection, floor_plane, inspect_pair
 from twin.judge.recorded import AlignmentName, TrueMap, associate
-from twin.recordings.frames import RecordedFrames
+from twin.recordings.frames import RecordedFrames, increasing
 from twin.recordings.recorded_aiding import Aiding
+from twin.report.number_formats import length
 from twin.report.run_writer import OPTIONAL_OUTPUTS
 
+_DEPTHS_M = 0.1, 30.0  # plausible median depths of images under water
 _FARTHEST_M = 1e8  # largest coordinate of a true position; in UTM and ECEF they are up to 1e7 m
 
 T = TypeVar("T")
@@ -59,6 +61,8 @@ class ReplayOptions:
             and of the baseline since the calibration; above 0, yaw and baseline are estimated. None: those of the data
             set, which are 0 unless the twin exported it.
         frames: frames of the data set that are used, by their numbers from 0 in the order of its list.
+        baseline_m: distance between the cameras, for a calibration in other units than metres; None: its own.
+        fov_deg: horizontal field of view of the rectified images; None: that of `rectification`.
     """
 
     calibration: Path | None = None
@@ -76,6 +80,8 @@ class ReplayOptions:
     baseline_sigma_mm: float | None = None
     imu: bool = False
     frames: slice = field(default_factory=lambda: slice(None))
+    baseline_m: float | None = None
+    fov_deg: float | None = None
 
     def with_sigmas(self, calibration: StereoCalibration) -> StereoCalibration:
         """Returns a calibration with the standard deviations that are given; raises TwinError if one is not valid."""
@@ -104,6 +110,15 @@ class OpenedDataset(NamedTuple):
         return [] if self.aiding is None else self.aiding.used
 
     @property
+    def depth_note(self) -> str:
+        """Returns a sentence on a depth that images under water cannot have; "" for any other depth."""
+        depth_m, baseline_m = float(np.median(self.pair.points.xyz[:, 2])), self.pair.rig.baseline_m
+        if _DEPTHS_M[0] <= depth_m <= _DEPTHS_M[1]:
+            return ""
+        problem = f"A median depth of {length(depth_m)} in the first pair is implausible under water"
+        return f"{problem}: check the unit of the baseline ({length(baseline_m)}, --baseline)."
+
+    @property
     def plane_text(self) -> str:
         """Returns a phrase that states how the plane of the map was chosen; a start in the options is ignored."""
         if "attitude" in self.used_readings:
@@ -122,6 +137,7 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     """
     in_bag = options.truth is not None and is_bag(folder) and not is_file(options.truth)
     dataset, reader = read_dataset(folder, BagTopics(options.topics, str(options.truth) if in_bag else None))
+    dataset = _forward(dataset)
     if options.topics is not None and not is_bag(folder):
         raise TwinError("--topics", f"{folder} is not a ROS 2 bag", "no topics for other data sets")
     calibration = dataset.calibration if options.calibration is None else read_calibration(options.calibration)
@@ -130,13 +146,14 @@ def open_dataset(folder: Path, options: ReplayOptions) -> OpenedDataset:
     used = replace(dataset, images=dataset.images[options.frames])
     if not used.images:
         raise TwinError("--frames", "no frame of the data set is in this range", f"0 to {len(dataset.images) - 1}")
-    frames = RecordedFrames(used, options.with_sigmas(_sound(calibration)), options.bayer)
+    calibration = options.with_sigmas(_sound(calibration).with_baseline(options.baseline_m))
+    frames = RecordedFrames(used, calibration, options.bayer, options.fov_deg)
     truth = _truth(dataset, frames, None if in_bag else options.truth)
     pair = inspect_pair(frames.first_pair(), frames.rectification.rig, options.settings)
-    if pair.swapped:
+    plane = floor_plane(pair.points)
+    if pair.swapped or (plane is None and _fits_exchanged(frames, calibration, options)):
         problem = "the left and the right images are swapped, or both upside down: the disparities are negative"
         raise TwinError(str(folder), problem, "left images of the camera on the left")
-    plane = floor_plane(pair.points)
     if plane is None:
         problem = f"only {len(pair.points.xyz)} points of the first pair are matched"
         raise TwinError(str(folder), problem, "a rectified pair that fits the calibration; see `--preview`")
@@ -155,6 +172,24 @@ def _sound(value: T | TwinError) -> T:
     if isinstance(value, TwinError):
         raise value
     return value
+
+
+def _forward(dataset: Dataset) -> Dataset:
+    """Returns the data set in the order of time if its images are listed in the reverse order."""
+    times_s = np.array([frame.time_s for frame in dataset.images])
+    if increasing(times_s).sum() >= increasing(times_s[::-1]).sum():
+        return dataset
+    note = "The images are listed in the reverse order of time; they were replayed in the order of time."
+    return replace(dataset, images=dataset.images[::-1], notes=(*dataset.notes, note))
+
+
+def _fits_exchanged(frames: RecordedFrames, calibration: StereoCalibration, options: ReplayOptions) -> bool:
+    """Returns whether the first pair is matched if each image is rectified as that of the other camera."""
+    images = [StereoImages(one.time_s, one.right, one.left) for one in frames.dataset.images if one.right is not None]
+    dataset = replace(frames.dataset, images=images)
+    exchanged = RecordedFrames(dataset, calibration, options.bayer, options.fov_deg)
+    rig = exchanged.rectification.rig
+    return floor_plane(inspect_pair(exchanged.first_pair(), rig, options.settings).points) is not None
 
 
 def _true_map(dataset: Dataset, truth: Trajectory | None, options: ReplayOptions) -> TrueMap | None:

@@ -50,6 +50,7 @@ def draw(opened: OpenedDataset, light: LightInspection, file: Path) -> Path:
 def rows(opened: OpenedDataset, light: LightInspection) -> list[tuple[str, ...]]:
     """Returns the rows of a table of the properties of a data set and its first pair: name, value, remark."""
     pair, rig = opened.pair, opened.pair.rig
+    remark = f". {opened.depth_note}" if opened.depth_note else ""
     found = opened.frames
     depth_m = pair.points.xyz[:, 2]
     subtracted = "subtracted before dense matching" if light.subtracted else "not subtracted: the texture dominates"
@@ -65,7 +66,7 @@ def rows(opened: OpenedDataset, light: LightInspection) -> list[tuple[str, ...]]
          f"disparity at {percent(_known_share(pair.disparity.disparity_px))} of the pixels"),
         ("row difference", f"{np.median(pair.points.row_difference_px):+.2f} px", "median, right minus left"),
         ("depth", length(float(np.median(depth_m))), "median; 5th and 95th percentile "
-         + " and ".join(length(float(value)) for value in np.percentile(depth_m, [5, 95]))),
+         + " and ".join(length(float(value)) for value in np.percentile(depth_m, [5, 95])) + remark),
         ("light at the corners", "unknown" if np.isnan(corner_share) else f"{100 * corner_share:.0f} %",
          f"of the centre, left camera; {subtracted}"),
         ("right camera", f"{100 * right_share:.0f} %",

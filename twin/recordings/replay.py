@@ -177,6 +177,7 @@ class _Replayed:
     def _notes(self, result: SurveyResult) -> list[str]:
         aiding, estimator = self.opened.aiding, self.options.estimator
         notes = [*self.opened.dataset.notes, *result.quality.repeat_notes, *result.quality.reading_notes]
+        notes += [self.opened.depth_note] if self.opened.depth_note else []
         if estimator is not None:
             notes.append(NOTE.format(estimator))
         if aiding is not None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from twin.core import geometry
 from twin.core.geometry import Array
-from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked, distortion_kind
+from twin.datasets.calibration import RecordedCamera, StereoCalibration, checked, distortion_kind, rigid
 from twin.datasets.calibration_values import numbers_of, refuse_unknown
 from twin.datasets.text_files import read_yaml
 from twin.errors import TwinError
@@ -69,9 +69,7 @@ def _rotation(info: Any, file: Path) -> Array:
     rotation = np.array(info.r, float).reshape(3, 3)
     if not rotation.any():
         return np.eye(3)
-    if not np.isfinite(rotation).all() or np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3:
-        raise TwinError(str(file), "R is not a rotation matrix")
-    return geometry.nearest_rigid(geometry.pose(rotation, np.zeros(3)))[:3, :3]
+    return rigid(geometry.pose(rotation, np.zeros(3)), "R", file)[:3, :3]
 
 
 def _offset_m(info: Any, file: Path) -> float:
@@ -98,6 +96,6 @@ def _read_message(file: Path) -> SimpleNamespace:
     numbers = {name: numbers_of(tree.get(key), file, key, shape).ravel() for name, (key, shape) in _NUMBERS.items()}
     width, height = numbers_of([tree.get(key) for key in _SIZE_KEYS], file, "the image size", (2,)).astype(int)
     return SimpleNamespace(
-        **numbers, width=width, height=height, distortion_model=tree.get("distortion_model"),
+        **numbers, width=width, height=height, distortion_model=tree.get("distortion_model") or "missing",
         roi=SimpleNamespace(width=0, height=0), binning_x=0, binning_y=0,
     )  # fmt: skip
