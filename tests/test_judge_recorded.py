@@ -149,3 +149,30 @@ def test_errors_against_a_recorded_truth_are_judged_by_their_covariances():
         n_errors = len(rows) / every  # their mean chi-square of 3 has the standard deviation sqrt(6 / n)
         assert found["nees_position_mean"] == pytest.approx(3.0, abs=4 * np.sqrt(6 / n_errors)), (every, alignment)
         assert found["within_2sigma_position"] == pytest.approx(0.954, abs=0.02)
+
+
+@pytest.mark.parametrize("offset_s", (1.0, -0.6))
+def test_a_truth_whose_clock_is_off_by_up_to_two_seconds_is_named(offset_s):
+    times_s = np.arange(0, 30, 0.1)
+    true = curve(times_s)
+    estimate = Trajectory(times_s, geometry.exp(np.array([0.2, 0.1, -0.4, 1.0, 2.0, 3.0])) @ true.world_from_camera)
+    shifted = Trajectory(times_s + offset_s, true.world_from_camera)
+    (warning,) = [text for text in truth_warnings(estimate, shifted) if "clock" in text]
+    assert f"shifted by {-offset_s:+.2f} s" in warning
+    assert not any("clock" in text for text in truth_warnings(estimate, true))
+
+
+def test_a_straight_path_shows_no_offset_of_the_clock():
+    times_s, noise = np.arange(0, 30, 0.1), np.random.default_rng(3).normal(size=(300, 3)) * 1e-3
+    poses = np.tile(np.eye(4), (300, 1, 1))
+    poses[:, 0, 3] = 0.3 * times_s
+    estimate = Trajectory(times_s, poses.copy())
+    estimate.world_from_camera[:, :3, 3] += noise
+    assert not truth_warnings(estimate, Trajectory(times_s + 1.0, poses))
+
+
+def test_a_truth_that_covers_a_quarter_of_the_frames_is_named(pair):
+    times_s = np.arange(0, 30, 0.1)
+    true = curve(times_s)
+    part = Trajectory(times_s[:75], true.world_from_camera[:75])
+    assert truth_warnings(true, part) == ["Only 75 of 300 frames have a true pose; errors are those of these frames."]

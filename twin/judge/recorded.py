@@ -27,6 +27,9 @@ _MAX_AXIS_DEG, _MAX_EXTENT_RATIO = 5.0, 2.0
 _MAX_AXIS_SIGMA_DEG = 10.0  # where the turn is less certain, it is not judged: along a line or noise, any turn fits
 _SIGNIFICANT = 3.0  # standard deviations of the turn of the axes
 _BLOCKS = 4  # parts of the path, left out one at a time for the standard deviation of the turn
+_LEAST_COVERED = 0.5  # of the frames, which have a true pose, without a warning
+_MOST_OFFSET_S, _OFFSET_STEP_S = 2.0, 0.05  # of the clock of the truth that is searched for, and steps of the search
+_CLEARLY = 0.3
 _MOST_STEPS = 20
 _CONVERGED_M = 1e-5
 _LEAST_COSINE = 0.7  # of the angle between the axes of height; a map of a wall is not compared with a height grid
@@ -123,6 +126,14 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
             f"{truth.times_s.max():.3f} s after the first frame. The truth seems to have another clock."
         ]
     found = []
+    if len(a) < _LEAST_COVERED * len(estimate):
+        found.append(f"Only {len(a)} of {len(estimate)} frames have a true pose; errors are those of these frames.")
+    if (clock := _clock_offset(estimate, truth)) is not None:
+        offset_s, shifted_m, as_given_m = clock
+        found.append(
+            f"The path fits the truth to {shifted_m:.2g} m if the true times are shifted by {offset_s:+.2f} s, "
+            f"otherwise to {as_given_m:.2g} m: the truth seems to have another clock."
+        )
     extents = [float(np.linalg.norm(np.ptp(path.positions, axis=0))) for path in (a, b)]  # noise adds to lengths
     if max(extents) > max(_MAX_EXTENT_RATIO * min(extents), 0.05):
         found.append(
@@ -137,6 +148,36 @@ def truth_warnings(estimate: Trajectory, truth: Trajectory) -> list[str]:
             "left camera: the truth seems to be that of another body."
         )
     return found
+
+
+def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float, float] | None:
+    """Returns by how much the true times would have to be shifted [s], and the RMS misfit [m] with and without that.
+
+    The misfit is that of positions after a rigid alignment, with the truth interpolated; None if no shift within
+    `_MOST_OFFSET_S` reduces it to a fraction of `_CLEARLY`.
+    """
+    order = np.argsort(truth.times_s, kind="stable")
+    true_s, true_m, times_s = truth.times_s[order], truth.positions[order], estimate.times_s
+    if len(true_s) < _MIN_ASSOCIATED:
+        return None
+    step_s = max(float(np.median(np.diff(true_s))), _OFFSET_STEP_S)
+    shifts_s = np.arange(-round(_MOST_OFFSET_S / step_s), round(_MOST_OFFSET_S / step_s) + 1) * step_s
+
+    def misfit_m(shift_s: float) -> float:
+        inside = (times_s >= true_s[0] + shift_s) & (times_s <= true_s[-1] + shift_s)
+        if inside.sum() < max(_MIN_ASSOCIATED, _LEAST_COVERED * len(times_s)):
+            return np.inf
+        at = [np.interp(times_s[inside], true_s + shift_s, axis) for axis in true_m.T]
+        moved = geometry.transform(
+            rigid_alignment(estimate.positions[inside], np.column_stack(at)), estimate.positions[inside]
+        )
+        return float(np.sqrt(np.mean(np.sum((moved - np.column_stack(at)) ** 2, axis=1))))
+
+    misfits_m = np.array([misfit_m(shift_s) for shift_s in shifts_s])
+    best, as_given_m = int(np.argmin(misfits_m)), float(misfits_m[len(shifts_s) // 2])
+    if abs(shifts_s[best]) <= step_s or not misfits_m[best] < _CLEARLY * as_given_m:
+        return None
+    return float(shifts_s[best]), float(misfits_m[best]), as_given_m
 
 
 def _axis_turn_deg(estimate: Trajectory, truth: Trajectory) -> tuple[float, float]:
