@@ -22,6 +22,7 @@ from twin.exports.command import ExportOptions, export, run_contents
 from twin.exports.formats import FORMATS
 from twin.exports.true_layers import floor_normals, optical_flow
 from twin.report.frame_recorder import EXPOSURE_COLUMNS, IMU_COLUMNS, FrameRecorder, remove_keyframe_images
+from twin.report.run_folder import load_run
 from twin.scenario.file import dump_toml
 from twin.scenario.model import Scenario
 from twin.terrains.terrain import Terrain
@@ -562,3 +563,37 @@ def test_an_image_of_another_size_has_no_true_layers(recorded, tmp_path):
 def test_the_writer_of_every_format_is_found(name):
     module, function = FORMATS[name].writer.split(":")
     assert callable(getattr(importlib.import_module(f"twin.{module}"), function))
+
+
+def test_images_along_a_path_show_the_floor_from_its_poses(tmp_path):
+    """The images of a pose are those that a world captures there, at rest; between poses the motion is uniform."""
+    from twin.exports.rendered_path import render_path
+    from twin.world.mission import prepare
+    from twin.world.rendered_world import RenderedWorld
+
+    scenario = Scenario.model_validate(SCENARIO)
+    first = prepare(scenario).start_of_body @ scenario.believed_rig().body_from_camera
+    moved = first @ geometry.exp(np.array([0.0, 0.0, 0.2, 0.1, 0.05, 0.0]))
+    path = Trajectory(np.array([7.0, 7.6, 8.0]), np.array([first, moved, moved]))
+    assert render_path(scenario, path, tmp_path / "run", lambda _: None) == 6  # at 5 Hz
+    run = load_run(tmp_path / "run")
+    np.testing.assert_allclose(run.trajectories["truth"].times_s, np.arange(6) / 5)
+    third = geometry.log(geometry.inverse(first) @ run.trajectories["truth"].world_from_camera[1])
+    np.testing.assert_allclose(third, np.array([0.0, 0.0, 0.2, 0.1, 0.05, 0.0]) / 3, atol=1e-8)
+    with RenderedWorld(prepare(scenario), Stopwatch()) as world:
+        for _ in range(6):
+            seen = world.camera.capture(moved, True)
+    for side, image in (("left", seen.left), ("right", seen.right)):
+        recorded = cv2.imread(str(tmp_path / "run" / "frames" / side / "000005.png"), cv2.IMREAD_COLOR_RGB)
+        assert np.abs(recorded.astype(int) - image.astype(int)).mean() < 0.6
+    written = export(tmp_path / "run", ["truth"], tmp_path)
+    assert written and (tmp_path / "truth" / "depth" / "000005.tiff").is_file()
+    below = path.world_from_camera.copy()
+    below[:, 2, 3] -= 9.0
+    wrong = {
+        "above the floor": Trajectory(path.times_s, below),
+        "do not increase": Trajectory(path.times_s[::-1].copy(), path.world_from_camera),
+    }
+    for problem, given in wrong.items():
+        with pytest.raises(TwinError, match=problem):
+            render_path(scenario, given, tmp_path / "wrong", lambda _: None)
