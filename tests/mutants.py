@@ -113,7 +113,7 @@ MUTANTS = [
         ("twin/estimate/mapping/surface.py", "col = (z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3] - west) / cell - 0.5", "col = (z * (pose[0, 0] * x + pose[0, 1] * y + pose[0, 2]) + pose[0, 3] - west) / cell", "estimate_elevation"),
         ("twin/estimate/navigation/aiding.py", "np.eye(3 - first) * sigma_m**-2", "np.eye(3 - first) * sigma_m**-1", "estimate_aiding"),
         ("twin/estimate/navigation/aiding.py", "np.eye(2) * noise.up_rad**-2 / max(len(index), 1)", "np.eye(2) * noise.up_rad**-2", "estimate_aiding estimate_vertical"),
-        ("twin/estimate/navigation/dvl.py", "step[i] = (last[i] + now) / 2 * model.step_s", "step[i] = now * model.step_s", "estimate_positioning estimate_aiding"),
+        ("twin/estimate/navigation/dvl.py", "step[i] = (last[i] + now) / 2 * duration_s", "step[i] = now * duration_s", "estimate_positioning estimate_aiding"),
         ("twin/estimate/navigation/dvl.py", "growth, cov = (2 * state.path_m[0] + length) / length,", "growth, cov = (state.path_m[0] + length) / length,", "estimate_positioning estimate_aiding"),
         ("twin/estimate/navigation/pose_filter.py", "[[1, 0, -x / depth], [0, 1, -y / depth]]", "[[1, 0, x / depth], [0, 1, -y / depth]]", "estimate_positioning estimate_aiding"),
         ("twin/estimate/navigation/vertical.py", "up = ahead * information[0][:, None] + back[::-1] * information[1][:, None]", "up = ahead * information[1][:, None] + back[::-1] * information[0][:, None]", "estimate_vertical"),

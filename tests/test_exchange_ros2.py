@@ -30,6 +30,7 @@ SCENARIO = {
         "attitude_sigma_deg": 1.0,
         "heading_sigma_deg": 2.0,
         "dvl_sigma_mps": 0.01,
+        "usbl_sigma_m": 0.3,
     },
     "sun": {"depth_m": 12.0},
 }
@@ -45,7 +46,8 @@ IMU = RecordedImu(
 def readings(k):
     """Returns readings of all sensors at frame 1, of the pressure sensor alone at frame 2, of none elsewhere."""
     if k == 1:
-        return Readings(pressure_z_m=1.5, ahrs_rpy_rad=ANGLES, dvl_mps=np.array([0.3, -0.1, 0.02]))
+        velocity_mps, position_m = np.array([0.3, -0.1, 0.02]), np.array([4.0, -5.0, 6.0])
+        return Readings(1.5, ANGLES, velocity_mps, position_m)
     return Readings(pressure_z_m=1.25) if k == 2 else Readings()
 
 
@@ -86,6 +88,7 @@ def test_the_topics_and_times_are_those_of_the_run(bag, run):
         "/imu/data_raw",
         "/pressure",
         "/dvl",
+        "/usbl",
     ]
     assert set(bag) == {*pair, *other}
     times_ns = [timestamp_ns(frame.time_s) for frame in run.frames]
@@ -161,6 +164,10 @@ def test_readings_are_in_the_units_of_the_messages(bag):
     velocity = bag["/dvl"][0][1].twist
     assert [velocity.twist.linear.x, velocity.twist.linear.y, velocity.twist.linear.z] == [0.3, -0.1, 0.02]
     assert velocity.covariance[0] == pytest.approx(1e-4) and velocity.covariance[-1] == -1
+    ((_, fix),) = bag["/usbl"]
+    assert [fix.pose.pose.position.x, fix.pose.pose.position.y, fix.pose.pose.position.z] == [4.0, -5.0, 6.0]
+    assert fix.header.frame_id == "world" and fix.pose.covariance[0] == pytest.approx(0.09)
+    assert fix.pose.covariance[-1] == -1
 
 
 def test_rates_and_specific_forces_are_those_of_the_run_without_an_orientation(bag):

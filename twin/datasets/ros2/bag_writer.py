@@ -30,7 +30,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
 
     Topics, all in the order of time (`timestamp_ns`): /left/image_rect/compressed, /left/camera_info and the same for
     right; /tf_static; /odometry and /tf of the final trajectory; /ground_truth/odometry if the truth is known; and, if
-    recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure and /dvl. Raises TwinError if
+    recorded, /imu/data (attitude), /imu/data_raw (rates and specific forces), /pressure, /dvl and /usbl. TwinError if
     rosbags is not installed, the bag exists already, or an image is damaged.
     """
     rosbag2 = optional("rosbags.rosbag2", "exchange", "--to mcap")
@@ -114,8 +114,8 @@ def body_twists(times_s: Array, poses: Array) -> Array:
 
 def _readings(contents: RunContents, factory: MessageFactory) -> Messages:
     surface_m = float(contents.scenario.get("sun", {}).get("depth_m", 0.0))
-    level_rad, heading_rad, height_m, sigma_mps = contents.sigmas(
-        "attitude_sigma_deg", "heading_sigma_deg", "pressure_sigma_m", "dvl_sigma_mps"
+    level_rad, heading_rad, height_m, sigma_mps, fix_m = contents.sigmas(
+        "attitude_sigma_deg", "heading_sigma_deg", "pressure_sigma_m", "dvl_sigma_mps", "usbl_sigma_m"
     )
     sigmas_rad, sigma_pa = np.array([level_rad, level_rad, heading_rad]), PASCAL_PER_METRE * height_m
     for frame in contents.frames:
@@ -127,6 +127,8 @@ def _readings(contents: RunContents, factory: MessageFactory) -> Messages:
             yield time_ns, "/pressure", factory.pressure(time_ns, value_pa, sigma_pa)
         if readings.dvl_mps is not None:
             yield time_ns, "/dvl", factory.velocity(time_ns, readings.dvl_mps, sigma_mps)
+        if readings.usbl_m is not None:
+            yield time_ns, "/usbl", factory.fix(time_ns, readings.usbl_m, fix_m)
 
 
 def _inertial(imu: RecordedImu, factory: MessageFactory) -> Messages:

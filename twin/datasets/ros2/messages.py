@@ -101,6 +101,18 @@ class MessageFactory:
         twist = self._twist(np.concatenate([np.zeros(3), velocity_mps]), covariance)
         return self._make("geometry_msgs/TwistWithCovarianceStamped", self._header(time_ns, BODY), twist)
 
+    def fix(self, time_ns: int, position_m: Array, sigma_m: float) -> Any:
+        """Returns geometry_msgs/PoseWithCovarianceStamped with the position (3,) of the left camera in the world.
+
+        Its orientation is not measured; the variances are -1.
+        """
+        covariance = np.diag([sigma_m**2] * 3 + [_NOT_MEASURED] * 3).ravel()
+        pose = self._make(
+            "geometry_msgs/Pose", *self._place(geometry.pose(np.eye(3), position_m), "geometry_msgs/Point")
+        )
+        with_cov = self._make("geometry_msgs/PoseWithCovariance", pose, covariance)
+        return self._make("geometry_msgs/PoseWithCovarianceStamped", self._header(time_ns, WORLD), with_cov)
+
     def _make(self, kind: str, *fields: Any) -> Any:
         return self.typestore.types[kind.replace("/", "/msg/")](*fields)
 
