@@ -1,8 +1,8 @@
 """Hostile and ordinary missions: none may end "complete" with a wrong path, and ordinary ones must not be degraded.
 
-usage: python tests/hostile_missions.py OUT.jsonl [MISSION...|faults] [--seeds 3] [--jobs 2] [--ordinary]
+usage: python tests/hostile_missions.py OUT.jsonl [MISSION...|faults] [--seeds 3] [--first 1] [--jobs 2] [--ordinary]
 
-Flies each mission rendered over 2 m x 1 m (one track, two legs) with several seeds and appends one line per survey to
+Flies each mission rendered over 2 m x 1 m (one track, two legs) with the seeds from `--first` to `--seeds` and appends one line per survey to
 OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each mission and the wrong ones:
 
 hostile: status "complete" although the largest position error of a frame exceeds 4 times its standard deviation (of
@@ -196,6 +196,7 @@ def main():
     parser.add_argument("out", type=Path)
     parser.add_argument("missions", nargs="*")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=1, help="first seed")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--ordinary", action="store_true", help="fly the ordinary missions, one seed each")
     given = parser.parse_args()
@@ -204,7 +205,7 @@ def main():
     chosen = {name: missions[name] for name in names or missions}
     rows = [json.loads(text) for text in given.out.read_text().splitlines()] if given.out.exists() else []
     flown = {(row["mission"], row["seed"]) for row in rows}
-    seeds = range(101, 102) if given.ordinary else range(1, given.seeds + 1)
+    seeds = range(101, 102) if given.ordinary else range(given.first, given.seeds + 1)
     waiting = [(name, chosen[name], seed) for seed in seeds for name in chosen if (name, seed) not in flown]
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool, given.out.open("a") as file:
         for done in as_completed([pool.submit(fly, *survey) for survey in waiting]):
