@@ -2,8 +2,9 @@
 
 usage: python tests/hostile_missions.py OUT.jsonl [MISSION...|faults] [--seeds 3] [--first 1] [--jobs 2] [--ordinary]
 
-Flies each mission rendered over 2 m x 1 m (one track, two legs) with the seeds from `--first` to `--seeds` and appends one line per survey to
-OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each mission and the wrong ones:
+Flies each mission rendered over 2 m x 1 m (one track, two legs) with the seeds from `--first` to `--seeds` and appends
+one line per survey to OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each
+mission and the wrong ones:
 
 hostile: status "complete" although the largest position error of a frame exceeds 4 times its standard deviation (of
     the worst keyframe and the motion since the last keyframe), or less than 90 % of the asked area is mapped;
@@ -43,7 +44,7 @@ def fault(part, type_, duration_s=None, **keys):
     """Returns the overrides for one fault from 4 s on, with all sensors."""
     keys = {"part": f'"{part}"', "type": f'"{type_}"', "start_s": 4.0, **keys}
     keys |= {} if duration_s is None else {"duration_s": duration_s}
-    text = ",".join(f"{key}={value}" for key, value in keys.items())
+    text = ",".join(f"{key}={value}" for key, value in keys.items() if value is not None)
     return f"faults=[{{{text}}}]", 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
 
 
@@ -59,6 +60,11 @@ FAULTS = {
     "half of the contrast lost in silt": fault("water", "silt", 5),
     "silt-out for 3 s": fault("water", "silt", 3, size=1.0),
     "8 fish": fault("fish", "school", 10, size=8),
+    "one lamp off": fault("lamp", "off", number=1),
+    "lamps off for 3 s": fault("lamp", "off", 3),
+    "lamps off at a place": fault("lamp", "off", 2, start_s=None, at_m=[0.3, -0.4], radius_m=0.3),
+    "lamps that flicker": fault("lamp", "intermittent", 5, size=0.3),
+    "gust of 0.4 m/s": fault("water", "gust", 4, size=0.4),
     "thruster off": fault("thruster", "off", number=1),
     "vertical thruster off": fault("thruster", "off", number=5),
     "thruster stuck": fault("thruster", "stuck", number=1),
@@ -66,6 +72,10 @@ FAULTS = {
     "AHRS 10 deg off": fault("ahrs", "wrong", 5, size=10),
     "DVL 0.3 m/s off": fault("dvl", "wrong", 5, size=0.3),
     "DVL without bottom lock": fault("dvl", "off", 10),
+    "DVL 1 s late": fault("dvl", "delayed", size=1),
+    "AHRS 0.5 s late": fault("ahrs", "delayed", size=0.5),
+    "pressure 1 s late": fault("pressure", "delayed", size=1),
+    "USBL 2 s late": fault("usbl", "delayed", size=2),
     "USBL spikes of 3 m": fault("usbl", "garbage", size=3),
     "USBL 3 m off": fault("usbl", "wrong", size=3),
 }

@@ -946,41 +946,50 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "cameras": ("off", "stuck", "garbage", "intermittent"),
     "left_camera": ("off", "stuck", "garbage", "intermittent"),
     "right_camera": ("off", "stuck", "garbage", "intermittent"),
-    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent"),
-    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent"),
-    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent"),
-    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "lamp": ("off", "intermittent"),
+    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
     "tether": ("stuck",),
-    "water": ("silt",),
+    "water": ("silt", "gust"),
     "fish": ("school",),
 }
 
 
 class FaultConfig(Section):
-    """Fault of a part, at a time or at a rate; the estimators and the controller are not told of it."""
+    """Fault of a part, at a time, at a place or at a rate; the estimators and the controller are not told of it."""
 
     part: Literal[
-        "thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl", "tether", "water",
-        "fish",
+        "thruster", "cameras", "left_camera", "right_camera", "lamp", "pressure", "ahrs", "dvl", "usbl", "tether",
+        "water", "fish",
     ]  # fmt: skip
-    """part that fails, or what drifts in front of the cameras; a sensor must be in navigation.aiding"""
-    number: int | None = Field(default=None, ge=1, le=32)
-    """number of the thruster, from 1"""
-    type: Literal["off", "stuck", "wrong", "garbage", "intermittent", "silt", "school"] = "off"
-    """off: no thrust, black images, no readings; stuck: the command, the images or the reading of its start are
-    repeated, the tether is caught with a slack of `size`; wrong: thrust times `size`, readings plus `size`; garbage:
-    images of noise, readings with added noise of standard deviation `size`; intermittent: as off, at random frames;
-    silt: a cloud hides the share `size` of the contrast, rises in 1 s and settles at a time constant of 3 s; school:
-    `size` fish swim between cameras and floor"""
+    """part that fails, what drifts in front of the cameras, or the water; a sensor must be in navigation.aiding"""
+    number: int | None = Field(default=None, ge=1, le=64)
+    """number of the thruster or the lamp, from 1; default: all lamps"""
+    type: Literal["off", "stuck", "wrong", "garbage", "intermittent", "delayed", "silt", "school", "gust"] = "off"
+    """off: no thrust, no light, black images, no readings; stuck: the command, the images or the reading of its start
+    are repeated, the tether is caught with a slack of `size`; wrong: thrust times `size`, readings plus `size`;
+    garbage: images of noise, readings with added noise of standard deviation `size`; intermittent: as off, at random
+    frames; delayed: readings arrive `size` seconds late; silt: a cloud hides the share `size` of the contrast, rises in
+    1 s and settles at a time constant of 3 s; school: `size` fish swim between cameras and floor; gust: the water moves
+    by `size` m/s more, rises and falls within 1 s"""
     start_s: float | None = Field(default=None, ge=0, le=1e6)
-    """time at which it starts; default: with per_hour [s]"""
+    """time at which it starts; default: see at_m and per_hour [s]"""
+    at_m: Vector2 | None = None
+    """place x, y in the scene: it starts when the left camera first comes within radius_m of it [m]"""
+    radius_m: float = Field(default=0.5, gt=0, le=1000)
+    """with at_m: horizontal distance at which it starts [m]"""
     per_hour: float | None = Field(default=None, gt=0, le=3600)
     """mean number of faults per hour, at random times"""
     duration_s: float | None = Field(default=None, gt=0, le=1e6)
     """duration of a fault; default: to the end of the survey [s]"""
     size: float = Field(default=0.5, ge=-100, le=100)
     """wrong, garbage: factor on the thrust; bias or noise of readings in their unit [m, deg, m/s]; intermittent: share
-    of the frames that are lost, 0 to 1; tether: slack [m]"""
+    of the frames that are lost, 0 to 1; delayed: delay [s]; tether: slack [m]; gust: added velocity [m/s]"""
+    direction_deg: float | None = Field(default=None, ge=-360, le=360)
+    """gust: direction of the added velocity, counter-clockwise from x (east); default: to port of the vehicle at its
+    start [deg]"""
 
     @property
     def name(self) -> str:

@@ -83,6 +83,10 @@ class CompiledVehicle:
         return self.state.tether
 
     @property
+    def sea(self) -> Sea:
+        return self.state.sea
+
+    @property
     def thrust_factors(self) -> Array:
         """Returns the factors (n,) on the thrusts, which can be modified in place; 1 without faults."""
         return self.state.thrusters.factors

@@ -36,6 +36,7 @@ class MujocoVehicle:
 
     Attributes:
         tether: its tether; `snag` can be modified in place.
+        sea: motion of the water; `single_gusts` can be modified in place.
         after_timestep: called with `inertial` after each timestep; None: nothing is called.
         touched: returns which obstacle the hull touches at a pose world_from_body, "" for none.
     """
@@ -45,7 +46,7 @@ class MujocoVehicle:
     ):
         self.tether = tether
         self._model, self._data = model, mujoco.MjData(model)
-        self._hull, self._sea = trimmed_hull(vehicle), sea
+        self._hull, self.sea = trimmed_hull(vehicle), sea
         self._body = model.body("vehicle").id
         joint = int(model.body_jntadr[self._body])
         first_q, first_v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
@@ -95,8 +96,8 @@ class MujocoVehicle:
 
     def _acceleration_at(self, velocity: Array, wrench: Array) -> Array:
         at = self._data.xpos[self._body]
-        flow = flow_at(self._sea, self.time_s, at)
-        add_tether(wrench, self.tether, self._sea, self.time_s, self._rotation, at, velocity)
+        flow = flow_at(self.sea, self.time_s, at)
+        add_tether(wrench, self.tether, self.sea, self.time_s, self._rotation, at, velocity)
         return free_joint_acceleration(self._hull, self._rotation, velocity, flow, wrench)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:

@@ -40,6 +40,7 @@ from twin.world.path_checks import (
     check_floor_below,
     check_lamp,
     check_objects,
+    check_places_of_faults,
     check_speed,
     check_tasks,
     check_thrust,
@@ -288,6 +289,7 @@ def _check_path(
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
     errors.attempt(check_tasks, scenario, plan, terrain)
+    errors.attempt(check_places_of_faults, scenario.faults, plan)
     if (sea := errors.attempt(make_sea, scenario)) is not None:
         errors.attempt(check_thrust, scenario.vehicle, sea, plan)
     camera_m = scenario.believed_rig().body_from_camera[:3, 3]

@@ -73,6 +73,8 @@ class RenderedWorld(World):
         self.renderer.close()
 
     def capture(self, step: Step) -> CameraImages:
+        if self.faults.exist:
+            self.camera.light_lamps(self.faults.lamps_lit(len(self.mission.scenario.lamps)).tolist())
         images = self.camera.capture(self.world_from_camera, step.keyframe, self.vehicle.twist_body)
         if images.depth_right is not None:
             self.coverage.add(self.world_from_camera, images.depth_left, images.depth_right)

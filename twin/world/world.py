@@ -108,10 +108,10 @@ class World(ABC):
 
     def observe(self, step: Step) -> Frame:
         """Returns the frame at the current pose and records its ground truth."""
-        index, images = len(self), self.capture(step)
+        index, time_s = len(self), len(self) / self.mission.rig.frame_rate_hz
+        self.faults.at(time_s, self.world_from_camera[:3, 3])
+        images = self.capture(step)
         self.record(self.world_from_camera)
-        time_s = index / self.mission.rig.frame_rate_hz
-        self.faults.at(time_s)
         left, right = self.faults.images(images.left, images.right)
         assert left is not None
         depth_m = images.depth_m if step.keyframe else None
@@ -126,6 +126,7 @@ class World(ABC):
             if self.faults.exist and not isinstance(self.vehicle, KinematicVehicle):
                 command, self.vehicle.thrust_factors[:] = self.faults.thrusts(command)
                 self.faults.catch_tether(self.vehicle.tether, self.vehicle.world_from_body[:3, 3])
+                self.faults.blow(self.vehicle.sea.single_gusts, self.vehicle.world_from_body[:3, 1])
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 
     def __len__(self) -> int:
