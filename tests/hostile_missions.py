@@ -67,6 +67,7 @@ FAULTS = {
     "gust of 0.4 m/s": fault("water", "gust", 4, size=0.4),
     "thruster off": fault("thruster", "off", number=1),
     "vertical thruster off": fault("thruster", "off", number=5),
+    "thruster at a third": fault("thruster", "wrong", number=1, size=0.3),
     "thruster stuck": fault("thruster", "stuck", number=1),
     "pressure 0.3 m off": fault("pressure", "wrong", 5, size=0.3),
     "AHRS 10 deg off": fault("ahrs", "wrong", 5, size=10),

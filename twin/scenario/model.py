@@ -931,6 +931,10 @@ class ControlConfig(Section):
     latency: Literal["none"] | Latency = "none"
     """time from an image to the command that follows from it, of a computer of finite speed, in whole frames [s]; the
     controller knows it and predicts the motion meanwhile"""
+    thruster_feedback: Literal["speed", "none"] = "speed"
+    """what the speed controllers (ESC) of the thrusters report. speed: the speed of each propeller, from which its
+    thrust follows; a thruster that misses half of the thrust of its commands is left out of the thrust allocation;
+    none: nothing"""
     off_course_m: float | None = Field(default=None, gt=0, le=1000)
     """largest distance from the planned path; beyond it for one second, the survey is degraded; default: a quarter of
     the shorter side of the footprint [m]"""
