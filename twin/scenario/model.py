@@ -886,7 +886,7 @@ class ObjectConfig(Section):
 
 
 class TaskConfig(Section):
-    """Close survey of a target, for which the survey is broken off at the end of a leg; afterwards the vehicle returns.
+    """Close survey of a target, for which the survey is broken off; afterwards the vehicle returns to where it left.
 
     Its keyframes have an elevation map of their own, in the frame of the map of the area.
     """
@@ -910,6 +910,9 @@ class TaskConfig(Section):
     start_s: float | None = Field(default=None, ge=0, le=1e6)
     """time from which on the survey is broken off, at the next end of a leg; default: at the end of a leg that is
     nearest to the target [s]"""
+    within_leg: bool = False
+    """true: the survey is broken off within a leg, at start_s or, without it, at the point of a leg that is nearest to
+    the target, and continues there; false: at the end of a leg"""
     cell_m: float | None = Field(default=None, gt=0.0005, le=1)
     """cell size of its map; default: map.cell_m in the ratio of the altitudes [m]"""
 
@@ -928,9 +931,13 @@ class ControlConfig(Section):
     also rises over obstacles (plan.clearance_m); where nothing has been measured yet, the floor is taken to continue"""
     natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10)
     """natural frequency of the closed position loop [rad/s]"""
-    latency: Literal["none"] | Latency = "none"
+    latency: Literal["none", "stated"] | Latency = "none"
     """time from an image to the command that follows from it, of a computer of finite speed, in whole frames [s]; the
-    controller knows it and predicts the motion meanwhile"""
+    controller knows it and predicts the motion meanwhile. stated: the time of the estimators for a keyframe on a
+    computer of computer_speed, proportional to the number of pixels"""
+    computer_speed: float = Field(default=1.0, ge=0.01, le=100)
+    """speed of the computer with latency = "stated", relative to the reference (2 cores of an x86-64 machine), which
+    takes 84 ms for a keyframe of 320 x 240 pixels"""
     thruster_feedback: Literal["speed", "none"] = "speed"
     """what the speed controllers (ESC) of the thrusters report. speed: the speed of each propeller, from which its
     thrust follows; a thruster that misses half of the thrust of its commands is left out of the thrust allocation;
@@ -938,10 +945,6 @@ class ControlConfig(Section):
     off_course_m: float | None = Field(default=None, gt=0, le=1000)
     """largest distance from the planned path; beyond it for one second, the survey is degraded; default: a quarter of
     the shorter side of the footprint [m]"""
-
-    @property
-    def latency_s(self) -> float:
-        return 0.0 if self.latency == "none" else self.latency
 
 
 #: Parts that can fail, with the ways in which they can, in the words of PX4.

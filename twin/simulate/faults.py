@@ -104,7 +104,7 @@ class Faults:
     def blow(self, single_gusts: Array, port: Array) -> None:
         """Lets gusts begin and end; `port` (3,) is the direction to port of the vehicle."""
         for row, fault in zip(single_gusts, self._gusts, strict=True):
-            if self._is_active(fault):
+            if any(fault is one for one in self._active):
                 if row[0] > self._time_s or row[1] <= self._time_s:
                     to_port, given_deg = np.arctan2(port[1], port[0]), fault.direction_deg
                     angle = to_port if given_deg is None else np.deg2rad(given_deg)
@@ -185,9 +185,6 @@ class Faults:
 
     def _is_lost(self, fault: FaultConfig) -> bool:
         return fault.type == "off" or (fault.type == "intermittent" and self._rng.uniform() < fault.size)
-
-    def _is_active(self, fault: FaultConfig) -> bool:
-        return any(fault is one for one in self._active)
 
     def _of(self, *parts: str) -> list[FaultConfig]:
         return [fault for fault in self._active if fault.part in parts]

@@ -61,9 +61,6 @@ def single_gusts(n: int) -> Array:
     return np.tile([np.inf, np.inf, 0.0, 0.0, 0.0], (n, 1))
 
 
-NO_SINGLE_GUSTS = single_gusts(0)
-
-
 @kernel
 def add_single_gusts(gusts, time_s, flow):
     """Adds `single_gusts` at a time to a flow (5, 3), see `sea.flow_at`; they rise and fall with a continuous rate."""

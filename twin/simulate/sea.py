@@ -11,7 +11,7 @@ from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.scenario.model import CurrentConfig, Scenario
 from twin.simulate.current_file import read_current
-from twin.simulate.gusts import NO_SINGLE_GUSTS, add_gusts, add_single_gusts, gust_series, single_gusts
+from twin.simulate.gusts import add_gusts, add_single_gusts, gust_series, single_gusts
 from twin.simulate.waves import CALM, Waves, add_waves, wave_components
 
 #: Heights between which a profile of the current is interpolated [m].
@@ -49,7 +49,7 @@ def make_sea(scenario: Scenario, rng: np.random.Generator | None = None) -> Sea:
 def steady_current(velocity_mps: Array) -> Sea:
     """Returns the sea with a steady, uniform current (3,): east, north, up."""
     mean = np.array(velocity_mps, float).reshape(1, 1, 3)
-    return Sea(np.zeros(1), np.zeros(1), mean, np.zeros(4), np.zeros((0, 3)), CALM, NO_SINGLE_GUSTS)
+    return Sea(np.zeros(1), np.zeros(1), mean, np.zeros(4), np.zeros((0, 3)), CALM, single_gusts(0))
 
 
 def _mean(current: CurrentConfig) -> tuple[Array, Array, Array]:

@@ -21,6 +21,7 @@ from twin.plugin.loading import CONTROLLERS
 from twin.plugin.protocols import ControllerSetup
 from twin.simulate.autopilot import allocation_without, nominal_controller, thruster_lag_s
 from twin.simulate.parameters import moves_along_all_axes
+from twin.world.computer import frames_of_latency
 from twin.world.mission import Mission
 
 #: Natural frequency of the position loop times the whole delay, at most; the attitude loop is twice as fast. At 0.3 rad
@@ -38,16 +39,12 @@ def make_pilot(mission: Mission, monitor: ThrusterMonitor | None = None) -> Pilo
     The thrusters that `monitor` finds lost are left out; a plug-in is not told of them.
     """
     scenario = mission.scenario
-    n_late = frames_of_latency(mission)
+    n_late = frames_of_latency(mission.scenario)
     if scenario.control.plugin is not None:
         return _late(_plugin_pilot(mission, scenario.control.plugin), n_late)
     return (
         RovPilot(mission, monitor) if scenario.vehicle.dynamics == "rigid" else _late(_kinematic_pilot(mission), n_late)
     )
-
-
-def frames_of_latency(mission: Mission) -> int:
-    return round(mission.scenario.control.latency_s * mission.rig.frame_rate_hz)
 
 
 def _late(pilot: PilotOfEstimates, n: int) -> PilotOfEstimates:
@@ -122,7 +119,7 @@ class RovPilot:
 
     def __init__(self, mission: Mission, monitor: ThrusterMonitor | None = None):
         self._vehicle, self._monitor, self._n_lost = mission.scenario.vehicle, monitor, 0
-        rig, scenario, n_late = mission.rig, mission.scenario, frames_of_latency(mission)
+        rig, scenario, n_late = mission.rig, mission.scenario, frames_of_latency(mission.scenario)
         frequency, latency_s = scenario.control.natural_frequency_radps, n_late / rig.frame_rate_hz
         if n_late:
             delay_s = latency_s + _VELOCITY_SMOOTHING_S + thruster_lag_s(scenario.vehicle)

@@ -25,6 +25,9 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     yield from _of_tasks(scenario)
     yield from _of_sea(scenario)
     yield from _of_faults(scenario)
+    if scenario.control.latency != "stated":
+        problem, allowed = "has no effect without a stated latency", 'control.latency = "stated"'
+        yield from keys_without_effect("control", scenario.control, ["computer_speed"], problem, allowed)
     if scenario.plan.cross_rise_m and not scenario.plan.cross_lines:
         yield TwinError("plan.cross_rise_m", "has no effect without cross lines", "0, or plan.cross_lines above 0")
     if scenario.plan.cross_rise_m and scenario.vehicle.dynamics == "kinematic":
@@ -113,6 +116,8 @@ def _of_tasks(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"tasks.{k}.name", f"{task.name!r} is the name of another task", "a name of its own")
         if task.after_track is not None and task.start_s is not None:
             yield TwinError(f"tasks.{k}.start_s", "contradicts after_track", "one of the two")
+        if task.within_leg and task.after_track is not None:
+            yield TwinError(f"tasks.{k}.within_leg", "contradicts after_track", "one of the two")
         if scenario.vehicle.dynamics == "kinematic":
             problem, allowed = "a kinematic vehicle moves in a horizontal plane", 'vehicle.dynamics = "rigid"'
             yield TwinError(f"tasks.{k}.altitude_m", problem, allowed)
