@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -77,10 +76,6 @@ class StereoCamera:
         self._focal_px, self._linear = rig.focal_px, scenario.delivers_linear_images
         self._rngs = (left_rng, right_rng)
         self._n_captures = 0
-
-    def light_lamps(self, lit: Sequence[bool]) -> None:
-        """Switches the lamps (n) on or off for the following captures."""
-        self._image_formation.light_lamps(lit)
 
     def capture(self, world_from_left: Array, stereo: bool, twist_body: Array = AT_REST) -> StereoCapture:
         """Returns the image of the left camera and, if `stereo`, of the right one; advances the time by one frame.
