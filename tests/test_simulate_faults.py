@@ -109,20 +109,30 @@ def test_readings_fail_by_their_kind():
     ('{part="thruster",number=1,type="garbage",start_s=1}', "faults.0.type: garbage: not simulated for thruster"),
     ('{part="cameras",start_s=1}', "faults.0.part: cameras: the surrogate has no images"),
     ('{part="pump",start_s=1}', "faults.0.part"),
-    ('{part="tether",start_s=1,at_m=[0,0]}', "faults.0.start_s: given together with at_m (allowed: either start_s"),
-    ('{part="thruster",number=1,start_s=1,radius_m=2}', "faults.0.radius_m: has no effect without a place"),
-    ('{part="thruster",number=1,at_m=[3,0]}', "faults.0.at_m: (3.0, 0.0): the left camera comes no nearer than"),
-    ('{part="thruster",number=1,start_s=1,direction_deg=9}', "faults.0.direction_deg: has no effect on off"),
-    ('{part="lamp",start_s=1}', "faults.0.part: lamp: the surrogate has no images"),
-    ('{part="lamp",number=3,start_s=1}', "faults.0.number: 3 (allowed: 1 to 2)"),
-    ('{part="lamp",type="stuck",start_s=1}', "faults.0.type: stuck: not simulated for lamp"),
-    ('{part="water",type="silt",start_s=1}', "faults.0.part: water: the surrogate has no images"),
-    ('{part="pressure",type="delayed",size=0,start_s=1}', "faults.0.size: 0: not a delay (allowed: above 0)"),
 ])  # fmt: skip
 def test_a_fault_that_cannot_be_is_refused_before_the_flight(fault, problem):
     with pytest.raises(ScenarioError) as raised:
         prepare(load_scenario("reef", ["imaging.fidelity=surrogate", f"faults=[{fault}]"]))
     assert any(problem in line for line in raised.value.lines), raised.value.lines
+
+
+def test_all_faults_that_cannot_be_are_named_at_once():
+    refused = [
+        ('{part="tether",start_s=1,at_m=[0,0]}', "start_s: given together with at_m (allowed: either start_s"),
+        ('{part="thruster",number=1,start_s=1,radius_m=2}', "radius_m: has no effect without a place"),
+        ('{part="thruster",number=1,at_m=[3,0]}', "at_m: (3.0, 0.0): the left camera comes no nearer than"),
+        ('{part="thruster",number=1,start_s=1,direction_deg=9}', "direction_deg: has no effect on off"),
+        ('{part="lamp",start_s=1}', "part: lamp: the surrogate has no images"),
+        ('{part="lamp",number=3,start_s=1}', "number: 3 (allowed: 1 to 2)"),
+        ('{part="lamp",type="stuck",start_s=1}', "type: stuck: not simulated for lamp"),
+        ('{part="water",type="silt",start_s=1}', "part: water: the surrogate has no images"),
+        ('{part="pressure",type="delayed",size=0,start_s=1}', "size: 0: not a delay (allowed: above 0)"),
+    ]
+    faults = ",".join(fault for fault, _ in refused)
+    with pytest.raises(ScenarioError) as raised:
+        prepare(load_scenario("reef", ["imaging.fidelity=surrogate", f"faults=[{faults}]"]))
+    for k, (_, problem) in enumerate(refused):
+        assert any(f"faults.{k}.{problem}" in line for line in raised.value.lines), raised.value.lines
 
 
 def flown(tmp_path, *overrides):
