@@ -15,6 +15,7 @@ from twin.controllers.segments import Line, Point, Segment, line
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import Detour, SurveyPlan, SurveyRequest
 
+_LEAST_M = 0.1  # least distance of a break within a leg from the ends of the leg
 _SAME_M = 1e-6  # distance below which two points of a path are the same
 
 
@@ -33,11 +34,13 @@ class Task(NamedTuple):
     #: a leg that is nearest to the target
     after_track: int | None = None
     start_s: float | None = None
+    within_leg: bool = False  # the survey is broken off within a leg: at `start_s`, else where it is nearest
 
 
 class _Break(NamedTuple):
     track: int  # from 1
     n_segments: int  # of the track that are flown before
+    along_m: float = math.inf  # length of the last of them that is flown before; inf: all of it
 
 
 def with_tasks(plan: SurveyPlan, tasks: Sequence[Task], hold_s: float) -> SurveyPlan:
@@ -48,6 +51,8 @@ def with_tasks(plan: SurveyPlan, tasks: Sequence[Task], hold_s: float) -> Survey
     """
     placed = sorted(((_break(plan, task, hold_s), task) for task in tasks), key=lambda item: item[0])
     for leave, task in reversed(placed):
+        if math.isfinite(leave.along_m):
+            plan = _split(plan, leave)
         path, n = _detour(plan, leave, task)
         plan = _inserted(plan, leave, path, n, task.name)
     return plan
@@ -70,6 +75,8 @@ def _break(plan: SurveyPlan, task: Task, hold_s: float) -> _Break:
     ends, time_s = list[tuple[_Break, float, float]](), 0.0
     for number, path in enumerate(plan.paths, 1):
         for k, segment in enumerate(path, 1):
+            if task.within_leg and isinstance(segment, Line) and segment.profile.length_m > 2 * _LEAST_M:
+                ends.append(_nearest_within(segment, _Break(number, k), time_s, task))
             time_s += segment.profile.duration_s
             away_m = math.dist(end_of([segment])[:2], task.centre_m)
             ends.append((_Break(number, k), time_s, away_m))
@@ -77,6 +84,31 @@ def _break(plan: SurveyPlan, task: Task, hold_s: float) -> _Break:
     if task.start_s is not None:
         return next((at for at, end_s, _ in ends if end_s >= task.start_s), ends[-1][0])
     return min(ends, key=lambda end: end[2])[0]
+
+
+def _nearest_within(leg: Line, at: _Break, begins_s: float, task: Task) -> tuple[_Break, float, float]:
+    """Returns the break within a leg that begins at a time [s], its time [s], and its distance from the target [m]."""
+    if task.start_s is None:
+        along_m = float(np.dot(np.subtract(task.centre_m, leg.start[:2]), leg.direction[:2]))
+        time_s = begins_s
+    else:
+        time_s = min(max(task.start_s, begins_s), begins_s + leg.profile.duration_s)
+        along_m = leg.profile.at(time_s - begins_s)[0]
+    along_m = min(max(along_m, _LEAST_M), leg.profile.length_m - _LEAST_M)
+    away_m = math.dist(np.array(leg.start[:2]) + along_m * np.array(leg.direction[:2]), task.centre_m)
+    return at._replace(along_m=along_m), time_s, away_m
+
+
+def _split(plan: SurveyPlan, at: _Break) -> SurveyPlan:
+    """Returns the plan with the last leg before a break as two, each flown from rest to rest."""
+    path = plan.paths[at.track - 1]
+    leg = path[at.n_segments - 1]
+    assert isinstance(leg, Line)
+    x, y, z = (np.array(leg.start) + at.along_m * np.array(leg.direction)).tolist()
+    before = leg._replace(profile=replace(leg.profile, length_m=at.along_m))
+    after = leg._replace(start=(x, y, z), profile=replace(leg.profile, length_m=leg.profile.length_m - at.along_m))
+    split = (*path[: at.n_segments - 1], before, after, *path[at.n_segments :])
+    return replace(plan, paths=(*plan.paths[: at.track - 1], split, *plan.paths[at.track :]))
 
 
 def _detour(plan: SurveyPlan, leave: _Break, task: Task) -> tuple[tuple[Segment, ...], int]:

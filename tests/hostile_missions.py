@@ -1,9 +1,10 @@
 """Hostile and ordinary missions: none may end "complete" with a wrong path, and ordinary ones must not be degraded.
 
-usage: python tests/hostile_missions.py OUT.jsonl [MISSION...|faults] [--seeds 3] [--jobs 2] [--ordinary]
+usage: python tests/hostile_missions.py OUT.jsonl [MISSION...|faults] [--seeds 3] [--first 1] [--jobs 2] [--ordinary]
 
-Flies each mission rendered over 2 m x 1 m (one track, two legs) with several seeds and appends one line per survey to
-OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each mission and the wrong ones:
+Flies each mission rendered over 2 m x 1 m (one track, two legs) with the seeds from `--first` to `--seeds` and appends
+one line per survey to OUT.jsonl; surveys already in the file are not flown again. The table at the end lists each
+mission and the wrong ones:
 
 hostile: status "complete" although the largest position error of a frame exceeds 4 times its standard deviation (of
     the worst keyframe and the motion since the last keyframe), or less than 90 % of the asked area is mapped;
@@ -43,7 +44,7 @@ def fault(part, type_, duration_s=None, **keys):
     """Returns the overrides for one fault from 4 s on, with all sensors."""
     keys = {"part": f'"{part}"', "type": f'"{type_}"', "start_s": 4.0, **keys}
     keys |= {} if duration_s is None else {"duration_s": duration_s}
-    text = ",".join(f"{key}={value}" for key, value in keys.items())
+    text = ",".join(f"{key}={value}" for key, value in keys.items() if value is not None)
     return f"faults=[{{{text}}}]", 'navigation.aiding=["pressure","ahrs","dvl","usbl"]'
 
 
@@ -59,13 +60,23 @@ FAULTS = {
     "half of the contrast lost in silt": fault("water", "silt", 5),
     "silt-out for 3 s": fault("water", "silt", 3, size=1.0),
     "8 fish": fault("fish", "school", 10, size=8),
+    "one lamp off": fault("lamp", "off", number=1),
+    "lamps off for 3 s": fault("lamp", "off", 3),
+    "lamps off at a place": fault("lamp", "off", 2, start_s=None, at_m=[0.3, -0.4], radius_m=0.3),
+    "lamps that flicker": fault("lamp", "intermittent", 5, size=0.3),
+    "gust of 0.4 m/s": fault("water", "gust", 4, size=0.4),
     "thruster off": fault("thruster", "off", number=1),
     "vertical thruster off": fault("thruster", "off", number=5),
+    "thruster at a third": fault("thruster", "wrong", number=1, size=0.3),
     "thruster stuck": fault("thruster", "stuck", number=1),
     "pressure 0.3 m off": fault("pressure", "wrong", 5, size=0.3),
     "AHRS 10 deg off": fault("ahrs", "wrong", 5, size=10),
     "DVL 0.3 m/s off": fault("dvl", "wrong", 5, size=0.3),
     "DVL without bottom lock": fault("dvl", "off", 10),
+    "DVL 1 s late": fault("dvl", "delayed", size=1),
+    "AHRS 0.5 s late": fault("ahrs", "delayed", size=0.5),
+    "pressure 1 s late": fault("pressure", "delayed", size=1),
+    "USBL 2 s late": fault("usbl", "delayed", size=2),
     "USBL spikes of 3 m": fault("usbl", "garbage", size=3),
     "USBL 3 m off": fault("usbl", "wrong", size=3),
 }
@@ -196,6 +207,7 @@ def main():
     parser.add_argument("out", type=Path)
     parser.add_argument("missions", nargs="*")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first", type=int, default=1, help="first seed")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--ordinary", action="store_true", help="fly the ordinary missions, one seed each")
     given = parser.parse_args()
@@ -204,7 +216,7 @@ def main():
     chosen = {name: missions[name] for name in names or missions}
     rows = [json.loads(text) for text in given.out.read_text().splitlines()] if given.out.exists() else []
     flown = {(row["mission"], row["seed"]) for row in rows}
-    seeds = range(101, 102) if given.ordinary else range(1, given.seeds + 1)
+    seeds = range(101, 102) if given.ordinary else range(given.first, given.seeds + 1)
     waiting = [(name, chosen[name], seed) for seed in seeds for name in chosen if (name, seed) not in flown]
     with ProcessPoolExecutor(given.jobs, get_context("spawn")) as pool, given.out.open("a") as file:
         for done in as_completed([pool.submit(fly, *survey) for survey in waiting]):

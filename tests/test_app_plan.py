@@ -157,3 +157,13 @@ def test_the_summary_is_json(summary):
     assert set(tree["floor"]["overlap_along"]) == {"minimum", "p05", "median", "maximum"}
     assert tree["plan"]["n_frames"] == summary.mission.n_frames
     assert 0 < tree["coverage"] <= 1 and len(tree["warnings"]) == len(summary.warnings)
+
+
+def test_a_plan_states_the_largest_stable_latency_and_warns_beyond_it(monkeypatch):
+    """The limit itself is that of `twin vehicle`."""
+    monkeypatch.setattr(plan_summary, "largest_latency_s", lambda _: 0.15)
+    shown = {latency: summary_of(f"control.latency={latency}") for latency in (0.2, "stated")}
+    assert {k: any("too long for a stable" in w for w in found.warnings) for k, found in shown.items()} == {
+        0.2: True, "stated": False,
+    }  # fmt: skip
+    assert ("latency", "0.20 s from image to command; stable up to 0.15 s") in plan_summary.rows(shown[0.2])

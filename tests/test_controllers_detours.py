@@ -28,7 +28,9 @@ def positions(survey):
     return [survey.references(k, survey.frames_of_track(k)[0]).position for k in range(1, survey.n_tracks + 1)]
 
 
-@pytest.mark.parametrize("where", [{"after_track": 1}, {"start_s": 10.0}, {}])
+@pytest.mark.parametrize(
+    "where", [{"after_track": 1}, {"start_s": 10.0}, {}, {"within_leg": True}, {"within_leg": True, "start_s": 10.0}]
+)
 def test_a_task_is_a_track_that_starts_and_ends_where_the_survey_was_left(where):
     level = plan(REQUEST)
     survey = with_tasks(level, [task(**where)], HOLD_S)
@@ -52,6 +54,30 @@ def test_a_task_leaves_at_the_end_of_the_leg_that_is_nearest_to_it():
     left = positions(survey)[survey.detours[0].track - 1][0]
     ends = np.concatenate([[s.points()[-1] for s in path] for path in plan(REQUEST).paths])
     assert math.dist(left[:2], (2.4, 0.9)) == pytest.approx(np.linalg.norm(ends[:, :2] - [2.4, 0.9], axis=1).min())
+
+
+def test_a_task_within_a_leg_leaves_at_the_foot_of_the_perpendicular_and_the_survey_continues_there():
+    survey = with_tasks(plan(REQUEST), [task(centre_m=(1.3, -0.9), within_leg=True)], HOLD_S)
+    track = survey.detours[0].track
+    before, own, after = positions(survey)[track - 2 : track + 1]
+    assert before[-1][0] == pytest.approx(1.3) and abs(before[-1][1] + 0.9) < 0.5 * plan(REQUEST).swath_spacing_m + 1e-9
+    np.testing.assert_allclose([own[0], after[0]], [before[-1]] * 2, atol=1e-9)
+    assert np.sign(after[20][0] - after[0][0]) == np.sign(before[-1][0] - before[-20][0])
+
+
+def test_a_task_at_a_time_within_a_leg_leaves_then():
+    level = plan(REQUEST)
+    survey = with_tasks(level, [task(start_s=7.3, within_leg=True)], HOLD_S)
+    np.testing.assert_allclose(positions(survey)[0][-1], level.reference(1, 7.3).position, atol=1e-3)
+
+
+def test_two_tasks_within_one_leg_are_flown_in_its_direction():
+    tasks = [task(name="far", centre_m=(2.0, -1.0), within_leg=True), task(centre_m=(-1.0, -1.0), within_leg=True)]
+    level, survey = plan(REQUEST), with_tasks(plan(REQUEST), tasks, HOLD_S)
+    starts = [positions(survey)[d.track - 1][0][0] for d in sorted(survey.detours, key=lambda d: d.track)]
+    assert sorted(np.round(starts, 6)) == [-1.0, 2.0]
+    before, after = (planned_keyframes(one, "lawnmower") for one in (level, survey))
+    assert set(before.swath) == set(after.swath)
 
 
 def test_several_tasks_keep_their_tracks_and_every_leg_keeps_its_number():

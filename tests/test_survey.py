@@ -194,8 +194,8 @@ def test_an_interrupted_survey_reports_its_reason_and_keeps_partial_results(tmp_
 def test_a_nan_in_the_physics_aborts_with_the_reason(tmp_path, monkeypatch):
     command = survey.make_pilot
 
-    def mad(mission):
-        sane, count = command(mission), 0
+    def mad(*given):
+        sane, count = command(*given), 0
 
         def steer(estimate, reference):
             nonlocal count

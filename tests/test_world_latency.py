@@ -7,9 +7,11 @@ from twin.controllers.segments import Reference
 from twin.core import geometry
 from twin.core.records import Estimate
 from twin.core.timing import Stopwatch
+from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.session.assembly import make_navigator, open_world
 from twin.survey import fly
+from twin.world.computer import frames_of_latency, latency_s
 from twin.world.mission import prepare
 from twin.world.pilot import RovPilot, make_pilot
 
@@ -62,6 +64,33 @@ def test_pose_and_reference_are_predicted_to_the_time_of_the_command():
 @pytest.mark.parametrize(("latency_s", "most_m"), [(0.1, 0.06), (0.2, 0.1), (0.3, 0.15)])
 def test_surveys_keep_their_path_with_a_latency(tmp_path, latency_s, most_m):
     assert deviations_m(mission(f"control.latency={latency_s}"), tmp_path).max() < most_m
+
+
+@pytest.mark.parametrize(("keys", "seconds"), [
+    ((), 0.084), (("control.computer_speed=2.1",), 0.04), (("rig.image_width_px=640",), 0.168),
+])  # fmt: skip
+def test_a_stated_latency_is_the_time_of_a_keyframe_by_pixels_and_speed_rounded_up_to_frames(keys, seconds):
+    stated = load_scenario("reef", [*SHORT, "control.latency=stated", *keys])
+    assert latency_s(stated) == pytest.approx(seconds)
+    assert frames_of_latency(stated) == np.ceil(seconds * stated.rig.frame_rate_hz)
+
+
+@pytest.mark.parametrize(("keys", "problem"), [
+    (("control.latency=stated", "control.computer_speed=0.1"), "control.computer_speed: 0.1: the estimators take"),
+    (("control.computer_speed=2",), "control.computer_speed: has no effect without a stated latency"),
+    (("control.latency=fast",), "control.latency"),
+])  # fmt: skip
+def test_a_computer_that_cannot_be_is_refused(keys, problem):
+    with pytest.raises(ScenarioError) as raised:
+        mission(*keys)
+    assert any(problem in line for line in raised.value.lines), raised.value.lines
+
+
+def test_the_slowest_computer_that_keeps_up_is_the_one_that_the_message_allows():
+    with pytest.raises(ScenarioError) as raised:
+        mission("control.latency=stated", "control.computer_speed=0.1")
+    speed = raised.value.lines[0].rpartition("at least ")[2].rstrip(")")
+    assert mission("control.latency=stated", f"control.computer_speed={speed}").scenario.control.latency == "stated"
 
 
 def test_without_latency_no_command_waits():

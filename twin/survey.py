@@ -83,7 +83,9 @@ def _run(
                 guard.cause = str(error) or "interrupted"
             for event in world.faults.events:
                 folder.log("fault", **event.described)
-            warnings = (*world.warnings, *world.faults.sentences)
+            for thruster in world.thruster_monitor.lost:
+                folder.log("thruster left out", **thruster._asdict())
+            warnings = (*world.warnings, *world.faults.sentences, *world.thruster_monitor.sentences)
             actions = monitor.actions.times
             flown = FlownSurvey(mission, world.truth(), warnings, actions, gaps, world.detail_truth)
             estimation = Estimation(navigator, stopwatch, guard, folder, monitor.report_stage, monitor.start_s)
@@ -122,7 +124,7 @@ def fly(
         SurveyAborted: the physics diverged, an alignment or a plug-in failed, or `observe` aborted the survey.
         OSError: images could not be read or written.
     """
-    pilot = make_pilot(mission)
+    pilot = make_pilot(mission, world.thruster_monitor)
     scenario = mission.scenario
     by_frame = scenario.control.height == "altimeter" or scenario.navigation.needs_every_frame
     flight = Flight(mission, world, None if by_frame else world.fast_forward(navigator, pilot))

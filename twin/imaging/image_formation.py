@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Sequence
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from twin.imaging.scene.mesh_raster import NO_OBJECTS, ObjectView
 from twin.imaging.scene.object_shadows import ObjectShadows, heights_with
 from twin.imaging.scene.object_view import Objects, draw_over_floor
 from twin.imaging.snow import MarineSnow
-from twin.scenario.model import Scenario
+from twin.scenario.model import LampConfig, Scenario
 
 
 class StampedPose(NamedTuple):
@@ -69,7 +70,8 @@ class ImageFormation:
         self._rig, self._material = rig, material_of(scenario.terrain)
         self._objects = objects
         self._facets = None if floor is None else Facets(floor)
-        self._optics = Optics(rig, illumination, scenario.lamps)
+        self._optics_of = cache(lambda lit: Optics(rig, illumination, _lit(scenario.lamps, lit)))
+        self._optics = self._optics_of((True,) * len(scenario.lamps))
         sources = self._optics.light_sources
         self._reference_depth_m, self._daylight_on = daylight.reference_depth_m, bool(daylight.surface_lx.any())
         waves = bool(daylight.focused_share)
@@ -86,6 +88,12 @@ class ImageFormation:
         particles = snow, current_mps, rig, self._optics.lamp_light, snow_rng
         height_m = scenario.plan.altitude_m
         self._snow = MarineSnow(*particles, defocus_of(scenario, rig), height_m) if snows else None
+
+    def light_lamps(self, lit: Sequence[bool]) -> None:
+        """Switches the lamps (n) on or off for the following images."""
+        self._optics = self._optics_of(tuple(lit))
+        if self._snow is not None:
+            self._snow.lamp_light = self._optics.lamp_light
 
     def view_of(self, floor: tuple[Image, Depth], camera: int, pose: StampedPose) -> RenderedView:
         """Returns the view of a camera; draws the objects, if any, into albedo and depth of the floor in place."""
@@ -148,3 +156,8 @@ class ImageFormation:
 
     def _world_from_camera(self, camera: int, pose: StampedPose) -> Array:
         return pose.world_from_left @ (self._rig.left_from_right if camera else np.eye(4))
+
+
+def _lit(lamps: Sequence[LampConfig], lit: Sequence[bool]) -> list[LampConfig]:
+    """Returns the lamps, dark where they are not lit."""
+    return [lamp if on else lamp.model_copy(update={"intensity_cd": 0.0}) for lamp, on in zip(lamps, lit, strict=True)]

@@ -66,7 +66,7 @@ class MarineSnow:
         self._start_m = rng.uniform(0, self._box_m, (n, 3))
         self._diameter_m = diameters(snow, len(self._start_m), rng)
         self._snow, self._current_mps, self._rig, self._water = snow, current_mps, rig, lamp_light[0].water
-        self._lamp_light = lamp_light
+        self.lamp_light = lamp_light
         self._defocus = Defocus(APERTURE_M, 0.0) if defocus is None else defocus
         largest = float(self._diameter_m.max(initial=0.0))
         self._margin_px = float(_width_px(rig.focal_px, largest, NEAREST_M, self._defocus))
@@ -88,7 +88,7 @@ class MarineSnow:
         pixel = points[:, :2] / points[:, 2:] * rig.focal_px + np.array(middle)
         diameter_m = self._diameter_m[found] if len(self._diameter_m) > 1 else np.repeat(self._diameter_m, len(found))
         return VisibleParticles(
-            pixel, points, self._radiance(points, self._lamp_light[camera], float(world_from_camera[2, 3])), diameter_m
+            pixel, points, self._radiance(points, self.lamp_light[camera], float(world_from_camera[2, 3])), diameter_m
         )
 
     def draw(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from twin.controllers.forecast import Forecast, forecast
 from twin.core.geometry import Array
@@ -14,7 +14,9 @@ from twin.judge.summary_statistics import finite_tree
 from twin.judge.verdict import judge_requirements
 from twin.planning.cost import ComputingCost, computing_cost
 from twin.planning.expected_error import ExpectedError, expected_error
+from twin.planning.vehicle_limits import largest_latency_s
 from twin.report.number_formats import length, percent, with_unit
+from twin.world.computer import frames_of_latency
 from twin.world.energy import planned_energy
 from twin.world.floor_forecast import FloorForecast, Spread, forecast_over_floor, spread
 from twin.world.mission import Mission
@@ -45,6 +47,21 @@ _PROPERTIES: dict[str, tuple[str, Callable[[float | None], str], Callable[[PlanS
 _EXTRAPOLATED = 1.5
 
 
+class Latency(NamedTuple):
+    """Latency of the computer, in whole frames."""
+
+    latency_s: float
+    stable_s: float  #: largest one with which leg and station keeping are stable (`largest_latency_s`)
+
+    @property
+    def unstable(self) -> bool:
+        return self.latency_s > self.stable_s
+
+    @property
+    def text(self) -> str:
+        return f"{self.latency_s:.2f} s from image to command; stable up to {self.stable_s:.2f} s"
+
+
 @dataclass(frozen=True)
 class PlanSummary:
     """Properties of a mission predicted by `twin plan`."""
@@ -55,6 +72,7 @@ class PlanSummary:
     error: ExpectedError
     cost: ComputingCost
     require: dict[str, dict[str, Any]]  #: value, limit and verdict of each required metric that can be predicted
+    latency: Latency | None  #: None without a latency
     #: sentences on requirements expected to be missed, on insufficient overlap, and on limits of validity
     warnings: tuple[str, ...]
 
@@ -75,8 +93,17 @@ def summarise(mission: Mission) -> PlanSummary:
     known = {f"{section}.{key}" for section, metrics in predicted.items() for key in metrics}
     require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
     holes = (note.removesuffix(".") for note in mission.hole_notes)
-    warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
-    return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
+    latency = _latency(mission)
+    late = [f"the latency is too long for a stable flight: {latency.text}"] if latency and latency.unstable else []
+    warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error), *late)
+    cost = computing_cost(mission, plane.n_keyframes)
+    return PlanSummary(mission, plane, floor, error, cost, require, latency, warnings)
+
+
+def _latency(mission: Mission) -> Latency | None:
+    scenario = mission.scenario
+    n, own = frames_of_latency(scenario), scenario.vehicle.dynamics == "rigid" and scenario.control.plugin is None
+    return Latency(n / mission.rig.frame_rate_hz, largest_latency_s(mission)) if n and own else None
 
 
 def run_time_s(mission: Mission) -> float:
@@ -177,6 +204,7 @@ def rows(summary: PlanSummary) -> list[tuple[str, str]]:
         ("frames", f"{mission.n_frames}"),
         ("time", f"{f.duration_s + summary.hold_s:.0f} s, of which {summary.hold_s:.0f} s station keeping"),
         *([("energy", _energy_text(mission))] if mission.scenario.vehicle.dynamics == "rigid" else []),
+        *([("latency", summary.latency.text)] if summary.latency else []),
         ("path", length(f.path_m)),
         ("speed", f"{length(f.speed_mps)} per second along a {swath}"),
         ("spacing", f"{length(f.keyframe_spacing_m)} between keyframes, {_swath_spacing(mission)} between {swath}s"),
@@ -263,6 +291,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "holes": _holes(mission),
             "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,
+            "latency": summary.latency and summary.latency._asdict(),
             "energy": planned_energy(mission)._asdict(),
             "cost": summary.cost._asdict(),
             "warnings": list(summary.warnings),

@@ -922,7 +922,7 @@ class ObjectConfig(Section):
 
 
 class TaskConfig(Section):
-    """Close survey of a target, for which the survey is broken off at the end of a leg; afterwards the vehicle returns.
+    """Close survey of a target, for which the survey is broken off; afterwards the vehicle returns to where it left.
 
     Its keyframes have an elevation map of their own, in the frame of the map of the area.
     """
@@ -946,6 +946,9 @@ class TaskConfig(Section):
     start_s: float | None = Field(default=None, ge=0, le=1e6)
     """time from which on the survey is broken off, at the next end of a leg; default: at the end of a leg that is
     nearest to the target [s]"""
+    within_leg: bool = False
+    """true: the survey is broken off within a leg, at start_s or, without it, at the point of a leg that is nearest to
+    the target, and continues there; false: at the end of a leg"""
     cell_m: float | None = Field(default=None, gt=0.0005, le=1)
     """cell size of its map; default: map.cell_m in the ratio of the altitudes [m]"""
 
@@ -964,16 +967,20 @@ class ControlConfig(Section):
     also rises over obstacles (plan.clearance_m); where nothing has been measured yet, the floor is taken to continue"""
     natural_frequency_radps: float = Field(default=1.2, gt=0.05, le=10)
     """natural frequency of the closed position loop [rad/s]"""
-    latency: Literal["none"] | Latency = "none"
+    latency: Literal["none", "stated"] | Latency = "none"
     """time from an image to the command that follows from it, of a computer of finite speed, in whole frames [s]; the
-    controller knows it and predicts the motion meanwhile"""
+    controller knows it and predicts the motion meanwhile. stated: the time of the estimators for a keyframe on a
+    computer of computer_speed, proportional to the number of pixels"""
+    computer_speed: float = Field(default=1.0, ge=0.01, le=100)
+    """speed of the computer with latency = "stated", relative to the reference (2 cores of an x86-64 machine), which
+    takes 84 ms for a keyframe of 320 x 240 pixels"""
+    thruster_feedback: Literal["speed", "none"] = "speed"
+    """what the speed controllers (ESC) of the thrusters report. speed: the speed of each propeller, from which its
+    thrust follows; a thruster that misses half of the thrust of its commands is left out of the thrust allocation;
+    none: nothing"""
     off_course_m: float | None = Field(default=None, gt=0, le=1000)
     """largest distance from the planned path; beyond it for one second, the survey is degraded; default: a quarter of
     the shorter side of the footprint [m]"""
-
-    @property
-    def latency_s(self) -> float:
-        return 0.0 if self.latency == "none" else self.latency
 
 
 #: Parts that can fail, with the ways in which they can, in the words of PX4.
@@ -982,41 +989,50 @@ FAULTS: dict[str, tuple[str, ...]] = {
     "cameras": ("off", "stuck", "garbage", "intermittent"),
     "left_camera": ("off", "stuck", "garbage", "intermittent"),
     "right_camera": ("off", "stuck", "garbage", "intermittent"),
-    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent"),
-    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent"),
-    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent"),
-    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent"),
+    "lamp": ("off", "intermittent"),
+    "pressure": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    "ahrs": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    "dvl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
+    "usbl": ("off", "stuck", "wrong", "garbage", "intermittent", "delayed"),
     "tether": ("stuck",),
-    "water": ("silt",),
+    "water": ("silt", "gust"),
     "fish": ("school",),
 }
 
 
 class FaultConfig(Section):
-    """Fault of a part, at a time or at a rate; the estimators and the controller are not told of it."""
+    """Fault of a part, at a time, at a place or at a rate; the estimators and the controller are not told of it."""
 
     part: Literal[
-        "thruster", "cameras", "left_camera", "right_camera", "pressure", "ahrs", "dvl", "usbl", "tether", "water",
-        "fish",
+        "thruster", "cameras", "left_camera", "right_camera", "lamp", "pressure", "ahrs", "dvl", "usbl", "tether",
+        "water", "fish",
     ]  # fmt: skip
-    """part that fails, or what drifts in front of the cameras; a sensor must be in navigation.aiding"""
-    number: int | None = Field(default=None, ge=1, le=32)
-    """number of the thruster, from 1"""
-    type: Literal["off", "stuck", "wrong", "garbage", "intermittent", "silt", "school"] = "off"
-    """off: no thrust, black images, no readings; stuck: the command, the images or the reading of its start are
-    repeated, the tether is caught with a slack of `size`; wrong: thrust times `size`, readings plus `size`; garbage:
-    images of noise, readings with added noise of standard deviation `size`; intermittent: as off, at random frames;
-    silt: a cloud hides the share `size` of the contrast, rises in 1 s and settles at a time constant of 3 s; school:
-    `size` fish swim between cameras and floor"""
+    """part that fails, what drifts in front of the cameras, or the water; a sensor must be in navigation.aiding"""
+    number: int | None = Field(default=None, ge=1, le=64)
+    """number of the thruster or the lamp, from 1; default: all lamps"""
+    type: Literal["off", "stuck", "wrong", "garbage", "intermittent", "delayed", "silt", "school", "gust"] = "off"
+    """off: no thrust, no light, black images, no readings; stuck: the command, the images or the reading of its start
+    are repeated, the tether is caught with a slack of `size`; wrong: thrust times `size`, readings plus `size`;
+    garbage: images of noise, readings with added noise of standard deviation `size`; intermittent: as off, at random
+    frames; delayed: readings arrive `size` seconds late; silt: a cloud hides the share `size` of the contrast, rises in
+    1 s and settles at a time constant of 3 s; school: `size` fish swim between cameras and floor; gust: the water moves
+    by `size` m/s more, rises and falls within 1 s"""
     start_s: float | None = Field(default=None, ge=0, le=1e6)
-    """time at which it starts; default: with per_hour [s]"""
+    """time at which it starts; default: see at_m and per_hour [s]"""
+    at_m: Vector2 | None = None
+    """place x, y in the scene: it starts when the left camera first comes within radius_m of it [m]"""
+    radius_m: float = Field(default=0.5, gt=0, le=1000)
+    """with at_m: horizontal distance at which it starts [m]"""
     per_hour: float | None = Field(default=None, gt=0, le=3600)
     """mean number of faults per hour, at random times"""
     duration_s: float | None = Field(default=None, gt=0, le=1e6)
     """duration of a fault; default: to the end of the survey [s]"""
     size: float = Field(default=0.5, ge=-100, le=100)
     """wrong, garbage: factor on the thrust; bias or noise of readings in their unit [m, deg, m/s]; intermittent: share
-    of the frames that are lost, 0 to 1; tether: slack [m]"""
+    of the frames that are lost, 0 to 1; delayed: delay [s]; tether: slack [m]; gust: added velocity [m/s]"""
+    direction_deg: float | None = Field(default=None, ge=-360, le=360)
+    """gust: direction of the added velocity, counter-clockwise from x (east); default: to port of the vehicle at its
+    start [deg]"""
 
     @property
     def name(self) -> str:

@@ -131,7 +131,7 @@ class SteppedWorld:
         `control.height` and `plan.fill_gaps` ask. Raises TwinError if the plug-in that the scenario names cannot be
         loaded.
         """
-        steer, flight = make_pilot(self._mission), self.flight
+        steer, flight = make_pilot(self._mission, self.world.thruster_monitor), self.flight
         adapt = PathAdaptation(flight)
 
         def command(estimate: Estimate, frame: Frame) -> Array:

@@ -6,6 +6,8 @@ scenario, which therefore act as model errors. The top speed includes the drag f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from twin.controllers.allocation import ThrustAllocation, pseudo_inverse_allocation
@@ -51,7 +53,7 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     follow from the thrust allocation. The Munk moment and the net buoyancy are neglected.
     """
     hull, rov = trimmed_hull(vehicle), parameters_of(vehicle)
-    thrusts_from_force, full_n = _allocation(rov).thrusts_from_wrench[:, 3:], _full_thrust_n(rov)
+    thrusts_from_force, full_n = _allocation(rov).thrusts_from_wrench[:, 3:], full_thrust_n(vehicle)
     linear = hull.linear_drag[3:, 3:] @ direction
     quadratic = hull.quadratic_drag[3:, 3:] @ (np.abs(direction) * direction)
     coefficients = zip(thrusts_from_force @ quadratic, thrusts_from_force @ linear, strict=True)
@@ -66,14 +68,14 @@ def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
     Velocities [m/s] are through the water, in the body, which is level, see `steady_thrusts_n`.
     """
     thrusts = steady_thrusts_n(vehicle, velocities)
-    return np.abs(thrusts).max(axis=1, initial=0.0) / _full_thrust_n(parameters_of(vehicle))
+    return np.abs(thrusts).max(axis=1, initial=0.0) / full_thrust_n(vehicle)
 
 
 def full_force_n(vehicle: VehicleConfig, direction: Array) -> float:
     """Returns the force along a direction (3,) in the body at which the first thruster saturates [N]."""
     rov = parameters_of(vehicle)
     per_newton = _allocation(rov).thrusts_from_wrench[:, 3:] @ direction
-    return _full_thrust_n(rov) / float(np.abs(per_newton).max())
+    return full_thrust_n(vehicle) / float(np.abs(per_newton).max())
 
 
 def steady_thrusts_n(vehicle: VehicleConfig, velocities: Array) -> Array:
@@ -96,13 +98,26 @@ def _controller_model(hull: Hull) -> HullModel:
     return HullModel(hull.inertia + added, added[3:], linear, quadratic, hull.drag_centre_m)
 
 
+def allocation_without(vehicle: VehicleConfig, lost: Sequence[int]) -> ThrustAllocation:
+    """Returns the allocation that leaves out the thrusters with these indices, whose commands are then 0."""
+    rov = parameters_of(vehicle)
+    configuration = rov.thrust_configuration.copy()
+    configuration[:, lost] = 0.0
+    return _allocation(rov._replace(thrust_configuration=configuration))
+
+
+def commanded_thrusts_n(vehicle: VehicleConfig, command: Array) -> Array:
+    """Returns the steady thrusts (n,) of commands (n,), which the thrusters limit to [-1, 1] [N]."""
+    return _thrust_n(parameters_of(vehicle), np.clip(command, -1.0, 1.0))
+
+
 def _allocation(rov: VehicleParameters) -> ThrustAllocation:
     return pseudo_inverse_allocation(angular_first(rov.thrust_configuration), lambda command: _thrust_n(rov, command))
 
 
-def _full_thrust_n(rov: VehicleParameters) -> float:
-    """Returns the smaller of the greatest thrusts forwards and backwards."""
-    return float(np.abs(_thrust_n(rov, np.array([-1.0, 1.0]))).min())
+def full_thrust_n(vehicle: VehicleConfig) -> float:
+    """Returns the full thrust of a thruster: the smaller of the greatest thrusts forwards and backwards [N]."""
+    return float(np.abs(_thrust_n(parameters_of(vehicle), np.array([-1.0, 1.0]))).min())
 
 
 def _thrust_n(rov: VehicleParameters, command: Array) -> Array:

@@ -83,9 +83,12 @@ class CompiledVehicle:
         return self.state.tether
 
     @property
-    def thrust_factors(self) -> Array:
-        """Returns the factors (n,) on the thrusts, which can be modified in place; 1 without faults."""
-        return self.state.thrusters.factors
+    def sea(self) -> Sea:
+        return self.state.sea
+
+    @property
+    def thrusters(self) -> ThrusterState:
+        return self.state.thrusters
 
     @property
     def twist_body(self) -> Array:

@@ -1,12 +1,14 @@
-"""Faults of thrusters, cameras, sensors and water: when each is active, and what it does to commands and data."""
+"""Faults of thrusters, cameras, lamps, sensors and water: when each is active, and its effect on commands and data."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from twin.core.geometry import Array
 from twin.core.records import Image, Readings, StereoRig
@@ -46,14 +48,22 @@ class Faults:
     ):
         self._rng, self._rig, self._floor_m, self._time_s = rng, rig, floor_m, 0.0
         self._spans = [(fault, span) for fault in faults for span in _spans(fault, duration_s, rng)]
+        self._of_places = [fault for fault in faults if fault.at_m is not None]  # that the vehicle has not reached
+        self._gusts = [fault for fault in faults if fault.type == "gust"]
         self._active: list[FaultConfig] = []
         self._kept: dict[tuple[int, object], Any] = {}  # by fault and kind of data: what a stuck part repeats
         self.events: list[FaultEvent] = []
         self.exist = bool(faults)
 
-    def at(self, time_s: float) -> None:
-        """Sets the time of the following calls, and adds `events` for the faults that have started or ended."""
+    def at(self, time_s: float, camera_m: Array) -> None:
+        """Sets the time of the following calls, and adds `events` for the faults that have started or ended.
+
+        `camera_m` (3,) is the true position of the left camera, at which faults of a place start.
+        """
         self._time_s = time_s
+        for fault in [one for one in self._of_places if math.dist(one.at_m or (), camera_m[:2]) <= one.radius_m]:
+            self._of_places.remove(fault)
+            self._spans.append((fault, (time_s, time_s + _lasting_s(fault))))
         active = [fault for fault, (start, end) in self._spans if start - 1e-9 <= time_s < end - 1e-9]
         for starts, new, old in ((True, active, self._active), (False, self._active, active)):
             for fault in new:
@@ -91,6 +101,25 @@ class Faults:
         elif tether.snag[0] == 0.0:
             tether.snag[:] = 1.0, *position_m, caught[0].size
 
+    def blow(self, single_gusts: Array, port: Array) -> None:
+        """Lets gusts begin and end; `port` (3,) is the direction to port of the vehicle."""
+        for row, fault in zip(single_gusts, self._gusts, strict=True):
+            if any(fault is one for one in self._active):
+                if row[0] > self._time_s or row[1] <= self._time_s:
+                    to_port, given_deg = np.arctan2(port[1], port[0]), fault.direction_deg
+                    angle = to_port if given_deg is None else np.deg2rad(given_deg)
+                    row[:] = self._time_s, np.inf, fault.size * np.cos(angle), fault.size * np.sin(angle), 0.0
+            elif np.isinf(row[1]) and row[0] <= self._time_s:
+                row[1] = self._time_s
+
+    def lamps_lit(self, n: int) -> NDArray[np.bool_]:
+        """Returns which of n lamps are lit."""
+        lit = np.ones(n, np.bool_)
+        for fault in self._of("lamp"):
+            if self._is_lost(fault):
+                lit[slice(None) if fault.number is None else fault.number - 1] = False
+        return lit
+
     def images(self, *images: Image | None) -> list[Image | None]:
         """Returns the images (h, w, 3) of the left and the right camera as they are delivered."""
         delivered = self._views(*images)
@@ -107,7 +136,7 @@ class Faults:
         seen = list(images)
         for n, (fault, (start_s, end_s)) in enumerate(self._spans):
             since_s = self._time_s - start_s
-            if fault.part == "water" and since_s >= 0:
+            if fault.type == "silt" and since_s >= 0:
                 share = silt_share(min(fault.size, 1.0), since_s, max(0.0, self._time_s - end_s))
                 if share > _LEAST_SILT:
                     seen = [image if image is None else behind_silt(image, share, self._rng) for image in seen]
@@ -131,7 +160,9 @@ class Faults:
         for fault in self._of(*_READING_OF):
             name = _READING_OF[fault.part]
             value = getattr(readings, name)
-            if value is not None:
+            if fault.type == "delayed":
+                readings = replace(readings, **{name: self._late_reading(fault, value)})
+            elif value is not None:
                 readings = replace(readings, **{name: self._faulty_reading(fault, value)})
         return readings
 
@@ -143,6 +174,15 @@ class Faults:
             return value + size * (self._rng.standard_normal(np.shape(value)) if fault.type == "garbage" else 1.0)
         return None if self._is_lost(fault) else value
 
+    def _late_reading(self, fault: FaultConfig, value: Any) -> Any:
+        """Returns the newest reading that arrives now, None if none does."""
+        waiting, found = self._kept.setdefault((id(fault), "readings"), []), None
+        if value is not None:
+            waiting.append((self._time_s + fault.size, value))
+        while waiting and waiting[0][0] <= self._time_s + 1e-9:
+            found = waiting.pop(0)[1]
+        return found
+
     def _is_lost(self, fault: FaultConfig) -> bool:
         return fault.type == "off" or (fault.type == "intermittent" and self._rng.uniform() < fault.size)
 
@@ -152,11 +192,16 @@ class Faults:
 
 def _spans(fault: FaultConfig, duration_s: float, rng: np.random.Generator) -> Iterator[tuple[float, float]]:
     """Yields start and end of each occurrence of a fault [s]."""
-    lasting_s = np.inf if fault.duration_s is None else fault.duration_s
+    lasting_s = _lasting_s(fault)
+    if fault.start_s is not None:
+        yield fault.start_s, fault.start_s + lasting_s
     if fault.per_hour is None:
-        yield fault.start_s or 0.0, (fault.start_s or 0.0) + lasting_s
         return
     time_s = float(rng.exponential(3600 / fault.per_hour))
     while time_s < duration_s:
         yield time_s, time_s + lasting_s
         time_s += lasting_s + float(rng.exponential(3600 / fault.per_hour))
+
+
+def _lasting_s(fault: FaultConfig) -> float:
+    return np.inf if fault.duration_s is None else fault.duration_s

@@ -1,4 +1,7 @@
-"""Gusts: a Gauss-Markov process with the covariance sigma^2 exp(-|t| / T), the same for any timestep of the physics."""
+"""Gusts: a Gauss-Markov process with the covariance sigma^2 exp(-|t| / T), the same for any timestep of the physics.
+
+Single gusts, of faults, have a known start, end and velocity.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from twin.scenario.model import CurrentConfig
 GUST_INTERVAL_S = 0.1  #: time between the values of a series [s]
 _REPEAT = 60  # the series repeats after this multiple of the correlation time, or after an hour if that is longer
 _HOUR_S = 3600.0
+_RISE_S = 1.0  # in which a single gust rises, and falls
 _VERTICAL = 0.5  # default ratio of the standard deviations, vertical to horizontal: about 1.2 u* to 2.3 u*
 
 
@@ -50,3 +54,23 @@ def add_gusts(series, time_s, flow):
         linear, square, cube = c - a, 2 * a - 5 * b + 4 * c - d, 3 * (b - c) + d - a
         flow[0, i] += b + 0.5 * s * (linear + s * (square + s * cube))
         flow[1, i] += 0.5 * (linear + s * (2 * square + 3 * s * cube)) / GUST_INTERVAL_S
+
+
+def single_gusts(n: int) -> Array:
+    """Returns n gusts that have not begun: rows (n, 5) of start, end [s] and velocity to east, north and up [m/s]."""
+    return np.tile([np.inf, np.inf, 0.0, 0.0, 0.0], (n, 1))
+
+
+@kernel
+def add_single_gusts(gusts, time_s, flow):
+    """Adds `single_gusts` at a time to a flow (5, 3), see `sea.flow_at`; they rise and fall with a continuous rate."""
+    for start_s, end_s, east, north, up in gusts:
+        for sign, since_s in ((1.0, time_s - start_s), (-1.0, time_s - end_s)):
+            if since_s <= 0.0:
+                continue
+            share = min(1.0, since_s / _RISE_S)
+            velocity = sign * share * share * (3 - 2 * share)
+            rate = sign * 6 * share * (1 - share) / _RISE_S
+            for i, mps in enumerate((east, north, up)):
+                flow[0, i] += velocity * mps
+                flow[1, i] += rate * mps

@@ -36,6 +36,7 @@ class MujocoVehicle:
 
     Attributes:
         tether: its tether; `snag` can be modified in place.
+        sea: motion of the water; `single_gusts` can be modified in place.
         after_timestep: called with `inertial` after each timestep; None: nothing is called.
         touched: returns which obstacle the hull touches at a pose world_from_body, "" for none.
     """
@@ -45,7 +46,7 @@ class MujocoVehicle:
     ):
         self.tether = tether
         self._model, self._data = model, mujoco.MjData(model)
-        self._hull, self._sea = trimmed_hull(vehicle), sea
+        self._hull, self.sea = trimmed_hull(vehicle), sea
         self._body = model.body("vehicle").id
         joint = int(model.body_jntadr[self._body])
         first_q, first_v = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
@@ -53,7 +54,7 @@ class MujocoVehicle:
         self._velocity = self._data.qvel[self._dofs]  # a view into MjData
         self._acceleration = np.zeros(6)
         self._kick = 0.5  # the first step advances the velocity by half a timestep, see the class docstring
-        self._thrusters = lagged_thrusters(parameters_of(vehicle), model.opt.timestep)
+        self.thrusters = lagged_thrusters(parameters_of(vehicle), model.opt.timestep)
         self._history: deque[str] = deque(maxlen=3)
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
@@ -74,15 +75,10 @@ class MujocoVehicle:
         return twist_from_free_joint(self._rotation, self._velocity_now())
 
     @property
-    def thrust_factors(self) -> Array:
-        """Returns the factors (n,) on the thrusts, which can be modified in place; 1 without faults."""
-        return self._thrusters.factors
-
-    @property
     def inertial(self) -> Array:
         """Returns the true [angular rate, specific force] (6,) in body axes [rad/s, m/s2], at the time of the pose."""
         velocity = self._velocity_now()
-        acceleration = self._acceleration_at(velocity, thruster_wrench(self._thrusters))
+        acceleration = self._acceleration_at(velocity, thruster_wrench(self.thrusters))
         return inertial_quantities(self._rotation, velocity[3:], acceleration[:3])
 
     @property
@@ -95,17 +91,17 @@ class MujocoVehicle:
 
     def _acceleration_at(self, velocity: Array, wrench: Array) -> Array:
         at = self._data.xpos[self._body]
-        flow = flow_at(self._sea, self.time_s, at)
-        add_tether(wrench, self.tether, self._sea, self.time_s, self._rotation, at, velocity)
+        flow = flow_at(self.sea, self.time_s, at)
+        add_tether(wrench, self.tether, self.sea, self.time_s, self._rotation, at, velocity)
         return free_joint_acceleration(self._hull, self._rotation, velocity, flow, wrench)
 
     def step(self, thruster_u: Array, duration_s: float) -> None:
         """Simulates as `CompiledVehicle.step` does, with all obstacles."""
         n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
-        set_thruster_command(self._thrusters, thruster_u)
+        set_thruster_command(self.thrusters, thruster_u)
         for _ in range(n_steps):
-            self._advance(thruster_wrench(self._thrusters))
-            step_thrusters(self._thrusters)
+            self._advance(thruster_wrench(self.thrusters))
+            step_thrusters(self.thrusters)
             if self.after_timestep is not None:
                 self.after_timestep(self.inertial)
             if obstacle := self.touched(self.world_from_body):

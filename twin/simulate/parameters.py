@@ -57,7 +57,11 @@ def _matrix(diagonal: Sequence[float], full: Sequence[Sequence[float]] | None) -
     return np.diag(diagonal) if full is None else np.array(full, float)
 
 
-def moves_along_all_axes(vehicle: VehicleConfig) -> bool:
-    """Returns whether the thrusters can push along each axis and turn about the vertical, independently."""
+def moves_along_all_axes(vehicle: VehicleConfig, lost: Sequence[int] = ()) -> bool:
+    """Returns whether the thrusters can push along each axis and turn about the vertical, independently.
+
+    `lost` are the indices of thrusters that do not push.
+    """
     surge, sway, heave, _, _, yaw = range(6)
-    return np.linalg.matrix_rank(parameters_of(vehicle).thrust_configuration[[surge, sway, heave, yaw]]) == 4
+    left = np.delete(parameters_of(vehicle).thrust_configuration, lost, axis=1)
+    return np.linalg.matrix_rank(left[[surge, sway, heave, yaw]]) == 4

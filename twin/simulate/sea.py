@@ -11,7 +11,7 @@ from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.scenario.model import CurrentConfig, Scenario
 from twin.simulate.current_file import read_current
-from twin.simulate.gusts import add_gusts, gust_series
+from twin.simulate.gusts import add_gusts, add_single_gusts, gust_series, single_gusts
 from twin.simulate.waves import CALM, Waves, add_waves, wave_components
 
 #: Heights between which a profile of the current is interpolated [m].
@@ -27,6 +27,7 @@ class Sea(NamedTuple):
     tide: Array  #: (4,) amplitude to east and north [m/s], angular frequency [rad/s], phase [rad]
     gusts_mps: Array  #: (n, 3) `gusts.gust_series`
     waves: Waves
+    single_gusts: Array  #: (k, 5) `gusts.single_gusts`; its rows are set when they start
 
 
 def make_sea(scenario: Scenario, rng: np.random.Generator | None = None) -> Sea:
@@ -41,13 +42,14 @@ def make_sea(scenario: Scenario, rng: np.random.Generator | None = None) -> Sea:
     return Sea(
         times_s, heights_m, mean_mps, tide, gust_series(current, rng),
         wave_components(scenario.waves, scenario.sun.depth_m, rng),
+        single_gusts(sum(fault.type == "gust" for fault in scenario.faults)),
     )  # fmt: skip
 
 
 def steady_current(velocity_mps: Array) -> Sea:
     """Returns the sea with a steady, uniform current (3,): east, north, up."""
     mean = np.array(velocity_mps, float).reshape(1, 1, 3)
-    return Sea(np.zeros(1), np.zeros(1), mean, np.zeros(4), np.zeros((0, 3)), CALM)
+    return Sea(np.zeros(1), np.zeros(1), mean, np.zeros(4), np.zeros((0, 3)), CALM, single_gusts(0))
 
 
 def _mean(current: CurrentConfig) -> tuple[Array, Array, Array]:
@@ -93,6 +95,7 @@ def flow_at(sea, time_s, position):
             flow[0, i] += sea.tide[i] * math.cos(angle)
             flow[1, i] -= sea.tide[i] * sea.tide[2] * math.sin(angle)
     add_gusts(sea.gusts_mps, time_s, flow)
+    add_single_gusts(sea.single_gusts, time_s, flow)
     add_waves(sea.waves, time_s, position, flow)
     return flow
 

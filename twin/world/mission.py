@@ -32,6 +32,7 @@ from twin.simulate.sea import make_sea
 from twin.simulate.sensors import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.chart import chart_of
+from twin.world.computer import check_computer
 from twin.world.height_floor import load_terrain
 from twin.world.mesh_floor import MeshFloor, load_mesh_floor
 from twin.world.objects import load_objects
@@ -40,6 +41,7 @@ from twin.world.path_checks import (
     check_floor_below,
     check_lamp,
     check_objects,
+    check_places_of_faults,
     check_speed,
     check_tasks,
     check_thrust,
@@ -288,6 +290,8 @@ def _check_path(
     errors.attempt(check_floor_below, scenario.plan, terrain, plan)
     errors.attempt(check_objects, objects, plan, scenario.plan.clearance_m)
     errors.attempt(check_tasks, scenario, plan, terrain)
+    errors.attempt(check_computer, scenario, plan)
+    errors.attempt(check_places_of_faults, scenario.faults, plan)
     if (sea := errors.attempt(make_sea, scenario)) is not None:
         errors.attempt(check_thrust, scenario.vehicle, sea, plan)
     camera_m = scenario.believed_rig().body_from_camera[:3, 3]

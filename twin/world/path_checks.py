@@ -15,7 +15,7 @@ from twin.controllers.survey_plan import SurveyPlan
 from twin.controllers.tracking import rotate_lever_arm
 from twin.core.geometry import Array
 from twin.errors import TwinError
-from twin.scenario.model import PlanConfig, Scenario, VehicleConfig
+from twin.scenario.model import FaultConfig, PlanConfig, Scenario, VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.simulate.sea import Sea, strongest_currents_mps
 from twin.terrains import Terrain
@@ -78,6 +78,16 @@ def check_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> None:
         if (short_m := scenario.plan.clearance_m - least_m) > 0:
             problem = f"{task.altitude_m:g}: the cameras come within {least_m:.2f} m of the floor"
             raise TwinError(f"tasks.{k}.altitude_m", problem, f"at least {task.altitude_m + short_m:.2f}")
+
+
+def check_places_of_faults(faults: Sequence[FaultConfig], plan: SurveyPlan) -> None:
+    """Raises TwinError if the left camera does not come to the place of a fault on its planned path."""
+    for k, fault in enumerate(faults):
+        if fault.at_m is not None:
+            least_m = float(np.linalg.norm(plan.all_references().position[:, :2] - fault.at_m, axis=1).min())
+            if least_m > fault.radius_m:
+                problem = f"{fault.at_m}: the left camera comes no nearer than {least_m:.2f} m"
+                raise TwinError(f"faults.{k}.at_m", problem, f"within radius_m = {fault.radius_m:g} m of the path")
 
 
 def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearance:

@@ -9,15 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.controllers.segments import Reference
+from twin.controllers.thruster_monitor import ThrusterMonitor
 from twin.controllers.tracking import ControllerState, commanded_velocity, control_thrusters, rotate_lever_arm
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Estimate, Readings
+from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import CONTROLLERS
 from twin.plugin.protocols import ControllerSetup
-from twin.simulate.autopilot import nominal_controller, thruster_lag_s
+from twin.simulate.autopilot import allocation_without, nominal_controller, thruster_lag_s
+from twin.simulate.parameters import moves_along_all_axes
+from twin.world.computer import frames_of_latency
 from twin.world.mission import Mission
 
 #: Natural frequency of the position loop times the whole delay, at most; the attitude loop is twice as fast. At 0.3 rad
@@ -29,17 +33,18 @@ _VELOCITY_SMOOTHING_S = 0.1  # time constant of the filter: velocity from F2F is
 PilotOfEstimates = Callable[[Estimate, Reference], Array]
 
 
-def make_pilot(mission: Mission) -> PilotOfEstimates:
-    """Returns the pilot of a mission; raises TwinError if its plug-in cannot be loaded."""
+def make_pilot(mission: Mission, monitor: ThrusterMonitor | None = None) -> PilotOfEstimates:
+    """Returns the pilot of a mission; raises TwinError if its plug-in cannot be loaded.
+
+    The thrusters that `monitor` finds lost are left out; a plug-in is not told of them.
+    """
     scenario = mission.scenario
-    n_late = frames_of_latency(mission)
+    n_late = frames_of_latency(mission.scenario)
     if scenario.control.plugin is not None:
         return _late(_plugin_pilot(mission, scenario.control.plugin), n_late)
-    return RovPilot(mission) if scenario.vehicle.dynamics == "rigid" else _late(_kinematic_pilot(mission), n_late)
-
-
-def frames_of_latency(mission: Mission) -> int:
-    return round(mission.scenario.control.latency_s * mission.rig.frame_rate_hz)
+    return (
+        RovPilot(mission, monitor) if scenario.vehicle.dynamics == "rigid" else _late(_kinematic_pilot(mission), n_late)
+    )
 
 
 def _late(pilot: PilotOfEstimates, n: int) -> PilotOfEstimates:
@@ -107,10 +112,14 @@ class PilotState(NamedTuple):
 
 
 class RovPilot:
-    """Pilot of the ROV; a command (n,) has one value in [-1, 1] per thruster."""
+    """Pilot of the ROV; a command (n,) has one value in [-1, 1] per thruster.
 
-    def __init__(self, mission: Mission):
-        rig, scenario, n_late = mission.rig, mission.scenario, frames_of_latency(mission)
+    It leaves out the thrusters that `monitor` finds lost; a call raises SurveyAborted if the others do not suffice.
+    """
+
+    def __init__(self, mission: Mission, monitor: ThrusterMonitor | None = None):
+        self._vehicle, self._monitor, self._n_lost = mission.scenario.vehicle, monitor, 0
+        rig, scenario, n_late = mission.rig, mission.scenario, frames_of_latency(mission.scenario)
         frequency, latency_s = scenario.control.natural_frequency_radps, n_late / rig.frame_rate_hz
         if n_late:
             delay_s = latency_s + _VELOCITY_SMOOTHING_S + thruster_lag_s(scenario.vehicle)
@@ -129,10 +138,23 @@ class RovPilot:
         )
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
+        if self._monitor is not None and len(self._monitor.lost) > self._n_lost:
+            self._leave_out([thruster.number - 1 for thruster in self._monitor.lost])
         return steer(
             self.state, estimate.world_from_camera, estimate.camera_velocity, reference.position, reference.velocity,
             reference.acceleration, float(reference.yaw), estimate.is_measured,
         )  # fmt: skip
+
+    def _leave_out(self, lost: list[int]) -> None:
+        self._n_lost = len(lost)
+        if not moves_along_all_axes(self._vehicle, lost):
+            names = ", ".join(str(k + 1) for k in sorted(lost))
+            raise SurveyAborted(
+                f"thrusters {names} do not push as commanded: the others cannot push along all axes and turn about the"
+                " vertical"
+            )
+        allocation = allocation_without(self._vehicle, lost)
+        self.state = self.state._replace(controller=self.state.controller._replace(allocation=allocation))
 
 
 @kernel

@@ -83,6 +83,7 @@ def _with_tasks(scenario: Scenario, plan: SurveyPlan, terrain: Terrain) -> Surve
             task.name, task.position_m, task.size_m, task.altitude_m,
             0.0 if plan.follows_floor else mean_height_m(terrain, task.position_m, (side, side)),
             task.speed_mps, task.overlap_along, task.overlap_across, task.after_track, task.start_s,
+            task.within_leg,
         )
         for task, side in zip(scenario.tasks, sides, strict=True)
     ]  # fmt: skip

@@ -58,9 +58,9 @@ class RenderedWorld(World):
         super().__init__(mission, stopwatch, vehicle, sensors)
         self.renderer = Renderer(scene, rig.width_px, rig.height_px, vfov_deg)
         floor, objects = mission.rendered_terrain, mission.rendered_objects()
-        image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
+        self._image_formation = ImageFormation(scenario, mission.illumination, floor, rng["snow"], rig, objects)
         noise_rngs = rng["left_camera"], rng["right_camera"]
-        self.camera = StereoCamera(self.renderer, image_formation, scenario, *noise_rngs, stopwatch, cameras)
+        self.camera = StereoCamera(self.renderer, self._image_formation, scenario, *noise_rngs, stopwatch, cameras)
         self._surface = _overhanging_surface(mission, mission.grid)
         top_m = None if self._surface is None else self._surface.height_m
         self.coverage = Coverage(mission.grid, replace(believed, baseline_m=rig.baseline_m), top_m)
@@ -73,6 +73,8 @@ class RenderedWorld(World):
         self.renderer.close()
 
     def capture(self, step: Step) -> CameraImages:
+        if self.faults.exist:
+            self._image_formation.light_lamps(self.faults.lamps_lit(len(self.mission.scenario.lamps)).tolist())
         images = self.camera.capture(self.world_from_camera, step.keyframe, self.vehicle.twist_body)
         if images.depth_right is not None:
             self.coverage.add(self.world_from_camera, images.depth_left, images.depth_right)

@@ -12,7 +12,7 @@ from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
 from twin.scenario.model import FAULTS, Scenario, SensorConfig, SnowConfig, TerrainConfig
 from twin.simulate.parameters import moves_along_all_axes
 
-_CAMERAS = ("cameras", "left_camera", "right_camera", "water", "fish")  # parts whose faults change images
+_IN_IMAGES = ("cameras", "left_camera", "right_camera", "lamp", "fish")  # parts whose faults change images, as silt
 _MESH_KEYS = ("mesh_file", "mesh_up", "mesh_scale")
 _FILE_KEYS = ("height_file", "texture_file", "orthophoto_file", "z")
 
@@ -25,6 +25,9 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     yield from _of_tasks(scenario)
     yield from _of_sea(scenario)
     yield from _of_faults(scenario)
+    if scenario.control.latency != "stated":
+        problem, allowed = "has no effect without a stated latency", 'control.latency = "stated"'
+        yield from keys_without_effect("control", scenario.control, ["computer_speed"], problem, allowed)
     if scenario.plan.cross_rise_m and not scenario.plan.cross_lines:
         yield TwinError("plan.cross_rise_m", "has no effect without cross lines", "0, or plan.cross_lines above 0")
     if scenario.plan.cross_rise_m and scenario.vehicle.dynamics == "kinematic":
@@ -113,6 +116,8 @@ def _of_tasks(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"tasks.{k}.name", f"{task.name!r} is the name of another task", "a name of its own")
         if task.after_track is not None and task.start_s is not None:
             yield TwinError(f"tasks.{k}.start_s", "contradicts after_track", "one of the two")
+        if task.within_leg and task.after_track is not None:
+            yield TwinError(f"tasks.{k}.within_leg", "contradicts after_track", "one of the two")
         if scenario.vehicle.dynamics == "kinematic":
             problem, allowed = "a kinematic vehicle moves in a horizontal plane", 'vehicle.dynamics = "rigid"'
             yield TwinError(f"tasks.{k}.altitude_m", problem, allowed)
@@ -148,30 +153,43 @@ def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
 
 
 def _of_faults(scenario: Scenario) -> Iterator[TwinError]:
-    n, kinematic = len(scenario.vehicle.thrusters), scenario.vehicle.dynamics == "kinematic"
+    kinematic = scenario.vehicle.dynamics == "kinematic"
+    numbered = {"thruster": len(scenario.vehicle.thrusters), "lamp": len(scenario.lamps)}
     for k, fault in enumerate(scenario.faults):
         key = f"faults.{k}"
         if fault.type not in FAULTS[fault.part]:
             problem = f"{fault.type}: not simulated for {fault.part}"
             yield TwinError(f"{key}.type", problem, ", ".join(FAULTS[fault.part]))
-        if fault.part == "thruster":
-            if kinematic:
-                yield TwinError(f"{key}.part", "a kinematic vehicle has no thrusters", 'vehicle.dynamics = "rigid"')
-            elif fault.number is None or fault.number > n:
-                yield TwinError(f"{key}.number", "missing" if fault.number is None else f"{fault.number}", f"1 to {n}")
-        elif fault.number is not None:
+        n = numbered.get(fault.part)
+        if fault.part == "thruster" and kinematic:
+            yield TwinError(f"{key}.part", "a kinematic vehicle has no thrusters", 'vehicle.dynamics = "rigid"')
+        elif n == 0:
+            yield TwinError(f"{key}.part", f"the scenario has no {fault.part}", "a part that it has")
+        elif n is None and fault.number is not None:
             yield TwinError(f"{key}.number", f"has no effect on {fault.part}", "no value")
+        elif n is not None and (fault.part == "thruster" if fault.number is None else fault.number > n):
+            yield TwinError(f"{key}.number", "missing" if fault.number is None else f"{fault.number}", f"1 to {n}")
+        if fault.type == "gust" and kinematic:
+            yield TwinError(f"{key}.type", "has no effect on a kinematic vehicle", 'vehicle.dynamics = "rigid"')
+        if fault.type != "gust":
+            problem = f"has no effect on {fault.type}"
+            yield from keys_without_effect(key, fault, ["direction_deg"], problem, 'type = "gust"')
         if fault.part == "tether" and (not scenario.tether.length_m or kinematic or fault.size <= 0):
             problem = "needs a tether, a rigid vehicle and a slack above 0"
             yield TwinError(f"{key}.part", problem, "tether.length_m and size above 0")
-        if fault.part not in (*_CAMERAS, "thruster", "tether") and fault.part not in scenario.navigation.aiding:
+        if fault.part in ("pressure", "ahrs", "dvl", "usbl") and fault.part not in scenario.navigation.aiding:
             yield TwinError(f"{key}.part", f"{fault.part} is not used", "a sensor in navigation.aiding")
-        if (fault.start_s is None) == (fault.per_hour is None):
-            problem = "missing" if fault.start_s is None else "given together with per_hour"
-            yield TwinError(f"{key}.start_s", problem, "either start_s or per_hour")
+        when = [name for name in ("start_s", "at_m", "per_hour") if getattr(fault, name) is not None]
+        if len(when) != 1:
+            problem = f"given together with {when[1]}" if when else "missing"
+            yield TwinError(f"{key}.{(when or ['start_s'])[0]}", problem, "either start_s, at_m or per_hour")
+        if fault.at_m is None:
+            yield from keys_without_effect(key, fault, ["radius_m"], "has no effect without a place", "with at_m")
+        if fault.type == "delayed" and fault.size <= 0:
+            yield TwinError(f"{key}.size", f"{fault.size:g}: not a delay", "above 0")
         if fault.type == "intermittent" and not 0 <= fault.size <= 1:
             yield TwinError(f"{key}.size", f"{fault.size:g}: not a share of the frames", "0 to 1")
-        if scenario.imaging.fidelity == "surrogate" and fault.part in _CAMERAS:
+        if scenario.imaging.fidelity == "surrogate" and (fault.part in _IN_IMAGES or fault.type == "silt"):
             allowed = 'imaging.fidelity = "rendered"'
             yield TwinError(f"{key}.part", f"{fault.part}: the surrogate has no images", allowed)
 

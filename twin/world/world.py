@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.controllers.camera_surface import surface_above_floor
+from twin.controllers.thruster_monitor import ThrusterMonitor
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Exposure, Frame, Image, MapGrid, Readings, StereoRig, Trajectory, Truth
 from twin.core.series import GrowingArray
 from twin.core.timing import StageTimer
 from twin.errors import TwinError
+from twin.simulate.autopilot import commanded_thrusts_n, full_thrust_n
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.echo_sounders import Altimeter, BottomLock
 from twin.simulate.faults import Faults
@@ -73,6 +75,8 @@ class World(ABC):
         duration_s = 2 * mission.n_frames / mission.rig.frame_rate_hz  # also of a survey that is slowed
         rng, floor_m = streams(scenario.seed)["faults"], scenario.plan.altitude_m
         self.faults = Faults(scenario.faults, duration_s, rng, mission.rig, floor_m)
+        #: what the vehicle knows of its thrusters; without faults, all give the thrusts of their commands
+        self.thruster_monitor = ThrusterMonitor(full_thrust_n(scenario.vehicle), mission.rig.frame_rate_hz)
         self._altimeter = self._bottom_lock = None
         navigation = scenario.navigation
         if scenario.control.height == "altimeter":
@@ -127,10 +131,10 @@ class World(ABC):
 
     def observe(self, step: Step) -> Frame:
         """Returns the frame at the current pose and records its ground truth."""
-        index, images = len(self), self.capture(step)
+        index, time_s = len(self), len(self) / self.mission.rig.frame_rate_hz
+        self.faults.at(time_s, self.world_from_camera[:3, 3])
+        images = self.capture(step)
         self.record(self.world_from_camera)
-        time_s = index / self.mission.rig.frame_rate_hz
-        self.faults.at(time_s)
         left, right = self.faults.images(images.left, images.right)
         assert left is not None
         depth_m = images.depth_m if step.keyframe else None
@@ -145,11 +149,19 @@ class World(ABC):
         return Frame(index, time_s, left, right, readings, step.keyframe, images.exposure)
 
     def act(self, command: Array) -> None:
+        scenario, interval_s = self.mission.scenario, 1 / self.mission.rig.frame_rate_hz
         with self.stopwatch("physics"):
-            if self.faults.exist and not isinstance(self.vehicle, KinematicVehicle):
-                command, self.vehicle.thrust_factors[:] = self.faults.thrusts(command)
-                self.faults.catch_tether(self.vehicle.tether, self.vehicle.world_from_body[:3, 3])
-            self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
+            if not self.faults.exist or isinstance(self.vehicle, KinematicVehicle):
+                self.vehicle.step(command, interval_s)
+                return
+            thrusters, pose = self.vehicle.thrusters, self.vehicle.world_from_body
+            arriving, thrusters.factors[:] = self.faults.thrusts(command)
+            self.faults.catch_tether(self.vehicle.tether, pose[:3, 3])
+            self.faults.blow(self.vehicle.sea.single_gusts, pose[:3, 1])
+            self.vehicle.step(arriving, interval_s)
+            if scenario.control.thruster_feedback == "speed":
+                commanded_n = commanded_thrusts_n(scenario.vehicle, command)
+                self.thruster_monitor.add(len(self) * interval_s, commanded_n, thrusters.steady_n)
 
     def __len__(self) -> int:
         return len(self._true_poses)
