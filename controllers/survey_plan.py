@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin.controllers.camera_surface import CameraSurface
-from twin.controllers.segments import Circle, Reference, Segment, Turn
+from twin.controllers.curves import PathSegment
+from twin.controllers.segments import Circle, Reference, Turn
 from twin.controllers.survey_area import SurveyArea
 from twin.core.geometry import Array
 from twin.errors import TwinError
@@ -38,7 +39,8 @@ class SurveyRequest(NamedTuple):
     frame_rate_hz: float
     acceleration_mps2: float = 0.2  # greatest acceleration of the camera
     area: SurveyArea | None = None  # of extent `area_m`; None: a rectangle or disc at the origin, with legs along x
-    turns: Literal["reverse", "bow_first"] = "reverse"
+    turns: Literal["reverse", "bow_first", "arcs"] = "reverse"
+    turn_radius_m: float = 0.0  # least radius of the arcs
     #: Factors on the spacing of keyframes and of swaths on the reference plane; below 1 if the floor is nearer.
     along_scale: float = 1.0
     across_scale: float = 1.0
@@ -66,10 +68,10 @@ class Detour(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """Planned path and heading of the left camera. The vehicle keeps station after each track."""
+    """Planned path and heading of the left camera. The vehicle keeps station after each track, or flies arcs."""
 
     request: SurveyRequest  # the requirements that it meets
-    paths: tuple[tuple[Segment, ...], ...]  # of each track; every segment starts and ends at rest
+    paths: tuple[tuple[PathSegment, ...], ...]  # of each track; segments start and end at rest, but for arcs
     area: SurveyArea  # area to cover; the legs, and the bow on the first leg, point along its heading
     speed_mps: float  # cruise speed along the swaths
     n_frames_per_keyframe: int  # N, frames from one keyframe to the next
@@ -125,6 +127,11 @@ class SurveyPlan:
     @property
     def turns_on_the_spot(self) -> bool:
         return any(isinstance(segment, Turn) for path in self.paths for segment in path)
+
+    @property
+    def flies_arcs(self) -> bool:
+        """Returns whether the vehicle flies all tracks without stopping."""
+        return self.request.turns == "arcs"
 
     @property
     def n_tracks(self) -> int:
@@ -191,7 +198,7 @@ class SurveyPlan:
         return level if self.request.surface is None else self.request.surface.follow(level)
 
     def all_references(self) -> Reference:
-        """Returns the references of the left camera at all frames, without station keeping."""
+        """Returns the references of the left camera at all planned frames, without those between tracks."""
         tracks = range(1, self.n_tracks + 1)
         return _joined([self.references(track, self.frames_of_track(track)[0]) for track in tracks])
 

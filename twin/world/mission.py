@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from twin import terrains
 from twin.controllers import segments
 from twin.controllers.camera_surface import CameraSurface
+from twin.controllers.lawnmower import FRAMES_BETWEEN_TRACKS
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import SurveyPlan
 from twin.core import geometry
@@ -126,6 +127,11 @@ class Mission:
         return geometry.pose(geometry.rotations_of_down_camera(np.asarray(start.yaw)), start.position)
 
     @property
+    def start_velocity_mps(self) -> Array:
+        """Returns the velocity (3,) at the start of the survey: at rest, or at the planned speed if it flies arcs."""
+        return self.plan.reference(1, 0.0).velocity + 0.0  # no negative zero
+
+    @property
     def start_of_body(self) -> Array:
         return self.start @ geometry.inverse(self.rig.body_from_camera)
 
@@ -169,10 +175,16 @@ class Mission:
         times_s, keyframes = self.plan.frames_of_track(track)
         return FrameSequence(self.plan.references(track, times_s), keyframes, False, times_s, track)
 
-    def station_keeping_frames(self, track: int) -> FrameSequence:
-        """Returns the planned frames of each half of the station keeping after a track; between them, GA runs."""
-        n = self._n_holding
-        times_s = np.full(n, self.plan.track_duration_s(track))
+    def station_keeping_frames(self, track: int, half: int = 0) -> FrameSequence:
+        """Returns the planned frames of a half (0 or 1) of the station keeping after a track; between them, GA runs.
+
+        A vehicle that flies arcs goes on straight ahead.
+        """
+        n, end_s = self._n_holding, self.plan.track_duration_s(track)
+        if self.plan.flies_arcs:
+            times_s = end_s + (half + np.arange(1.0, 2.0)) / self.plan.request.frame_rate_hz
+            return FrameSequence(self.plan.references(track, times_s), np.zeros(1, np.bool_), False, times_s, track)
+        times_s = np.full(n, end_s)
         return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), True, times_s, track)
 
     def next_frames(self, track: int, path_time_s: float, pace: Pace) -> FrameSequence:
@@ -188,6 +200,8 @@ class Mission:
 
     @property
     def _n_holding(self) -> int:
+        if self.plan.flies_arcs:
+            return FRAMES_BETWEEN_TRACKS // 2
         return max(1, round(self.scenario.control.hold_s / 2 * self.plan.request.frame_rate_hz))
 
     @property
@@ -222,7 +236,8 @@ def prepare(scenario: Scenario) -> Mission:
         objects = load_objects(scenario, terrain, errors.attempt)
         for k, beacon in enumerate(scenario.beacons):
             errors.attempt(_check_beacon, k, beacon, terrain)
-    errors.attempt(check_speed, scenario.vehicle, scenario.plan, (plan or scenario.plan).speed_mps)
+    if not scenario.vehicle.is_steered_by_fins or plan is not None:
+        errors.attempt(check_speed, scenario.vehicle, scenario.plan, (plan or scenario.plan).speed_mps)
     if terrain is not None and chart is not None and plan is not None:
         _check_path(scenario, chart, plan, objects if chart is terrain else (), errors)
         grid = errors.attempt(
@@ -319,7 +334,7 @@ def _greatest_altitude_m(plan: SurveyPlan, terrain: terrains.Terrain) -> float:
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
     """Returns half the greatest extent of a footprint on the reference plane along x and y [m]."""
     across_m, along_m = plan.request.footprint_m
-    if plan.turns_on_the_spot:
+    if plan.turns_on_the_spot or plan.flies_arcs:
         diagonal_m = float(np.hypot(along_m, across_m))
         return diagonal_m / 2, diagonal_m / 2
     c, s = abs(np.cos(plan.area.heading)), abs(np.sin(plan.area.heading))

@@ -18,6 +18,7 @@ from twin.errors import TwinError
 from twin.scenario.model import PlanConfig, Scenario, VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.simulate.sea import Sea, strongest_currents_mps
+from twin.simulate.steady_flight import minimum_speed_mps
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.objects.scattering import disc_of
@@ -31,6 +32,7 @@ _AREA_SAMPLES = 500  # along each side of an area
 _CLIMB_SHARE = 0.5
 #: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.
 _MAX_SLOPE = 0.6
+_FIN_SLOPE = 0.15  #: the same of a vehicle that climbs by pitching
 
 
 def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> None:
@@ -195,7 +197,7 @@ def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain
     along = np.append(np.arange(0.0, lengths[-1], max(LAMP_STEP_M, lengths[-1] / LAMP_POINTS)), lengths[-1])
     x, y = (np.interp(along, lengths, corners[:, k]) for k in range(2))
     camera = np.column_stack([x, y, plan.camera_height_at(x, y)])
-    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + plan.turns_on_the_spot]
+    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + (plan.turns_on_the_spot or plan.flies_arcs)]
     offset = position_m - camera_m
     x, y, z = np.concatenate([camera + rotate_lever_arm(heading, offset) for heading in headings]).T
     above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
@@ -210,6 +212,9 @@ def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> 
     """Raises TwinError if a cruise speed exceeds the top speed, for loops and cross lines in the slowest direction."""
     if vehicle.dynamics == "kinematic":
         return
+    if vehicle.is_steered_by_fins and speed_mps < (least := minimum_speed_mps(vehicle)):
+        problem = f"{asked.speed_mps:g}: too slow for the fins to keep the height"
+        raise TwinError("plan.speed_mps", problem, f"at least {least:.2f}")
     around = asked.pattern == "loops" or asked.cross_lines > 0
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if around else np.zeros(1)
     directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
@@ -234,8 +239,21 @@ def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan) -> None:
     distinct = np.unique(rounded, axis=0)
     yaw, velocity = distinct[:, 0], distinct[:, 1:]
     for current in strongest_currents_mps(sea, lowest_m, highest_m):
-        if current.any() or plan.follows_floor or plan.request.cross_rise_m:
+        if vehicle.is_steered_by_fins:
+            _check_speed_through(vehicle, current, velocity)
+        elif current.any() or plan.follows_floor or plan.request.cross_rise_m:
             _check_thrust_in(vehicle, current, plan.speed_mps, yaw, velocity)
+
+
+def _check_speed_through(vehicle: VehicleConfig, current: Array, velocity: Array) -> None:
+    """Raises TwinError if the planned velocities (n, 3) need a speed through the water that fins cannot use."""
+    through = np.linalg.norm(velocity - current, axis=1)
+    least, most = minimum_speed_mps(vehicle), top_speed_mps(vehicle, np.array([1.0, 0.0, 0.0]))
+    if through.min() < least or through.max() > most:
+        raise TwinError(
+            "current.velocity_mps", f"{np.linalg.norm(current):.2f} m/s: at the planned speed over the ground, the"
+            f" speed through the water is {through.min():.2f} to {through.max():.2f} m/s", f"{least:.2f} to {most:.2f}",
+        )  # fmt: skip
 
 
 def _check_coverage(sea: Sea, lowest_m: float, highest_m: float, duration_s: float) -> None:
@@ -266,6 +284,8 @@ def _check_thrust_in(vehicle: VehicleConfig, current: Array, cruise_mps: float, 
 
 def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
     """Returns the greatest slope of a path: a share of that which saturates a thruster, at most _MAX_SLOPE."""
+    if vehicle.is_steered_by_fins:
+        return _FIN_SLOPE
     ahead = np.array([speed_mps, 0.0, 0.0])
     excess = lambda climb: _load(vehicle, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
     if excess(0.0) >= 0:

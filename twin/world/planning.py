@@ -19,6 +19,7 @@ from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, swath_numbers, travel_direction
 from twin.scenario.model import Scenario
+from twin.simulate.steady_flight import turning_radius_m
 from twin.terrains import Terrain
 from twin.world.asked_area import survey_area
 from twin.world.path_checks import climb_slope, hole_part
@@ -140,15 +141,21 @@ def _check_number(field: str, number: float, limit: int, items: str, remedy: str
 def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest:
     """Returns the requirements of a survey; without a terrain, its area lies at the origin.
 
-    Raises TwinError if the area cannot be placed, or the vehicle cannot turn on the spot.
+    Raises TwinError if the area cannot be placed, or the vehicle cannot turn as planned.
     """
     p, rig = scenario.plan, scenario.believed_rig()
     if p.turns != "reverse" and scenario.vehicle.dynamics == "kinematic":
         raise TwinError("plan.turns", f"{p.turns!r}: a kinematic vehicle does not rotate", '"reverse"')
+    if (p.turns == "arcs") != scenario.vehicle.is_steered_by_fins:
+        if p.turns == "arcs":
+            raise TwinError("plan.turns", "'arcs': the vehicle is not steered by fins", '"reverse" or "bow_first"')
+        problem = f"{p.turns!r}: a vehicle that is steered by fins can neither reverse nor turn on the spot"
+        raise TwinError("plan.turns", problem, '"arcs"')
     area = None if terrain is None else survey_area(p, terrain)
     return SurveyRequest(
         p.area_m if area is None else area.size_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across,
         p.tracks, rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz, area=area, turns=p.turns,
+        turn_radius_m=turning_radius_m(scenario.vehicle, p.speed_mps) if p.turns == "arcs" else 0.0,
         cross_lines=p.cross_lines, cross_rise_m=p.cross_rise_m,
     )  # fmt: skip
 

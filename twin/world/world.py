@@ -124,7 +124,8 @@ class World(ABC):
     def act(self, command: Array) -> None:
         with self.stopwatch("physics"):
             if self.faults.exist and not isinstance(self.vehicle, KinematicVehicle):
-                command, self.vehicle.thrust_factors[:] = self.faults.thrusts(command)
+                command, factors = self.faults.thrusts(command)
+                self.vehicle.thrust_factors[:] = factors[: len(self.vehicle.thrust_factors)]
                 self.faults.catch_tether(self.vehicle.tether, self.vehicle.world_from_body[:3, 3])
             self.vehicle.step(command, 1 / self.mission.rig.frame_rate_hz)
 

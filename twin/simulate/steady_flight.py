@@ -1,0 +1,115 @@
+"""Steady flight of a vehicle that is steered by fins: its trim on a level circle, minimum speed and turning radius."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import root
+
+from twin.core import geometry
+from twin.core.geometry import Array
+from twin.errors import TwinError
+from twin.scenario.model import VehicleConfig
+from twin.simulate.fins import add_fins, fins_of
+from twin.simulate.hull import trimmed_hull
+from twin.simulate.hydrodynamics import acceleration, angular_first
+from twin.simulate.parameters import parameters_of
+
+
+#: Share of their greatest angle that fins use in steady flight, so that the rest is left for control.
+_TRIM_SHARE = 0.5
+_RESERVE_N = 1.0  # by which the net buoyancy may change, upwards or downwards, at the minimum speed
+_SPEEDS_MPS = np.arange(3.0, 0.25, -0.05)
+_CURVATURES_PER_M = np.arange(0.01, 2.0, 0.01)
+
+
+class Trim(NamedTuple):
+    """Steady motion at constant height on a circle, or straight ahead, in still water."""
+
+    roll: float  #: [rad]
+    pitch: float  #: [rad], positive with the bow down
+    twist: Array  #: (6,) [angular, linear] velocity in body axes [rad/s, m/s]
+    thrust_n: float  #: of each thruster
+    angles_rad: Array  #: (n,) of the fins
+
+    @property
+    def yaw_from_course(self) -> float:
+        """Returns the yaw of the bow minus that of the direction of motion [rad]."""
+        course = geometry.rotation_from_rpy(self.roll, self.pitch, 0.0) @ self.twist[3:]
+        return float(-np.arctan2(course[1], course[0]))
+
+
+def trim(vehicle: VehicleConfig, speed_mps: float, curvature_per_m: float = 0.0) -> Trim | None:
+    """Returns the trim at a speed through the water on a circle of this curvature, positive to the left.
+
+    It solves acceleration (6,) = 0 and vertical velocity = 0 for roll, pitch, the two angles of the flow, the thrust,
+    and the angles of rudders and elevators: the angle of a fin is that of the rudders times the left part of its normal
+    plus that of the elevators times the upper part. None if there is no such motion, or none was found.
+    """
+    hull, fins = trimmed_hull(vehicle), fins_of(vehicle, 1.0)
+    thrusters = angular_first(parameters_of(vehicle).thrust_configuration).sum(axis=1)
+    movable = fins.max_rad > 0
+    scale = np.array([1.0, 1.0, 1.0, 1.0, hull.quadratic_drag[3, 3] * speed_mps**2, 1.0, 1.0])
+
+    def motion(unknown: Array) -> Trim:
+        roll, pitch, sideslip, attack, thrust_n, rudder, elevator = unknown * scale
+        rates = geometry.rotation_from_rpy(roll, pitch, 0.0).T @ [0.0, 0.0, curvature_per_m * speed_mps]
+        c, s = np.cos([sideslip, attack]), np.sin([sideslip, attack])
+        linear = speed_mps * np.array([c[0] * c[1], s[0], c[0] * s[1]])
+        angles = movable * (fins.normal[:, 1:] @ [rudder, elevator])
+        return Trim(roll, pitch, np.concatenate([rates, linear]), thrust_n, angles)
+
+    def residual(unknown: Array) -> Array:
+        found = motion(unknown)
+        rotation, wrench = geometry.rotation_from_rpy(found.roll, found.pitch, 0.0), found.thrust_n * thrusters
+        add_fins(wrench, fins._replace(angle_rad=found.angles_rad), found.twist)
+        rate = acceleration(hull, rotation, found.twist, np.zeros((5, 3)), wrench)
+        return np.append(rate, rotation[2] @ found.twist[3:])
+
+    solved = root(residual, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), tol=1e-10)
+    return motion(solved.x) if solved.success else None
+
+
+@cache
+def minimum_speed_mps(vehicle: VehicleConfig) -> float:
+    """Returns the least speed, rounded up to 0.05 m/s, at which the fins keep the height with a reserve.
+
+    It is at least 0.3 m/s. Raises TwinError if the fins cannot keep the height at any speed up to 3 m/s.
+    """
+    loaded = [
+        vehicle.model_copy(update={"buoyancy_n": float(np.clip(vehicle.buoyancy_n + change, -20, 20))})
+        for change in (-_RESERVE_N, _RESERVE_N)
+    ]
+    least = np.inf
+    for speed in _SPEEDS_MPS:
+        if not all(_is_easy(each, trim(each, speed)) for each in loaded):
+            break
+        least = speed
+    if least == np.inf:
+        problem = f"cannot keep the height against a net buoyancy of {vehicle.buoyancy_n:g} N"
+        raise TwinError("vehicle.fins", problem, "larger fins, or a vehicle.buoyancy_n nearer to 0")
+    return float(least)
+
+
+@cache
+def turning_radius_m(vehicle: VehicleConfig, speed_mps: float) -> float:
+    """Returns the least radius of a level turn in which the fins use half of their greatest angles [m].
+
+    Raises TwinError if they cannot turn the vehicle.
+    """
+    easy = 0.0
+    for curvature in _CURVATURES_PER_M:
+        if not _is_easy(vehicle, trim(vehicle, speed_mps, curvature)):
+            break
+        easy = curvature
+    if easy == 0.0:
+        problem = f"cannot turn the vehicle at {speed_mps:g} m/s within 100 m"
+        raise TwinError("vehicle.fins", problem, "larger fins, or another plan.speed_mps")
+    return float(1 / easy)
+
+
+def _is_easy(vehicle: VehicleConfig, found: Trim | None) -> bool:
+    fins = fins_of(vehicle, 1.0)
+    return found is not None and bool((np.abs(found.angles_rad) <= _TRIM_SHARE * fins.max_rad + 1e-12).all())
