@@ -16,7 +16,7 @@ from twin.controllers.segments import Line, Point, Reference, Segment
 from twin.core.geometry import Array
 
 _STEP_M = 0.01  # of the integration along a curve
-_RAMP_S = 1.5  # time in which the curvature rises from 0 to its greatest value, or falls to 0
+_RAMP_S = 3.0  # time in which the curvature rises from 0 to its greatest value, or falls to 0
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from twin.core.geometry import Array
 
 #: Limits of the integrals of the position error along and across the path, and upwards [m s].
 _MOST_INTEGRAL = np.array([20.0, 20.0, 20.0])
-_CURRENT_S = 6.0  # time constant of the estimate of the current
+_CURRENT_S = 6.0  # time constant of the estimate of the current; at first, that since the start
 _MOST_ERROR = np.array([1.5, 1.0, 0.5])  # position error that is corrected at once [m]
 
 
@@ -41,6 +41,7 @@ class FinAutopilot:
         self._table, self._gains, self.most = table, gains, most
         self._speed_mps, self._period_s = speed_mps, period_s
         self._integral, self._current = np.zeros(3), np.zeros(2)
+        self._since_start_s = 0.0
 
     def inputs(
         self, pose: Array, twist: Array, position: Array, velocity: Array, acceleration: Array, is_measured: bool
@@ -86,4 +87,6 @@ class FinAutopilot:
         """Updates the integrals and the current: what moves the vehicle across its bow faster than in its trim."""
         if not saturated:
             self._integral = np.clip(self._integral + self._period_s * error, -_MOST_INTEGRAL, _MOST_INTEGRAL)
-        self._current = self._current + self._period_s / _CURRENT_S * drift_mps * pose[:2, 1]
+        self._since_start_s += self._period_s
+        lag_s = min(max(self._since_start_s, 5 * self._period_s), _CURRENT_S)
+        self._current = self._current + self._period_s / lag_s * drift_mps * pose[:2, 1]

@@ -16,10 +16,10 @@ from twin.simulate.hydrodynamics import acceleration, angular_first
 from twin.simulate.parameters import parameters_of
 from twin.simulate.steady_flight import Trim, trim, turning_radius_m
 
-#: Deviations that cost the same (Bryson's rule): position along, across, up [m], roll, pitch, yaw [rad], twist (without
-#: cost), integrals of the position [m s]; inputs as shares of their greatest values.
-_DEVIATIONS = np.array([1.0, 0.3, 0.3, np.inf, 0.3, 0.3, *[np.inf] * 6, 5.0, 1.5, 1.5])
-_INPUT_SHARE = 0.25
+#: Deviations that cost the same (Bryson's rule): position along, across, up [m], roll, pitch, yaw [rad], twist (of
+#: which only the yaw rate costs [rad/s]), integrals of the position [m s]; inputs as shares of their greatest values.
+_DEVIATIONS = np.array([1.0, 0.2, 0.2, np.inf, 0.3, 0.15, *[np.inf] * 2, 0.3, *[np.inf] * 3, 5.0, 2.0, 1.5])
+_INPUT_SHARE = 0.5
 _N_CURVATURES = 9  # of the table of trims
 _BEYOND = 1.5  # greatest curvature of the table, in curvatures of the planned turns
 _STEP = 1e-5  # of the numerical derivatives

@@ -19,7 +19,7 @@ from twin.simulate.parameters import parameters_of
 
 
 #: Share of their greatest angle that fins use in steady flight, so that the rest is left for control.
-_TRIM_SHARE = 0.5
+_TRIM_SHARE = 0.4
 _RESERVE_N = 1.0  # by which the net buoyancy may change, upwards or downwards, at the minimum speed
 _SPEEDS_MPS = np.arange(3.0, 0.25, -0.05)
 _CURVATURES_PER_M = np.arange(0.01, 2.0, 0.01)
@@ -86,16 +86,16 @@ def minimum_speed_mps(vehicle: VehicleConfig) -> float:
     for speed in _SPEEDS_MPS:
         if not all(_is_easy(each, trim(each, speed)) for each in loaded):
             break
-        least = speed
+        least = round(float(speed), 2)
     if least == np.inf:
         problem = f"cannot keep the height against a net buoyancy of {vehicle.buoyancy_n:g} N"
         raise TwinError("vehicle.fins", problem, "larger fins, or a vehicle.buoyancy_n nearer to 0")
-    return float(least)
+    return least
 
 
 @cache
 def turning_radius_m(vehicle: VehicleConfig, speed_mps: float) -> float:
-    """Returns the least radius of a level turn in which the fins use half of their greatest angles [m].
+    """Returns the least radius of a level turn in which the fins use two fifths of their greatest angles [m].
 
     Raises TwinError if they cannot turn the vehicle.
     """

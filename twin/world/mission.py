@@ -29,7 +29,7 @@ from twin.plugin.guard import check_loadable
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, Source, TaskConfig
 from twin.simulate.hull import physics_timestep_s
-from twin.simulate.sea import make_sea
+from twin.simulate.sea import make_sea, mean_current_mps
 from twin.simulate.sensors import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.chart import chart_of
@@ -122,9 +122,16 @@ class Mission:
 
     @property
     def start(self) -> Array:
-        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow along the first leg."""
+        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow along the first leg.
+
+        If it flies arcs, its bow points along its velocity through the mean current.
+        """
         start = self.plan.reference(1, 0.0)
-        return geometry.pose(geometry.rotations_of_down_camera(np.asarray(start.yaw)), start.position)
+        yaw = np.asarray(start.yaw)
+        if self.plan.flies_arcs:
+            x, y, _ = start.velocity - mean_current_mps(make_sea(self.scenario), float(start.position[2]))
+            yaw = np.arctan2(y, x)
+        return geometry.pose(geometry.rotations_of_down_camera(yaw), start.position)
 
     @property
     def start_velocity_mps(self) -> Array:

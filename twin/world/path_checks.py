@@ -240,7 +240,8 @@ def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan) -> None:
     yaw, velocity = distinct[:, 0], distinct[:, 1:]
     for current in strongest_currents_mps(sea, lowest_m, highest_m):
         if vehicle.is_steered_by_fins:
-            _check_speed_through(vehicle, current, velocity)
+            if current.any():
+                _check_speed_through(vehicle, current, velocity)
         elif current.any() or plan.follows_floor or plan.request.cross_rise_m:
             _check_thrust_in(vehicle, current, plan.speed_mps, yaw, velocity)
 
