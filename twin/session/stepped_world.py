@@ -85,8 +85,8 @@ class SteppedWorld:
         """Moves the vehicle for one frame interval under a constant command and returns the next frame.
 
         Args:
-            command: (n,) commands in [-1, 1] of `vehicle.thrusters`, then of the movable `vehicle.fins`, which limit larger
-                values. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
+            command: (n,) commands in [-1, 1] of `vehicle.thrusters`, then of the movable `vehicle.fins`; larger values
+                are limited. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
             pace: pace along the planned path from this frame to the next, from `actions`.
             keyframe: whether the next frame is a keyframe, which has both images; None: as planned.
 

@@ -37,7 +37,6 @@ from twin.simulate.thrusters import (
     thruster_wrench,
 )  # fmt: skip
 
-
 AT_REST = np.zeros(3)
 
 
@@ -105,9 +104,9 @@ class CompiledVehicle:
         return body_twist(self.state)
 
     def step(self, command: Array, duration_s: float) -> None:
-        """Simulates `duration_s`, whole timesteps (else ValueError), under commands (n,) in [-1, 1], of thrusters and fins.
+        """Simulates `duration_s`, whole timesteps (else ValueError), under commands (n,) in [-1, 1].
 
-        Raises SurveyAborted if the physics diverged, or the hull touches the floor.
+        The commands are those of the thrusters, then those of the movable fins. Raises SurveyAborted if the physics diverged, or the hull touches the floor.
         """
         advance(self.state, command, whole_timesteps(duration_s, self.state.timestep_s))
         self.advance_clock(duration_s)

@@ -17,7 +17,6 @@ from twin.simulate.hull import trimmed_hull
 from twin.simulate.hydrodynamics import acceleration, angular_first
 from twin.simulate.parameters import parameters_of
 
-
 #: Share of their greatest angle that fins use in steady flight, so that the rest is left for control.
 _TRIM_SHARE = 0.4
 _RESERVE_N = 1.0  # by which the net buoyancy may change, upwards or downwards, at the minimum speed
@@ -94,14 +93,14 @@ def minimum_speed_mps(vehicle: VehicleConfig) -> float:
 
 
 @cache
-def turning_radius_m(vehicle: VehicleConfig, speed_mps: float) -> float:
-    """Returns the least radius of a level turn in which the fins use two fifths of their greatest angles [m].
+def turning_radius_m(vehicle: VehicleConfig, speed_mps: float, share: float = _TRIM_SHARE) -> float:
+    """Returns the least radius of a level turn in which the fins use this share of their greatest angles [m].
 
     Raises TwinError if they cannot turn the vehicle.
     """
     easy = 0.0
     for curvature in _CURVATURES_PER_M:
-        if not _is_easy(vehicle, trim(vehicle, speed_mps, curvature)):
+        if not _is_easy(vehicle, trim(vehicle, speed_mps, curvature), share):
             break
         easy = curvature
     if easy == 0.0:
@@ -110,6 +109,6 @@ def turning_radius_m(vehicle: VehicleConfig, speed_mps: float) -> float:
     return float(1 / easy)
 
 
-def _is_easy(vehicle: VehicleConfig, found: Trim | None) -> bool:
+def _is_easy(vehicle: VehicleConfig, found: Trim | None, share: float = _TRIM_SHARE) -> bool:
     fins = fins_of(vehicle, 1.0)
-    return found is not None and bool((np.abs(found.angles_rad) <= _TRIM_SHARE * fins.max_rad + 1e-12).all())
+    return found is not None and bool((np.abs(found.angles_rad) <= share * fins.max_rad + 1e-12).all())
