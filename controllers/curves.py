@@ -6,41 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import root_scalar
 
-from twin.controllers.segments import Line, Point, Reference, Segment
+from twin.controllers.segments import Line, Point, Reference, Segment, SpeedProfile
 from twin.core.geometry import Array
 
 _STEP_M = 0.01  # of the integration along a curve
 _RAMP_S = 3.0  # time in which the curvature rises from 0 to its greatest value, or falls to 0
 
-
-@dataclass(frozen=True)
-class SteadySpeed:
-    """Speed profile of constant speed, which continues before and after the segment."""
-
-    length_m: float
-    cruise_mps: float
-
-    @property
-    def duration_s(self) -> float:
-        return self.length_m / self.cruise_mps
-
-    def at(self, time_s: float) -> tuple[float, float, float]:
-        """Returns distance [m], speed [m/s] and acceleration [m/s2] at a time since the start [s]."""
-        return self.cruise_mps * time_s, self.cruise_mps, 0.0
-
-
-class Bend(NamedTuple):
-    """Piece of a curve whose curvature changes linearly over its length; positive to the left."""
-
-    length_m: float
-    first_per_m: float
-    last_per_m: float
+#: Curvatures [1/m], positive to the left, at distances [m] from the start; linear between them.
+Bends = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
@@ -49,43 +27,35 @@ class Curve:
 
     start: Point
     yaw: float
-    bends: tuple[Bend, ...]
+    bends: Bends
     speed_mps: float
 
     @property
-    def profile(self) -> SteadySpeed:
-        return SteadySpeed(sum(bend.length_m for bend in self.bends), self.speed_mps)
+    def profile(self) -> SpeedProfile:
+        return SpeedProfile(self.bends[-1][0], self.speed_mps, math.inf)
 
     @cached_property
-    def _samples(self) -> tuple[Array, Array, Array, Array]:
-        """Returns distance [m], curvature [1/m], yaw [rad] (n,) and position (n, 2) [m] of points along the curve."""
-        ends = np.cumsum([0.0, *(bend.length_m for bend in self.bends)])
+    def _samples(self) -> tuple[Array, Array]:
+        """Returns distances (n,) [m], and rows x, y [m], yaw [rad] and curvature [1/m] (4, n) there."""
+        ends, curvatures = np.array(self.bends).T
         along = np.unique(np.concatenate([np.arange(0.0, ends[-1], _STEP_M), ends]))
-        curvature = np.zeros(len(along))
-        for bend, low, high in zip(self.bends, ends[:-1], ends[1:], strict=True):
-            inside = (along >= low) & (along <= high)
-            curvature[inside] = np.interp(along[inside], [low, high], [bend.first_per_m, bend.last_per_m])
+        curvature = np.interp(along, ends, curvatures)
         yaw = self.yaw + cumulative_trapezoid(curvature, along, initial=0)
-        direction = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        xy = np.array(self.start[:2]) + cumulative_trapezoid(direction, along, axis=0, initial=0)
-        return along, curvature, yaw, xy
+        x, y = (cumulative_trapezoid(f(yaw), along, initial=0) for f in (np.cos, np.sin))
+        return along, np.stack([x + self.start[0], y + self.start[1], yaw, curvature])
 
     def points(self) -> Array:
-        _, _, _, xy = self._samples
-        return np.column_stack([xy, np.full(len(xy), self.start[2])])
+        x, y, *_ = self._samples[1]
+        return np.column_stack([x, y, np.full(len(x), self.start[2])])
 
     def at(self, times_s: Array) -> Reference:
         """Returns the references (n,) at times (n,) since the start [s]."""
-        along, curvature, yaw, xy = self._samples
-        s = self.speed_mps * times_s
-        x, y, heading, bend = (np.interp(s, along, values) for values in (*xy.T, yaw, curvature))
-        level, c, sine = np.zeros(len(s)), np.cos(heading), np.sin(heading)
-        return Reference(
-            np.column_stack([x, y, level + self.start[2]]),
-            self.speed_mps * np.column_stack([c, sine, level]),
-            heading,
-            (self.speed_mps**2 * bend)[:, None] * np.column_stack([-sine, c, level]),
-        )
+        along, rows = self._samples
+        x, y, yaw, curvature = (np.interp(self.speed_mps * times_s, along, row) for row in rows)
+        level, c, s = np.zeros(len(yaw)), np.cos(yaw), np.sin(yaw)
+        centripetal = (self.speed_mps**2 * curvature)[:, None] * np.column_stack([-s, c, level])
+        velocity = self.speed_mps * np.column_stack([c, s, level])
+        return Reference(np.column_stack([x, y, level + self.start[2]]), velocity, yaw, centripetal)
 
 
 PathSegment = Segment | Curve
@@ -97,44 +67,40 @@ def end_of(path: Sequence[PathSegment]) -> Point:
 
 
 def steady_line(start: Point, yaw: float, length_m: float, speed_mps: float) -> Line:
-    return Line(start, (math.cos(yaw), math.sin(yaw), 0.0), SteadySpeed(length_m, speed_mps), yaw)
+    profile = SpeedProfile(length_m, speed_mps, math.inf)
+    return Line(start, (math.cos(yaw), math.sin(yaw), 0.0), profile, yaw)
 
 
 def u_turn(start: Point, yaw: float, across_m: float, radius_m: float, speed_mps: float) -> Curve:
-    """Returns the turn by 180 deg that ends `across_m` to the left of its start, or to the right if negative.
+    """Returns the turn by 180 deg that ends abreast of its start, `across_m` to the left (negative: to the right).
 
     A half circle with ramps of its curvature (clothoids) where there is room for one of at least `radius_m`; else a
-    keyhole turn, which first bends away. It ends abreast of its start.
+    keyhole turn, which first bends away.
     """
-    sign, bends = math.copysign(1.0, across_m), _bends_of_turn(abs(across_m), radius_m, speed_mps)
-    return Curve(start, yaw, tuple(Bend(b.length_m, sign * b.first_per_m, sign * b.last_per_m) for b in bends), speed_mps)
+    bends = _bends_of_turn(abs(across_m), radius_m, speed_mps)
+    return Curve(start, yaw, tuple((s, math.copysign(k, k * across_m)) for s, k in bends), speed_mps)
 
 
 @cache
-def _bends_of_turn(across_m: float, radius_m: float, speed_mps: float) -> tuple[Bend, ...]:
-    ramp_m, half = _RAMP_S * speed_mps, [math.pi]
+def _bends_of_turn(across_m: float, radius_m: float, speed_mps: float) -> Bends:
+    def excess_m(away: float, radius: float) -> float:
+        bends = _bends([-away, math.pi + 2 * away, -away], radius, _RAMP_S * speed_mps)
+        return float(Curve((0.0, 0.0, 0.0), 0.0, bends, speed_mps).points()[-1, 1]) - across_m
 
-    def width_m(angles: Sequence[float], radius: float) -> float:
-        curve = Curve((0.0, 0.0, 0.0), 0.0, _bends(angles, radius, ramp_m), speed_mps)
-        return float(curve.points()[-1, 1])
-
-    def keyhole(away: float) -> list[float]:
-        return [-away, math.pi + 2 * away, -away]
-
-    if width_m(half, radius_m) > across_m:
-        away = root_scalar(lambda a: width_m(keyhole(a), radius_m) - across_m, bracket=(1e-6, math.pi / 2), xtol=1e-10)
-        return _bends(keyhole(away.root), radius_m, ramp_m)
-    wide = root_scalar(lambda r: width_m(half, r) - across_m, bracket=(radius_m, across_m / 2), xtol=1e-10)
-    return _bends(half, wide.root, ramp_m)
+    away, radius = 0.0, radius_m
+    if excess_m(0.0, radius_m) > 0:
+        away = root_scalar(excess_m, args=(radius_m,), bracket=(0.0, math.pi / 2), xtol=1e-10).root
+    else:
+        radius = root_scalar(lambda r: excess_m(0.0, r), bracket=(radius_m, across_m / 2), xtol=1e-10).root
+    return _bends([-away, math.pi + 2 * away, -away], radius, _RAMP_S * speed_mps)
 
 
-def _bends(angles: Sequence[float], radius_m: float, ramp_m: float) -> tuple[Bend, ...]:
-    """Returns the pieces of arcs by angles [rad], each with a ramp of its curvature at both ends."""
-    bends: list[Bend] = []
+def _bends(angles: Sequence[float], radius_m: float, ramp_m: float) -> Bends:
+    """Returns arcs by angles [rad], each with a ramp of its curvature at both ends."""
+    bends = [(0.0, 0.0)]
     for angle in angles:
         peak = math.copysign(min(1 / radius_m, abs(angle) / ramp_m), angle)
-        bends.append(Bend(ramp_m, 0.0, peak))
-        if (rest_m := angle / peak - ramp_m) > 0:
-            bends.append(Bend(rest_m, peak, peak))
-        bends.append(Bend(ramp_m, peak, 0.0))
+        if peak:
+            start_m, length_m = bends[-1][0], angle / peak + ramp_m
+            bends += [(start_m + s, k) for s, k in ((ramp_m, peak), (length_m - ramp_m, peak), (length_m, 0.0))]
     return tuple(bends)

@@ -34,7 +34,6 @@ from twin.core.geometry import Array
 _SPACING_SAMPLES = 2001  # of an uneven spacing, across an area
 _COINCIDE_M = 1e-9  # distance below which two corners of a path are the same
 _RUN_S = 2.0  # time of straight flight before a leg and after it, in which the vehicle settles
-FRAMES_BETWEEN_TRACKS = 2  #: number of frames between the tracks of a path that is flown in arcs
 
 
 class _Strip(NamedTuple):
@@ -159,26 +158,21 @@ def _tracks_of_arcs(
 ) -> list[tuple[PathSegment, ...]]:
     """Returns the segments of tracks between their corners (u, v) [m], flown at constant speed.
 
-    A straight line before and after each leg gives the vehicle time to settle. A track lasts a whole number of frames,
-    and the next one starts one frame after the `FRAMES_BETWEEN_TRACKS`.
+    A straight line before and after each leg gives the vehicle time to settle; the first line of a track begins where
+    the last track ends, after a whole number of frames.
     """
-    speed, frame_m = request.speed_mps, request.speed_mps / request.frame_rate_hz
-    between_m = (FRAMES_BETWEEN_TRACKS + 1) * frame_m
-    run_m = max(_RUN_S * speed, between_m + 2 * frame_m)
-    paths, done_m = list[tuple[PathSegment, ...]](), 0.0
+    speed, radius_m, run_m = request.speed_mps, request.turn_radius_m, _RUN_S * request.speed_mps
+    ahead, astern, done_m, paths = area.heading, area.heading + math.pi, 0.0, list[tuple[PathSegment, ...]]()
     for (start, south), (turn, _), (_, north), (end, _), *following in corners:
-        first = _points(request, area, [(start - run_m + done_m, south)])[0]
-        out = steady_line(first, area.heading, turn - start + 2 * run_m - done_m, speed)
-        far = u_turn(end_of([out]), area.heading, north - south, request.turn_radius_m, speed)
-        back = steady_line(end_of([far]), area.heading + math.pi, turn - end + 2 * run_m, speed)
-        path: list[PathSegment] = [out, far, back]
-        for _, v in following:
-            path.append(u_turn(end_of([back]), area.heading + math.pi, -(v - north), request.turn_radius_m, speed))
-        frames = sum(segment.profile.duration_s for segment in path) * request.frame_rate_hz
-        rest_m = (math.floor(frames) + 1 - frames) * frame_m
-        path.append(steady_line(end_of(path), area.heading + (0.0 if following else math.pi), rest_m, speed))
+        (first,) = _points(request, area, [(start - run_m + done_m, south)])
+        path: list[PathSegment] = [steady_line(first, ahead, turn - start + 2 * run_m - done_m, speed)]
+        path.append(u_turn(end_of(path), ahead, north - south, radius_m, speed))
+        path.append(steady_line(end_of(path), astern, turn - end + 2 * run_m, speed))
+        path += [u_turn(end_of(path), astern, north - v, radius_m, speed) for _, v in following]
+        n_frames = sum(segment.profile.duration_s for segment in path) * request.frame_rate_hz
+        done_m = (math.floor(n_frames) + 1 - n_frames) * speed / request.frame_rate_hz
+        path.append(steady_line(end_of(path), ahead if following else astern, done_m, speed))
         paths.append(tuple(path))
-        done_m = rest_m + between_m
     return paths
 
 

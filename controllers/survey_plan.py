@@ -20,6 +20,7 @@ _EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of roun
 TURN_RATE = math.radians(15)  # greatest rate of a turn on the spot [rad/s]: 0.5 deg between frames at 30 Hz
 TURN_ACCELERATION = math.radians(15)  # angular acceleration of a turn [rad/s2]
 TURN_PER_KEYFRAME = math.radians(10)  # greatest rotation between keyframes [rad]; beyond it, patch matching degrades
+FRAMES_BETWEEN_TRACKS = 2  #: between the tracks of a path that is flown in arcs, for the global alignment
 
 #: Largest number of tracks to fly, and of tracks that fill an area; least altitude, and least side of an area [m].
 MAX_TRACKS, MAX_FILLING, LEAST_M = 10_000, 1_000_000, 1e-3
@@ -165,10 +166,13 @@ class SurveyPlan:
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
         """Returns the times (n,) of the frames of a track since its start [s], and whether each is a keyframe.
 
+        Of a path that is flown in arcs, `FRAMES_BETWEEN_TRACKS` follow, and then the first one of the next track.
+
         These are every N-th frame, with its own N for a task, and the last one, and more while the vehicle turns
         (`TURN_PER_KEYFRAME`).
         """
-        frames = np.arange(round(self.track_duration_s(track) * self.request.frame_rate_hz) + 1)
+        n_frames = round(self.track_duration_s(track) * self.request.frame_rate_hz) + 1
+        frames = np.arange(n_frames - (FRAMES_BETWEEN_TRACKS + 1 if self.flies_arcs else 0))
         steps = {detour.track: detour.n_frames_per_keyframe for detour in self.detours}
         times_s, n = frames / self.request.frame_rate_hz, steps.get(track, self.n_frames_per_keyframe)
         keyframe = (frames % n == 0) | (frames == frames[-1])

@@ -14,7 +14,6 @@ from twin.planning.vehicle_limits import VehicleLimits, axes_of, electrical_powe
 from twin.report.style import FIGURE_STYLE
 from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
-from twin.simulate.steady_flight import trim
 
 
 def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
@@ -32,9 +31,7 @@ def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
         speed.set(xlabel="thrust of the busiest thruster [%]", ylabel="speed [m/s]", title=f"Speed of {limits.title}")
         power.set(xlabel="speed [m/s]", ylabel="electrical power [W]", title="Power", ylim=(0, None))
         speed.legend()
-        if vehicle.is_steered_by_fins:
-            _draw_turns(figure.add_subplot(1, 3, 3), vehicle, limits)
-        else:
+        if not vehicle.is_steered_by_fins:
             _draw_currents(figure.add_subplot(1, 3, 3, projection="polar"), vehicle)
         file.parent.mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_png(str(file))
@@ -48,11 +45,3 @@ def _draw_currents(axes: Any, vehicle: VehicleConfig) -> None:
     axes.set_theta_zero_location("N")
     axes.set_title("Current that it holds, by bearing from the bow [m/s]")
 
-
-def _draw_turns(axes: Any, vehicle: VehicleConfig, limits: VehicleLimits) -> None:
-    radii_m = np.geomspace(limits.full_rudder_radius_m, 100.0, 40)
-    found = [trim(vehicle, limits.speed_mps, 1 / radius) for radius in radii_m]
-    angles = [np.nan if each is None else np.degrees(np.abs(each.angles_rad).max()) for each in found]
-    axes.semilogx(radii_m, angles)
-    axes.axvline(limits.turning_radius_m, ls=":", color="0.4")
-    axes.set(xlabel="radius of a level turn [m]", ylabel="greatest angle of a fin [deg]", title="Turns")

@@ -217,8 +217,8 @@ class FinConfig(Section):
 
     position_m: Vector3
     """centre of pressure in the body [m]"""
-    normal: Vector3
-    """direction of the lift at a positive angle, across the x axis of the body; its length is irrelevant"""
+    lift_direction_deg: float = Field(ge=-180, le=180)
+    """direction of the lift at a positive angle, from left (0: a rudder) towards up (90: an elevator) [deg]"""
     area_m2: Positive
     """planform area [m2]"""
     lift_slope_per_rad: Positive
@@ -229,13 +229,6 @@ class FinConfig(Section):
     """angle at a command of 1; 0: a fixed fin, without a command [deg]"""
     lag_s: float = Field(default=0.1, gt=0, le=5)
     """time constant with which the angle follows the command [s]"""
-
-    @field_validator("normal")
-    @classmethod
-    def _require_across(cls, value: Vector3) -> Vector3:
-        if value[0] != 0 or not any(value):
-            raise PydanticCustomError("normal", "a vector across the x axis that is not zero")
-        return value
 
 
 #: Position and direction of the thrusters of the BlueROV2 Heavy: four vectored at 45 deg, then four vertical ones.
@@ -1212,10 +1205,8 @@ class Scenario(Section):
     def estimator_settings(self) -> EstimatorSettings:
         noise = self.imaging.noise_sd, self.imaging.shot_noise
         settings = self.estimate.model_dump(exclude={"plugin"})
-        noisy = self.sensor is not None or max(noise) >= _VISIBLE_NOISE
-        return EstimatorSettings(
-            **settings, noisy_images=noisy, stops_if_blind=not self.vehicle.is_steered_by_fins
-        )  # fmt: skip
+        noisy, stops = self.sensor is not None or max(noise) >= _VISIBLE_NOISE, not self.vehicle.is_steered_by_fins
+        return EstimatorSettings(**settings, noisy_images=noisy, stops_if_blind=stops)
 
     def fingerprint(self) -> str:
         """Returns a hash of all values but `record`, 16 hexadecimal digits; of files, only the paths are hashed."""

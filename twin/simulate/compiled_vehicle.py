@@ -18,14 +18,9 @@ from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
 from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches_floor
-from twin.simulate.fins import Fins, add_fins, fins_of, set_fin_commands, step_fins
+from twin.simulate.fins import Fins, add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
-from twin.simulate.hydrodynamics import (
-    Hull,
-    free_joint_acceleration,
-    twist_from_free_joint,
-    velocity_through_water,
-)
+from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import Sea, flow_at
 from twin.simulate.tether import NO_TETHER, Tether, add_tether
@@ -106,7 +101,8 @@ class CompiledVehicle:
     def step(self, command: Array, duration_s: float) -> None:
         """Simulates `duration_s`, whole timesteps (else ValueError), under commands (n,) in [-1, 1].
 
-        The commands are those of the thrusters, then those of the movable fins. Raises SurveyAborted if the physics diverged, or the hull touches the floor.
+        The commands are those of the thrusters, then those of the movable fins. Raises SurveyAborted if the physics
+        diverged, or the hull touches the floor.
         """
         advance(self.state, command, whole_timesteps(duration_s, self.state.timestep_s))
         self.advance_clock(duration_s)

@@ -17,6 +17,7 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
+from twin.simulate.hydrodynamics import twist_from_free_joint
 
 WATER_KG_M3 = 1025.0
 
@@ -25,7 +26,7 @@ class Fins(NamedTuple):
     """State and parameters of n fins, for a fixed timestep."""
 
     position_m: Array  #: (n, 3) centre of pressure from the centre of gravity, in the body
-    normal: Array  #: (n, 3) unit vectors of the lift at a positive angle
+    normal: Array  #: (n, 2) parts to the left and up of the unit vector of the lift at a positive angle
     coefficient: Array  #: (n,) rho/2 S a [N s2/m2 per rad]
     stall_rad: Array  #: (n,)
     max_rad: Array  #: (n,) angle at a command of 1; 0 of a fixed fin
@@ -37,10 +38,10 @@ class Fins(NamedTuple):
 def fins_of(vehicle: VehicleConfig, timestep_s: float) -> Fins:
     """Returns the fins of a vehicle at an angle of 0, exact for commands that are constant over a timestep."""
     fins, n = vehicle.fins, len(vehicle.fins)
-    normal = np.array([fin.normal for fin in fins], float).reshape(n, 3)
+    direction = np.radians([fin.lift_direction_deg for fin in fins])
     return Fins(
         position_m=np.array([fin.position_m for fin in fins], float).reshape(n, 3),
-        normal=normal / np.linalg.norm(normal, axis=1, keepdims=True),
+        normal=np.column_stack([np.cos(direction), np.sin(direction)]),
         coefficient=np.array([WATER_KG_M3 / 2 * fin.area_m2 * fin.lift_slope_per_rad for fin in fins]),
         stall_rad=np.radians([fin.stall_deg for fin in fins]),
         max_rad=np.radians([fin.max_deg for fin in fins]),
@@ -68,6 +69,14 @@ def step_fins(fins):
 
 
 @kernel
+def velocity_through_water(world_from_body, velocity, flow):
+    """Returns the [angular, linear] velocity (6,) through the water in body axes, from that of a free joint."""
+    moving = velocity.copy()
+    moving[:3] -= flow[0]
+    return twist_from_free_joint(world_from_body, moving)
+
+
+@kernel
 def add_fins(wrench, fins, relative):
     """Adds the forces of the fins to a wrench (6,) [moment, force] in body axes [N m, N].
 
@@ -75,7 +84,7 @@ def add_fins(wrench, fins, relative):
     """
     for n in range(len(fins.angle_rad)):
         x, y, z = fins.position_m[n]
-        _, left, up = fins.normal[n]
+        left, up = fins.normal[n]
         p, q, r, u, v, w = relative
         ahead = u + q * z - r * y
         across = left * (v + r * x - p * z) + up * (w + p * y - q * x)

@@ -63,10 +63,12 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, flow: Array, 
         flow: (5, 3) motion of the water in the world, see `sea.flow_at`.
         wrench: (6,) [moment, force] of the thrusters in body axes [N m, N].
     """
-    current = _current_in_body(world_from_body, flow)
+    current = np.zeros(6)  # R'v_c
     up = np.zeros(3)
     for k in range(3):
         up[k] = world_from_body[2, k]
+        for i in range(3):
+            current[3 + k] += world_from_body[i, k] * flow[0, i]
     relative = twist - current
     momentum, added_momentum = hull.inertia * twist, np.zeros(6)
     added_flow, rate = np.zeros(6), np.zeros(6)  # rate: - w x R'v_c
@@ -91,22 +93,6 @@ def acceleration(hull: Hull, world_from_body: Array, twist: Array, flow: Array, 
         total[k, k] += hull.inertia[k]
     _solve_in_place(total, force)
     return force
-
-
-@kernel
-def _current_in_body(world_from_body: Array, flow: Array) -> Array:
-    """Returns R'v_c as a twist (6,), without an angular part."""
-    current = np.zeros(6)
-    for k in range(3):
-        for i in range(3):
-            current[3 + k] += world_from_body[i, k] * flow[0, i]
-    return current
-
-
-@kernel
-def velocity_through_water(world_from_body: Array, velocity: Array, flow: Array) -> Array:
-    """Returns the [angular, linear] velocity (6,) through the water in body axes, from that of a free joint."""
-    return twist_from_free_joint(world_from_body, velocity) - _current_in_body(world_from_body, flow)
 
 
 @kernel

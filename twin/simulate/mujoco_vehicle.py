@@ -14,9 +14,9 @@ from twin.scenario.model import VehicleConfig
 from twin.scenes.gl import MjModel, mujoco
 from twin.simulate.compiled_vehicle import AT_REST
 from twin.simulate.contact import contact_error
-from twin.simulate.fins import add_fins, fins_of, set_fin_commands, step_fins
+from twin.simulate.fins import add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
-from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint, velocity_through_water
+from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import Sea, flow_at
 from twin.simulate.sensors import inertial_quantities

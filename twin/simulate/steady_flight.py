@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,13 +11,12 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.errors import TwinError
 from twin.scenario.model import VehicleConfig
-from twin.simulate.fins import add_fins, fins_of
+from twin.simulate.fins import Fins, add_fins, fins_of
 from twin.simulate.hull import trimmed_hull
-from twin.simulate.hydrodynamics import acceleration, angular_first
+from twin.simulate.hydrodynamics import Hull, acceleration, angular_first
 from twin.simulate.parameters import parameters_of
 
-#: Share of their greatest angle that fins use in steady flight, so that the rest is left for control.
-_TRIM_SHARE = 0.4
+_TRIM_SHARE = 0.4  # share of their greatest angle that fins use in steady flight; the rest is left for control
 _RESERVE_N = 1.0  # by which the net buoyancy may change, upwards or downwards, at the minimum speed
 _SPEEDS_MPS = np.arange(3.0, 0.25, -0.05)
 _CURVATURES_PER_M = np.arange(0.01, 2.0, 0.01)
@@ -40,6 +38,13 @@ class Trim(NamedTuple):
         return float(-np.arctan2(course[1], course[0]))
 
 
+def accelerated(hull: Hull, fins: Fins, rotation: Array, twist: Array, thrust: Array, angles_rad: Array) -> Array:
+    """Returns the `acceleration` (6,) in still water under a wrench of the thrusters (6,) and angles of the fins."""
+    wrench = thrust.copy()
+    add_fins(wrench, fins._replace(angle_rad=angles_rad), twist)
+    return acceleration(hull, rotation, twist, np.zeros((5, 3)), wrench)
+
+
 def trim(vehicle: VehicleConfig, speed_mps: float, curvature_per_m: float = 0.0) -> Trim | None:
     """Returns the trim at a speed through the water on a circle of this curvature, positive to the left.
 
@@ -48,39 +53,33 @@ def trim(vehicle: VehicleConfig, speed_mps: float, curvature_per_m: float = 0.0)
     plus that of the elevators times the upper part. None if there is no such motion, or none was found.
     """
     hull, fins = trimmed_hull(vehicle), fins_of(vehicle, 1.0)
-    thrusters = angular_first(parameters_of(vehicle).thrust_configuration).sum(axis=1)
-    movable = fins.max_rad > 0
-    scale = np.array([1.0, 1.0, 1.0, 1.0, hull.quadratic_drag[3, 3] * speed_mps**2, 1.0, 1.0])
+    per_newton = angular_first(parameters_of(vehicle).thrust_configuration).sum(axis=1)
+    drag_n = hull.quadratic_drag[3, 3] * speed_mps**2
 
     def motion(unknown: Array) -> Trim:
-        roll, pitch, sideslip, attack, thrust_n, rudder, elevator = unknown * scale
+        roll, pitch, sideslip, attack, load, rudder, elevator = unknown
         rates = geometry.rotation_from_rpy(roll, pitch, 0.0).T @ [0.0, 0.0, curvature_per_m * speed_mps]
-        c, s = np.cos([sideslip, attack]), np.sin([sideslip, attack])
-        linear = speed_mps * np.array([c[0] * c[1], s[0], c[0] * s[1]])
-        angles = movable * (fins.normal[:, 1:] @ [rudder, elevator])
-        return Trim(roll, pitch, np.concatenate([rates, linear]), thrust_n, angles)
+        ahead = np.cos(sideslip) * np.array([np.cos(attack), 0.0, np.sin(attack)])
+        twist = np.concatenate([rates, speed_mps * (ahead + [0.0, np.sin(sideslip), 0.0])])
+        return Trim(roll, pitch, twist, load * drag_n, (fins.max_rad > 0) * (fins.normal @ [rudder, elevator]))
 
     def residual(unknown: Array) -> Array:
-        found = motion(unknown)
-        rotation, wrench = geometry.rotation_from_rpy(found.roll, found.pitch, 0.0), found.thrust_n * thrusters
-        add_fins(wrench, fins._replace(angle_rad=found.angles_rad), found.twist)
-        rate = acceleration(hull, rotation, found.twist, np.zeros((5, 3)), wrench)
-        return np.append(rate, rotation[2] @ found.twist[3:])
+        roll, pitch, twist, thrust_n, angles_rad = motion(unknown)
+        rotation = geometry.rotation_from_rpy(roll, pitch, 0.0)
+        rate = accelerated(hull, fins, rotation, twist, thrust_n * per_newton, angles_rad)
+        return np.append(rate, rotation[2] @ twist[3:])
 
     solved = root(residual, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), tol=1e-10)
     return motion(solved.x) if solved.success else None
 
 
-@cache
 def minimum_speed_mps(vehicle: VehicleConfig) -> float:
-    """Returns the least speed, rounded up to 0.05 m/s, at which the fins keep the height with a reserve.
+    """Returns the least speed, from 0.3 m/s in steps of 0.05 m/s, at which the fins keep the height with a reserve.
 
-    It is at least 0.3 m/s. Raises TwinError if the fins cannot keep the height at any speed up to 3 m/s.
+    Raises TwinError if the fins cannot keep the height at any speed up to 3 m/s.
     """
-    loaded = [
-        vehicle.model_copy(update={"buoyancy_n": float(np.clip(vehicle.buoyancy_n + change, -20, 20))})
-        for change in (-_RESERVE_N, _RESERVE_N)
-    ]
+    buoyancies_n = np.clip([vehicle.buoyancy_n - _RESERVE_N, vehicle.buoyancy_n + _RESERVE_N], -20, 20).tolist()
+    loaded = [vehicle.model_copy(update={"buoyancy_n": buoyancy_n}) for buoyancy_n in buoyancies_n]
     least = np.inf
     for speed in _SPEEDS_MPS:
         if not all(_is_easy(each, trim(each, speed)) for each in loaded):
@@ -92,23 +91,22 @@ def minimum_speed_mps(vehicle: VehicleConfig) -> float:
     return least
 
 
-@cache
 def turning_radius_m(vehicle: VehicleConfig, speed_mps: float, share: float = _TRIM_SHARE) -> float:
     """Returns the least radius of a level turn in which the fins use this share of their greatest angles [m].
 
     Raises TwinError if they cannot turn the vehicle.
     """
-    easy = 0.0
+    least = np.inf
     for curvature in _CURVATURES_PER_M:
         if not _is_easy(vehicle, trim(vehicle, speed_mps, curvature), share):
             break
-        easy = curvature
-    if easy == 0.0:
-        problem = f"cannot turn the vehicle at {speed_mps:g} m/s within 100 m"
+        least = float(1 / curvature)
+    if least == np.inf:
+        problem = f"cannot turn the vehicle at {speed_mps:g} m/s within {1 / _CURVATURES_PER_M[0]:g} m"
         raise TwinError("vehicle.fins", problem, "larger fins, or another plan.speed_mps")
-    return float(1 / easy)
+    return least
 
 
 def _is_easy(vehicle: VehicleConfig, found: Trim | None, share: float = _TRIM_SHARE) -> bool:
-    fins = fins_of(vehicle, 1.0)
-    return found is not None and bool((np.abs(found.angles_rad) <= share * fins.max_rad + 1e-12).all())
+    most_rad = np.radians([fin.max_deg for fin in vehicle.fins])
+    return found is not None and bool((np.abs(found.angles_rad) <= share * most_rad + 1e-12).all())

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from twin import terrains
 from twin.controllers import segments
 from twin.controllers.camera_surface import CameraSurface
-from twin.controllers.lawnmower import FRAMES_BETWEEN_TRACKS
 from twin.controllers.survey_area import SurveyArea
-from twin.controllers.survey_plan import SurveyPlan
+from twin.controllers.survey_plan import FRAMES_BETWEEN_TRACKS, SurveyPlan
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
@@ -187,12 +186,11 @@ class Mission:
 
         A vehicle that flies arcs goes on straight ahead.
         """
-        n, end_s = self._n_holding, self.plan.track_duration_s(track)
+        n, times_s = self._n_holding, np.full(self._n_holding, self.plan.track_duration_s(track))
         if self.plan.flies_arcs:
-            times_s = end_s + (half + np.arange(1.0, 2.0)) / self.plan.request.frame_rate_hz
-            return FrameSequence(self.plan.references(track, times_s), np.zeros(1, np.bool_), False, times_s, track)
-        times_s = np.full(n, end_s)
-        return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), True, times_s, track)
+            times_s -= (FRAMES_BETWEEN_TRACKS - half * n - np.arange(n)) / self.plan.request.frame_rate_hz
+        holding = not self.plan.flies_arcs
+        return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), holding, times_s, track)
 
     def next_frames(self, track: int, path_time_s: float, pace: Pace) -> FrameSequence:
         """Returns the frames of a track after a path time at a pace: the next one, or all that remain at full pace.

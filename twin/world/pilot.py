@@ -134,9 +134,8 @@ class AuvPilot:
         velocity = reference.velocity + late_s * reference.acceleration
         target = reference.position - rotate_lever_arm(yaw, self._lever_arm_m)
         target = target + late_s * (reference.velocity + velocity) / 2
-        inputs = self._autopilot.inputs(
-            body, twist, target, velocity, reference.acceleration, estimate.is_measured
-        )  # fmt: skip
+        measured_now, acceleration = estimate.is_measured, reference.acceleration
+        inputs = self._autopilot.inputs(body, twist, target, velocity, acceleration, measured_now)
         n, allocation = self._n_thrusters, self._allocation
         thrusts = np.interp(inputs[:n], allocation.thrust_table_n, allocation.command_table)
         return np.concatenate([thrusts, inputs[n:] / self._autopilot.most[n:]])
