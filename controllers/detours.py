@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.controllers import lawnmower
-from twin.controllers.curves import PathSegment, end_of
+from twin.controllers.curves import end_of
 from twin.controllers.segments import Line, Point, Segment, line
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import Detour, SurveyPlan, SurveyRequest

@@ -44,4 +44,3 @@ def _draw_currents(axes: Any, vehicle: VehicleConfig) -> None:
     axes.plot(bearings, [top_speed_mps(vehicle, direction) for direction in directions])
     axes.set_theta_zero_location("N")
     axes.set_title("Current that it holds, by bearing from the bow [m/s]")
-

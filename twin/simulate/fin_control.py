@@ -41,7 +41,13 @@ def fin_autopilot(vehicle: VehicleConfig, speed_mps: float, frame_rate_hz: float
         angles[movable] = inputs[n:]
         s, c, t = np.sin(roll), np.cos(roll), np.tan(pitch)
         turning = [[1, s * t, c * t], [0, c, -s], [0, s / np.cos(pitch), c / np.cos(pitch)]] @ twist[:3]
-        return np.concatenate([rotation @ twist[3:], turning, accelerated(hull, fins, rotation, twist, configuration @ inputs[:n], angles)])
+        return np.concatenate(
+            [
+                rotation @ twist[3:],
+                turning,
+                accelerated(hull, fins, rotation, twist, configuration @ inputs[:n], angles),
+            ]
+        )
 
     most = np.concatenate([[full_force_n(nominal, np.array([1.0, 0, 0]))] * n, fins.max_rad[movable]])
     planned = 1 / turning_radius_m(nominal, speed_mps)

@@ -17,8 +17,10 @@ from twin.simulate.hydrodynamics import Hull, acceleration, angular_first
 from twin.simulate.parameters import parameters_of
 
 _TRIM_SHARE = 0.4  # share of their greatest angle that fins use in steady flight; the rest is left for control
+_MOST_PITCH = np.radians(8.0)  # in steady flight, so that hull and fins are far from stall
 _RESERVE_N = 1.0  # by which the net buoyancy may change, upwards or downwards, at the minimum speed
 _SPEEDS_MPS = np.arange(3.0, 0.25, -0.05)
+_TOLERANCE = 1e-7  # of the accelerations of a trim [rad/s2, m/s2]
 _CURVATURES_PER_M = np.arange(0.01, 2.0, 0.01)
 
 
@@ -69,8 +71,9 @@ def trim(vehicle: VehicleConfig, speed_mps: float, curvature_per_m: float = 0.0)
         rate = accelerated(hull, fins, rotation, twist, thrust_n * per_newton, angles_rad)
         return np.append(rate, rotation[2] @ twist[3:])
 
-    solved = root(residual, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), tol=1e-10)
-    return motion(solved.x) if solved.success else None
+    # least squares: without rudders or elevators, the Jacobian is singular
+    solved = root(residual, np.array([0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0]), method="lm", tol=1e-12)
+    return motion(solved.x) if np.abs(solved.fun).max() < _TOLERANCE else None
 
 
 def minimum_speed_mps(vehicle: VehicleConfig) -> float:
@@ -109,4 +112,6 @@ def turning_radius_m(vehicle: VehicleConfig, speed_mps: float, share: float = _T
 
 def _is_easy(vehicle: VehicleConfig, found: Trim | None, share: float = _TRIM_SHARE) -> bool:
     most_rad = np.radians([fin.max_deg for fin in vehicle.fins])
-    return found is not None and bool((np.abs(found.angles_rad) <= share * most_rad + 1e-12).all())
+    if found is None or abs(found.pitch) > _MOST_PITCH:
+        return False
+    return bool((np.abs(found.angles_rad) <= share * most_rad + 1e-12).all())

@@ -241,8 +241,7 @@ def prepare(scenario: Scenario) -> Mission:
         objects = load_objects(scenario, terrain, errors.attempt)
         for k, beacon in enumerate(scenario.beacons):
             errors.attempt(_check_beacon, k, beacon, terrain)
-    if not scenario.vehicle.is_steered_by_fins or plan is not None:
-        errors.attempt(check_speed, scenario.vehicle, scenario.plan, (plan or scenario.plan).speed_mps)
+    errors.attempt(check_speed, scenario.vehicle, scenario.plan, (plan or scenario.plan).speed_mps)
     if terrain is not None and chart is not None and plan is not None:
         _check_path(scenario, chart, plan, objects if chart is terrain else (), errors)
         grid = errors.attempt(

@@ -212,9 +212,6 @@ def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> 
     """Raises TwinError if a cruise speed exceeds the top speed, for loops and cross lines in the slowest direction."""
     if vehicle.dynamics == "kinematic":
         return
-    if vehicle.is_steered_by_fins and speed_mps < (least := minimum_speed_mps(vehicle)):
-        problem = f"{asked.speed_mps:g}: too slow for the fins to keep the height"
-        raise TwinError("plan.speed_mps", problem, f"at least {least:.2f}")
     around = asked.pattern == "loops" or asked.cross_lines > 0
     bearings = np.linspace(0, 2 * np.pi, 24, endpoint=False) if around else np.zeros(1)
     directions = np.stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)], axis=1)
