@@ -1,4 +1,4 @@
-"""Autopilot of a vehicle that is steered by fins: it keeps the vehicle on its path at the planned speed.
+"""Autopilot of a vehicle that is steered by fins: it keeps the vehicle on its level path at the planned speed.
 
 Feed-forward of the trim on a circle of the curvature of the path, and linear state feedback u = u_trim - K (x - x_trim)
 with integral action. The bow points along the planned velocity through the estimated current.
@@ -47,7 +47,7 @@ class FinAutopilot:
         speed = float(np.hypot(*through))
         curvature = float(through[0] * acceleration[1] - through[1] * acceleration[0]) / speed**3
         trim = np.array([np.interp(curvature, self._curvatures, column) for column in self._trims.T])
-        attitude = trim[:3] + [0.0, -np.arctan2(velocity[2], speed), np.arctan2(through[1], through[0])]
+        attitude = trim[:3] + [0.0, 0.0, np.arctan2(through[1], through[0])]
         turned = (np.array(geometry.rpy_from_rotation(pose[:3, :3])) - attitude + np.pi) % (2 * np.pi) - np.pi
         offset = geometry.rotation_from_rpy(0.0, 0.0, course).T @ (pose[:3, 3] - position)
         offset = np.clip(offset, -_MOST_ERROR_M, _MOST_ERROR_M)

@@ -145,6 +145,11 @@ REFUSED = [
     ("[plan]\nspeed_mps = 2.0\n[vehicle]\ndrag_factor = 2.0", r"a.toml:3: plan.speed_mps: 2: too fast"),
     ("[plan]\npattern = 'loops'", r"a.toml:3: plan.pattern: 'loops': .*bow first"),
     ("[plan]\ncross_lines = 2", r"a.toml:3: plan.cross_lines: cannot be flown"),
+    (
+        "[vehicle]\nthrusters = [{ position_m = [0, 0, 0], direction = [0, 1, 0] }]",
+        r"vehicle.fins: .*movable fins only with thrusters that all push forwards",
+    ),
+    ("[plan]\nheight = 'floor'", r"a.toml:3: plan.height: cannot be flown"),
     ("[plan]\nfill_gaps = true", r"a.toml:3: plan.fill_gaps: cannot be flown"),
     ("[control]\nhold_s = 3.0", r"a.toml:3: control.hold_s: has no effect"),
     ("[control]\nheight = 'map'", r"a.toml:3: control.height: has no effect"),

@@ -327,6 +327,14 @@ class VehicleConfig(Section):
             raise PydanticCustomError("drag_matrix", "a matrix with a diagonal of 0 or more: drag resists motion")
         return value
 
+    @field_validator("fins")
+    @classmethod
+    def _require_thrust_ahead(cls, value: tuple[FinConfig, ...], info: ValidationInfo) -> tuple[FinConfig, ...]:
+        ahead = all(thruster.direction[0] > 0 for thruster in info.data.get("thrusters", ()))
+        if any(fin.max_deg > 0 for fin in value) and not ahead:
+            raise PydanticCustomError("fins", "movable fins only with thrusters that all push forwards")
+        return value
+
     @field_validator("thrust_coefficients")
     @classmethod
     def _require_thrust(cls, value: tuple[float, ...]) -> tuple[float, ...]:

@@ -32,7 +32,6 @@ _AREA_SAMPLES = 500  # along each side of an area
 _CLIMB_SHARE = 0.5
 #: Greatest slope (rise over run) of a path over the floor, even if the thrusters can fly a steeper one.
 _MAX_SLOPE = 0.6
-_FIN_SLOPE = 0.15  #: the same of a vehicle that climbs by pitching
 
 
 def check_floor_below(asked: PlanConfig, terrain: Terrain, plan: SurveyPlan) -> None:
@@ -282,8 +281,6 @@ def _check_thrust_in(vehicle: VehicleConfig, current: Array, cruise_mps: float, 
 
 def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
     """Returns the greatest slope of a path: a share of that which saturates a thruster, at most _MAX_SLOPE."""
-    if vehicle.is_steered_by_fins:
-        return _FIN_SLOPE
     ahead = np.array([speed_mps, 0.0, 0.0])
     excess = lambda climb: _load(vehicle, np.array([ahead, ahead]) + [[0, 0, climb], [0, 0, -climb]]) - 1  # noqa: E731
     if excess(0.0) >= 0:

@@ -127,15 +127,18 @@ class AuvPilot:
         self._n_thrusters = len(scenario.vehicle.thrusters)
 
     def __call__(self, estimate: Estimate, reference: Reference) -> Array:
-        measured, yaw, late_s = self._from_camera_twist @ estimate.camera_velocity, float(reference.yaw), self._late_s
-        twist = measured if self._twist is None else self._twist + self._smoothing * (measured - self._twist)
-        self._twist = twist
-        body = estimate.world_from_camera @ self._camera_from_body @ geometry.exp(late_s * twist)
+        yaw, late_s, body = float(reference.yaw), self._late_s, estimate.world_from_camera @ self._camera_from_body
+        if self._twist is None:  # at the first frame, no velocity is measured
+            self._twist = np.concatenate([np.zeros(3), body[:3, :3].T @ reference.velocity])
+        else:
+            measured = self._from_camera_twist @ estimate.camera_velocity
+            self._twist = self._twist + self._smoothing * (measured - self._twist)
+        body = body @ geometry.exp(late_s * self._twist)
         velocity = reference.velocity + late_s * reference.acceleration
         target = reference.position - rotate_lever_arm(yaw, self._lever_arm_m)
         target = target + late_s * (reference.velocity + velocity) / 2
-        measured_now, acceleration = estimate.is_measured, reference.acceleration
-        inputs = self._autopilot.inputs(body, twist, target, velocity, acceleration, measured_now)
+        acceleration, is_measured = reference.acceleration, estimate.is_measured
+        inputs = self._autopilot.inputs(body, self._twist, target, velocity, acceleration, is_measured)
         n, allocation = self._n_thrusters, self._allocation
         thrusts = np.interp(inputs[:n], allocation.thrust_table_n, allocation.command_table)
         return np.concatenate([thrusts, inputs[n:] / self._autopilot.most[n:]])

@@ -10,7 +10,6 @@ from pydantic import BaseModel
 from twin.errors import TwinError
 from twin.imaging.camera.lens_psf import NEAREST_FOCUS_M
 from twin.scenario.model import FAULTS, Scenario, SensorConfig, SnowConfig, TerrainConfig
-from twin.simulate.autopilot import full_force_n
 from twin.simulate.parameters import moves_along_all_axes
 
 _CAMERAS = ("cameras", "left_camera", "right_camera", "water", "fish")  # parts whose faults change images
@@ -110,13 +109,11 @@ def _of_lens(scenario: Scenario) -> Iterator[TwinError]:
 
 
 def _of_fins(scenario: Scenario) -> Iterator[TwinError]:
-    """Yields an error for each key that asks a vehicle that is steered by fins to stop, hover or follow the floor."""
-    if full_force_n(scenario.vehicle, np.array([1.0, 0.0, 0.0])) <= 0:
-        yield TwinError("vehicle.thrusters", "cannot push forwards", "a thruster along the axis of the hull")
-    problem = "a vehicle that is steered by fins flies at a minimum speed, bow first"
+    """Yields an error for each key that asks a vehicle that is steered by fins to stop, sidestep or climb."""
+    problem = "a vehicle that is steered by fins flies level, bow first, at a minimum speed"
     if scenario.plan.pattern != "lawnmower":
         yield TwinError("plan.pattern", f"{scenario.plan.pattern!r}: {problem}", '"lawnmower"')
-    plan = ("cross_lines", "fill_gaps")
+    plan = ("cross_lines", "fill_gaps", "height")
     yield from keys_without_effect("plan", scenario.plan, plan, f"cannot be flown: {problem}", "the default")
     control = ("hold_s", "natural_frequency_radps", "height")
     yield from keys_without_effect("control", scenario.control, control, f"has no effect: {problem}", "the default")
