@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from twin.controllers import lawnmower
+from twin.controllers.curves import end_of
 from twin.controllers.segments import Line, Point, Segment, line
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import Detour, SurveyPlan, SurveyRequest
@@ -136,11 +137,6 @@ def _raised(segment: Segment, by_m: float) -> Segment:
     assert isinstance(segment, Line)  # a lawnmower that reverses
     x, y, z = segment.start
     return segment._replace(start=(x, y, z + by_m))
-
-
-def end_of(path: Sequence[Segment]) -> Point:
-    x, y, z = path[-1].points()[-1].tolist()
-    return x, y, z
 
 
 def _start_of(path: Sequence[Segment]) -> Point:

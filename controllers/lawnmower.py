@@ -3,7 +3,8 @@
 By default every second leg is flown backwards, so the images of all legs have the same orientation. With `turns` =
 "bow_first" the vehicle turns by 180 degrees at the end of each leg except the last, alternately counter-clockwise and
 clockwise so that a tether is not twisted. Consecutive keyframes are displaced along the image height, neighbouring
-swaths along the image width. Cross lines, which check the legs, are a last track: the vehicle flies them sideways.
+swaths along the image width. With "arcs", it flies all legs bow first at constant speed, and turns beyond their ends.
+Cross lines, which check the legs, are a last track: the vehicle flies them sideways.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 
+from twin.controllers.curves import PathSegment, end_of, steady_line, u_turn
 from twin.controllers.segments import Point, Segment, SpeedProfile, Turn, line
 from twin.controllers.survey_area import SurveyArea
 from twin.controllers.survey_plan import (
@@ -31,6 +33,7 @@ from twin.core.geometry import Array
 
 _SPACING_SAMPLES = 2001  # of an uneven spacing, across an area
 _COINCIDE_M = 1e-9  # distance below which two corners of a path are the same
+_RUN_S = 2.0  # time of straight flight before a leg and after it, in which the vehicle settles
 
 
 class _Strip(NamedTuple):
@@ -72,7 +75,10 @@ def plan(request: SurveyRequest) -> SurveyPlan:
         for strip, following in zip(strips, [*strips[1:], None], strict=True)
     ]
     corners = [_corners(legs, 2 * k, last=k == n_tracks - 1) for k in range(n_tracks)]
-    paths = [_track(request, area, track) for track in corners]
+    if request.turns == "arcs":
+        paths = _tracks_of_arcs(request, area, corners)
+    else:
+        paths = [_track(request, area, track) for track in corners]
     if request.cross_lines:
         paths.append(_cross_track(request, area, legs[: 2 * n_tracks], corners[-1][-1], paths[-1][-1].yaw))
     return SurveyPlan(
@@ -145,6 +151,29 @@ def _track(request: SurveyRequest, area: SurveyArea, corners: list[tuple[float, 
             profile = SpeedProfile(math.pi, TURN_RATE, TURN_ACCELERATION)
             segments.append(Turn(b, yaw, -1.0 if reversed_bow else 1.0, profile))
     return tuple(segments)
+
+
+def _tracks_of_arcs(
+    request: SurveyRequest, area: SurveyArea, corners: Sequence[list[tuple[float, float]]]
+) -> list[tuple[PathSegment, ...]]:
+    """Returns the segments of tracks between their corners (u, v) [m], flown at constant speed.
+
+    A straight line before and after each leg gives the vehicle time to settle; the first line of a track begins where
+    the last track ends, after a whole number of frames.
+    """
+    speed, radius_m, run_m = request.speed_mps, request.turn_radius_m, _RUN_S * request.speed_mps
+    ahead, astern, done_m, paths = area.heading, area.heading + math.pi, 0.0, list[tuple[PathSegment, ...]]()
+    for (start, south), (turn, _), (_, north), (end, _), *following in corners:
+        (first,) = _points(request, area, [(start - run_m + done_m, south)])
+        path: list[PathSegment] = [steady_line(first, ahead, turn - start + 2 * run_m - done_m, speed)]
+        path.append(u_turn(end_of(path), ahead, north - south, radius_m, speed))
+        path.append(steady_line(end_of(path), astern, turn - end + 2 * run_m, speed))
+        path += [u_turn(end_of(path), astern, north - v, radius_m, speed) for _, v in following]
+        n_frames = sum(segment.profile.duration_s for segment in path) * request.frame_rate_hz
+        done_m = (math.floor(n_frames) + 1 - n_frames) * speed / request.frame_rate_hz
+        path.append(steady_line(end_of(path), ahead if following else astern, done_m, speed))
+        paths.append(tuple(path))
+    return paths
 
 
 def _points(request: SurveyRequest, area: SurveyArea, corners: Sequence[tuple[float, float]]) -> list[Point]:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from twin.controllers.camera_surface import CameraSurface
-from twin.controllers.segments import Circle, Reference, Segment, Turn
+from twin.controllers.curves import PathSegment
+from twin.controllers.segments import Circle, Reference, Turn
 from twin.controllers.survey_area import SurveyArea
 from twin.core.geometry import Array
 from twin.errors import TwinError
@@ -19,6 +20,7 @@ _EDGE_M = 1e-9  # tolerance: points on the edge count as inside in spite of roun
 TURN_RATE = math.radians(15)  # greatest rate of a turn on the spot [rad/s]: 0.5 deg between frames at 30 Hz
 TURN_ACCELERATION = math.radians(15)  # angular acceleration of a turn [rad/s2]
 TURN_PER_KEYFRAME = math.radians(10)  # greatest rotation between keyframes [rad]; beyond it, patch matching degrades
+FRAMES_BETWEEN_TRACKS = 2  #: between the tracks of a path that is flown in arcs, for the global alignment
 
 #: Largest number of tracks to fly, and of tracks that fill an area; least altitude, and least side of an area [m].
 MAX_TRACKS, MAX_FILLING, LEAST_M = 10_000, 1_000_000, 1e-3
@@ -38,7 +40,8 @@ class SurveyRequest(NamedTuple):
     frame_rate_hz: float
     acceleration_mps2: float = 0.2  # greatest acceleration of the camera
     area: SurveyArea | None = None  # of extent `area_m`; None: a rectangle or disc at the origin, with legs along x
-    turns: Literal["reverse", "bow_first"] = "reverse"
+    turns: Literal["reverse", "bow_first", "arcs"] = "reverse"
+    turn_radius_m: float = 0.0  # least radius of the arcs
     #: Factors on the spacing of keyframes and of swaths on the reference plane; below 1 if the floor is nearer.
     along_scale: float = 1.0
     across_scale: float = 1.0
@@ -66,10 +69,10 @@ class Detour(NamedTuple):
 
 @dataclass(frozen=True)
 class SurveyPlan:
-    """Planned path and heading of the left camera. The vehicle keeps station after each track."""
+    """Planned path and heading of the left camera. The vehicle keeps station after each track, or flies arcs."""
 
     request: SurveyRequest  # the requirements that it meets
-    paths: tuple[tuple[Segment, ...], ...]  # of each track; every segment starts and ends at rest
+    paths: tuple[tuple[PathSegment, ...], ...]  # of each track; segments start and end at rest, but for arcs
     area: SurveyArea  # area to cover; the legs, and the bow on the first leg, point along its heading
     speed_mps: float  # cruise speed along the swaths
     n_frames_per_keyframe: int  # N, frames from one keyframe to the next
@@ -127,6 +130,11 @@ class SurveyPlan:
         return any(isinstance(segment, Turn) for path in self.paths for segment in path)
 
     @property
+    def flies_arcs(self) -> bool:
+        """Returns whether the vehicle flies all tracks without stopping."""
+        return self.request.turns == "arcs"
+
+    @property
     def n_tracks(self) -> int:
         return len(self.paths)
 
@@ -158,10 +166,13 @@ class SurveyPlan:
     def frames_of_track(self, track: int) -> tuple[Array, NDArray[np.bool_]]:
         """Returns the times (n,) of the frames of a track since its start [s], and whether each is a keyframe.
 
+        Of a path that is flown in arcs, `FRAMES_BETWEEN_TRACKS` follow, and then the first one of the next track.
+
         These are every N-th frame, with its own N for a task, and the last one, and more while the vehicle turns
         (`TURN_PER_KEYFRAME`).
         """
-        frames = np.arange(round(self.track_duration_s(track) * self.request.frame_rate_hz) + 1)
+        n_frames = round(self.track_duration_s(track) * self.request.frame_rate_hz) + 1
+        frames = np.arange(n_frames - (FRAMES_BETWEEN_TRACKS + 1 if self.flies_arcs else 0))
         steps = {detour.track: detour.n_frames_per_keyframe for detour in self.detours}
         times_s, n = frames / self.request.frame_rate_hz, steps.get(track, self.n_frames_per_keyframe)
         keyframe = (frames % n == 0) | (frames == frames[-1])
@@ -191,7 +202,7 @@ class SurveyPlan:
         return level if self.request.surface is None else self.request.surface.follow(level)
 
     def all_references(self) -> Reference:
-        """Returns the references of the left camera at all frames, without station keeping."""
+        """Returns the references of the left camera at all planned frames, without those between tracks."""
         tracks = range(1, self.n_tracks + 1)
         return _joined([self.references(track, self.frames_of_track(track)[0]) for track in tracks])
 

@@ -8,13 +8,14 @@ from twin.core import geometry
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
 from twin.simulate.compiled_vehicle import CompiledVehicle
+from twin.simulate.fins import WATER_KG_M3
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.hydrodynamics import acceleration
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import steady_current
 
-STEP_S = 1 / 120
+STEP_S, AHEAD = 1 / 120, np.array([1.0, 0.0, 0.0])
 ROV, HULL = parameters_of(VehicleConfig()), trimmed_hull(VehicleConfig(buoyancy_n=0.0))
 
 
@@ -54,6 +55,26 @@ def dense_acceleration(hull, rotation, twist, flow, wrench):
     total += np.concatenate([displaced, np.cross(hull.centre_of_buoyancy_m, displaced)])
     total -= coriolis(mass, nu) @ nu + coriolis(added, relative) @ relative + drag
     return np.roll(np.linalg.solve(mass + added, total), 3)
+
+
+def dense_fins(vehicle, angles_rad, relative):
+    """Returns the wrench (6,) of the fins by vectors, each force resolved into lift and drag in the flow."""
+    total, w, v = np.zeros(6), relative[:3], relative[3:]
+    for fin, angle in zip(vehicle.fins, angles_rad, strict=True):
+        at, cant = np.array(fin.position_m), np.radians(fin.lift_direction_deg)
+        normal = np.array([0.0, np.cos(cant), np.sin(cant)])
+        there = v + np.cross(w, at)
+        there = there @ AHEAD * AHEAD + there @ normal * normal  # without the part along the span
+        chord, across = np.cos(angle) * AHEAD + np.sin(angle) * normal, np.cos(angle) * normal - np.sin(angle) * AHEAD
+        speed, attack = np.linalg.norm(there), -np.arctan2(there @ across, abs(there @ chord))
+        if speed == 0:
+            continue
+        coefficient = fin.lift_slope_per_rad * np.clip(attack, *np.radians([-fin.stall_deg, fin.stall_deg]))
+        flow = there / speed
+        lift = across - across @ flow * flow
+        force = coefficient * (lift + across @ flow * flow) * WATER_KG_M3 / 2 * fin.area_m2 * speed**2
+        total += np.concatenate([np.cross(at, force), force])
+    return total
 
 
 def coupled(rng, **factors):

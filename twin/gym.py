@@ -53,7 +53,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         "velocity": (4,) forward, left and up velocity of the left camera, and yaw rate to the left. 1 is 1.5 times
             plan.speed_mps, or 0.5 rad/s. The controller of the scenario steers, by the believed pose, to the
             position and yaw that follow from integration of these velocities.
-        "thrust": (n,) commands of the n thrusters of a rigid vehicle.
+        "thrust": (n,) commands of the thrusters and movable fins of a rigid vehicle.
 
     Reward of a step:
         "coverage": part of the asked area that both cameras saw for the first time, in a keyframe [m2].
@@ -92,7 +92,7 @@ class SeabedTwinEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._velocity_action, self._reward, self.render_mode = action == "velocity", reward, render_mode
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
         self.action_space = spaces.Box(
-            -1.0, 1.0, (4 if self._velocity_action else len(given.vehicle.thrusters),), np.float32
+            -1.0, 1.0, (4 if self._velocity_action else given.vehicle.n_commands,), np.float32
         )
         shape = (self._world.rig.height_px, self._world.rig.width_px, 3)
         images = {name: spaces.Box(0, 255, shape, np.uint8) for name in ("left", "right")}
@@ -251,7 +251,7 @@ class SeabedTwinStateEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self._velocity_action = action == "velocity"
         self._reward = reward if callable(reward) else _minus_distance
         self._most_mps = SPEED_RATIO * given.plan.speed_mps
-        self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else len(given.vehicle.thrusters),))
+        self.action_space = spaces.Box(-1.0, 1.0, (4 if self._velocity_action else given.vehicle.n_commands,))
         self._limits = {name: np.array(_BOUNDS[name], np.float64) for name in self._observe}
         self.observation_space = spaces.Dict({n: spaces.Box(-b, b, dtype=np.float64) for n, b in self._limits.items()})
 
@@ -342,6 +342,8 @@ def moved(last: Reference, values: Array, most_mps: float, interval_s: float) ->
 def _check_action(scenario: Scenario, action: str) -> None:
     if action not in ("velocity", "thrust") or (action == "thrust" and scenario.vehicle.dynamics != "rigid"):
         raise TwinError("action", f"{action!r}: not for this vehicle", '"velocity", or "thrust" of a rigid vehicle')
+    if action == "velocity" and scenario.vehicle.is_steered_by_fins:
+        raise TwinError("action", f"{action!r}: not for a vehicle that is steered by fins", '"thrust"')
 
 
 def _readings(frame: Frame) -> tuple[Array, NDArray[np.int8]]:

@@ -46,6 +46,8 @@ class EstimatorSettings:
     wide_search: bool = False
     #: whether the images have noise, so that no image of a live camera equals the image before it.
     noisy_images: bool = True
+    #: whether the vehicle stops while no motion is measured (`braking_factor`).
+    stops_if_blind: bool = True
 
     def __post_init__(self) -> None:
         for setting in fields(self):
@@ -59,6 +61,6 @@ class EstimatorSettings:
                 raise TwinError(f"estimate.{setting.name}", f"{value!r} is out of range", allowed)
 
 
-def braking_factor(blind_s: float, interval_s: float) -> float:
+def braking_factor(blind_s: float, interval_s: float, stops: bool = True) -> float:
     """Returns the factor of the speed over an interval that starts after `blind_s` without measured motion."""
-    return 1.0 if blind_s <= BLIND_S else math.exp(-interval_s / BRAKING_S)
+    return 1.0 if blind_s <= BLIND_S or not stops else math.exp(-interval_s / BRAKING_S)

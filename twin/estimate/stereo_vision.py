@@ -85,7 +85,9 @@ class StereoVision:
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
         self._pattern_fits: dict[int, Array] = {}  # by frame index
-        self.f2f = FrameToFrame(self.rig, self.settings.patch_px, self._imu_noise)
+        self.f2f = FrameToFrame(
+            self.rig, self.settings.patch_px, self._imu_noise, self.settings.stops_if_blind
+        )  # fmt: skip
         self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
         self.search_range = disparity.SearchRange(self.rig)
         self._gray = self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)

@@ -61,7 +61,8 @@ def swath_numbers(
     if yaw is not None:
         off_leg |= is_turning(yaw)
     legs = np.full(len(track), -1)
-    legs[~away] = leg_numbers(reference[~away])
+    numbered = ~away if yaw is None else ~away & ~is_turning(yaw)
+    legs[numbered] = leg_numbers(reference[numbered])
     return np.where(off_leg, -1, legs + np.searchsorted(planned.get("legs_after_gaps", ()), legs, side="right"))
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from twin.planning.vehicle_limits import AXES, VehicleLimits, electrical_power_w
+from twin.planning.vehicle_limits import VehicleLimits, axes_of, electrical_power_w
 from twin.report.style import FIGURE_STYLE
 from twin.scenario.model import VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
@@ -20,8 +21,7 @@ def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
     with matplotlib.rc_context(FIGURE_STYLE):
         figure = Figure(figsize=(14, 4.5))
         speed, power = (figure.add_subplot(1, 3, k) for k in (1, 2))
-        current = figure.add_subplot(1, 3, 3, projection="polar")
-        for name, axis in AXES.items():
+        for name, axis in axes_of(vehicle).items():
             speeds = np.linspace(0, limits.speeds_mps[name], 60)
             velocities = speeds[:, None] * np.array(axis)
             speed.plot(100 * thrust_loads(vehicle, velocities), speeds, label=name)
@@ -30,12 +30,17 @@ def draw(vehicle: VehicleConfig, limits: VehicleLimits, file: Path) -> Path:
         power.axvline(limits.speed_mps, ls=":", color="0.4")
         speed.set(xlabel="thrust of the busiest thruster [%]", ylabel="speed [m/s]", title=f"Speed of {limits.title}")
         power.set(xlabel="speed [m/s]", ylabel="electrical power [W]", title="Power", ylim=(0, None))
-        bearings = np.linspace(0, 2 * np.pi, 181)
-        directions = np.column_stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)])
-        current.plot(bearings, [top_speed_mps(vehicle, direction) for direction in directions])
-        current.set_theta_zero_location("N")  # type: ignore[attr-defined]
-        current.set_title("Current that it holds, by bearing from the bow [m/s]")
         speed.legend()
+        if not vehicle.is_steered_by_fins:
+            _draw_currents(figure.add_subplot(1, 3, 3, projection="polar"), vehicle)
         file.parent.mkdir(parents=True, exist_ok=True)
         FigureCanvasAgg(figure).print_png(str(file))
     return file
+
+
+def _draw_currents(axes: Any, vehicle: VehicleConfig) -> None:
+    bearings = np.linspace(0, 2 * np.pi, 181)
+    directions = np.column_stack([np.cos(bearings), np.sin(bearings), np.zeros_like(bearings)])
+    axes.plot(bearings, [top_speed_mps(vehicle, direction) for direction in directions])
+    axes.set_theta_zero_location("N")
+    axes.set_title("Current that it holds, by bearing from the bow [m/s]")

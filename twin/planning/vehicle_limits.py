@@ -21,9 +21,10 @@ from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.energy import electrical_power_w, usable_wh
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.sea import steady_current
+from twin.simulate.steady_flight import minimum_speed_mps, turning_radius_m
 from twin.world.energy import planned_energy, planned_velocities
 from twin.world.mission import Mission
-from twin.world.pilot import RovPilot
+from twin.world.pilot import RovPilot, make_pilot
 
 #: Directions in the body, by name.
 AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
@@ -40,22 +41,25 @@ class VehicleLimits:
     righting_nm_per_deg: float  #: moment that turns a tilted vehicle back
     speeds_mps: dict[str, float]  #: top speed by direction: the first thruster saturates
     forces_n: dict[str, float]  #: force by direction at which the first thruster saturates
-    current_mps: float  #: greatest horizontal current, from any side, in which it holds station
+    current_mps: float  #: greatest horizontal current, from any side, in which it holds station; NaN: it cannot
     speed_mps: float  #: planned speed
     load: float  #: thrust of the busiest thruster / full thrust, at the planned speed in the mean current
     stopping_m: float  #: distance from the planned speed to rest at full thrust, with the lag of the thrusters
     coasting_m: float  #: distance from the planned speed to a tenth of it without thrust
     latency_s: float  #: greatest latency of the computer with which leg and station keeping are stable
-    hover_h: float  #: endurance at rest, without the reserve of a fifth
+    hover_h: float  #: endurance at rest, without the reserve of a fifth; NaN: it cannot hover
     cruise_h: float  #: the same at the planned speed
     survey_s: float  #: duration of the survey, with station keeping
     survey_wh: float  #: energy of the survey
     dives: int  #: number of batteries that the survey takes, each with a reserve of a fifth
+    minimum_speed_mps: float  #: least speed at which fins keep the height; 0 of a vehicle that hovers
+    turning_radius_m: float  #: least radius of a planned turn; 0 of a vehicle that turns on the spot
+    full_rudder_radius_m: float  #: radius of a turn with the fins at their greatest angles; 0 as above
 
 
 def vehicle_limits(mission: Mission) -> VehicleLimits:
     vehicle, plan = mission.scenario.vehicle, mission.plan
-    hull = trimmed_hull(vehicle)
+    hull, fins, axes = trimmed_hull(vehicle), vehicle.is_steered_by_fins, axes_of(vehicle)
     speed_mps, ahead = plan.speed_mps, np.array(AXES["forwards"])
     through_water, energy = planned_velocities(mission), planned_energy(mission)
     assert energy.survey_wh is not None and energy.dives is not None  # a rigid vehicle
@@ -65,28 +69,36 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
         title=vehicle.title,
         buoyancy_n=hull.buoyancy_n - hull.weight_n,
         righting_nm_per_deg=math.radians(hull.buoyancy_n * float(hull.centre_of_buoyancy_m[2])),
-        speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in AXES.items()},
-        forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in AXES.items()},
-        current_mps=min(top_speed_mps(vehicle, direction) for direction in directions),
+        speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in axes.items()},
+        forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in axes.items()},
+        current_mps=np.nan if fins else min(top_speed_mps(vehicle, direction) for direction in directions),
         speed_mps=speed_mps,
         load=float(thrust_loads(vehicle, through_water).max()),
         stopping_m=speed_mps * thruster_lag_s(vehicle)
         + stopping_distance_m(vehicle, speed_mps, full_force_n(vehicle, ahead), 0.0),
         coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps),
         latency_s=largest_latency_s(mission),
-        hover_h=usable_wh(vehicle) / rest,
+        hover_h=np.nan if fins else usable_wh(vehicle) / rest,
         cruise_h=usable_wh(vehicle) / cruise,
         survey_s=len(through_water) / mission.rig.frame_rate_hz,
         survey_wh=energy.survey_wh,
         dives=energy.dives,
+        minimum_speed_mps=minimum_speed_mps(vehicle) if fins else 0.0,
+        turning_radius_m=turning_radius_m(vehicle, speed_mps) if fins else 0.0,
+        full_rudder_radius_m=turning_radius_m(vehicle, speed_mps, share=1.0) if fins else 0.0,
     )
+
+
+def axes_of(vehicle: VehicleConfig) -> dict[str, tuple[float, float, float]]:
+    """Returns the directions, by name, in which a vehicle can move by its thrusters."""
+    return {"forwards": AXES["forwards"]} if vehicle.is_steered_by_fins else AXES
 
 
 def largest_latency_s(mission: Mission) -> float:
     """Returns the greatest latency in whole frames, up to a second, with which the vehicle flies a leg and stops [s].
 
-    It starts at the planned speed with its true motion known, and has to be within `_STABLE_M` of its reference after
-    `_SETTLED_S`.
+    A vehicle that is steered by fins does not stop. It starts at the planned speed with its true motion known, and has
+    to be within `_STABLE_M` of its reference after `_SETTLED_S`.
     """
     interval_s = 1 / mission.rig.frame_rate_hz
     latencies = interval_s * np.arange(1, round(1 / interval_s) + 1)
@@ -95,15 +107,20 @@ def largest_latency_s(mission: Mission) -> float:
 
 def _settles(mission: Mission, latency_s: float) -> bool:
     scenario, interval_s = mission.scenario, 1 / mission.rig.frame_rate_hz
+    fins = scenario.vehicle.is_steered_by_fins
     late = scenario.model_copy(update={"control": scenario.control.model_copy(update={"latency": latency_s})})
-    pilot, start = RovPilot(replace(mission, scenario=late)), mission.start_of_body
+    leg_s, velocity_mps = (_SETTLED_S, mission.start_velocity_mps) if fins else (_LEG_S, np.zeros(3))
+    changed, start = replace(mission, scenario=late), mission.start_of_body
+    pilot = make_pilot(changed) if fins else RovPilot(changed)
     still = steady_current(np.zeros(3))
-    vehicle = CompiledVehicle(scenario.vehicle, still, start, physics_timestep_s(mission.rig.frame_rate_hz))
+    vehicle = CompiledVehicle(
+        scenario.vehicle, still, start, physics_timestep_s(mission.rig.frame_rate_hz), start_velocity_mps=velocity_mps
+    )
     camera, start_m, yaw = mission.rig.body_from_camera, mission.start[:3, 3], mission.plan.reference(1, 0.0).yaw
     velocity = mission.plan.speed_mps * start[:3, 0]  # along the bow
     to_camera, excursion_m = geometry.adjoint(geometry.inverse(camera)), 0.0
     for time_s in np.arange(0.0, _SETTLED_S, interval_s):
-        position, moves = start_m + min(time_s, _LEG_S) * velocity, time_s < _LEG_S
+        position, moves = start_m + min(time_s, leg_s) * velocity, time_s < leg_s
         pose, twist = vehicle.world_from_body @ camera, to_camera @ vehicle.twist_body
         wanted = Reference(position, velocity if moves else np.zeros(3), yaw, np.zeros(3))
         vehicle.step(pilot(Estimate(time_s, pose, pose, twist, 0.0, "ok"), wanted), interval_s)
@@ -137,16 +154,27 @@ def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
         return ", ".join(f"{value:.{digits}f} {unit} {name}" for name, value in values.items())
 
     survey_min = limits.survey_s / 60
+    own = [
+        ("holds station in", f"{limits.current_mps:.2f} m/s of current from any side"),
+        ("endurance", f"{limits.hover_h:.1f} h at rest, {limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
+    ]
+    if limits.minimum_speed_mps:
+        radii = limits.turning_radius_m, limits.full_rudder_radius_m
+        own = [
+            ("minimum speed", f"{limits.minimum_speed_mps:.2f} m/s through the water; it cannot hover"),
+            ("turning radius", f"{radii[0]:.1f} m as planned, {radii[1]:.1f} m at full rudder"),
+            ("endurance", f"{limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
+        ]
     return [
         ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
         ("righting moment", f"{limits.righting_nm_per_deg:.3f} N m per degree"),
         ("top speed", of_axes(limits.speeds_mps, "m/s", 2)),
         ("full force", of_axes(limits.forces_n, "N", 0)),
-        ("holds station in", f"{limits.current_mps:.2f} m/s of current from any side"),
+        *own[:-1],
         ("busiest thruster", f"{percent(limits.load)} of its thrust at {limits.speed_mps:g} m/s in the mean current"),
         ("stopping distance", f"{length(limits.stopping_m)} at full thrust, {length(limits.coasting_m)} without"),
         ("latency", f"stable up to {limits.latency_s:.2f} s from image to command"),
-        ("endurance", f"{limits.hover_h:.1f} h at rest, {limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
+        own[-1],
         ("this survey", f"{survey_min:.1f} min, {limits.survey_wh:.1f} W h, {limits.dives} dive(s)"),
     ]
 

@@ -209,6 +209,28 @@ class ThrusterConfig(Section):
         return value
 
 
+class FinConfig(Section):
+    """Fin or lifting part of a hull, in the axes of the body; its chord is along the x axis at an angle of 0.
+
+    Movable fins have commands in [-1, 1], which follow those of the thrusters, in the order of the fins.
+    """
+
+    position_m: Vector3
+    """centre of pressure in the body [m]"""
+    lift_direction_deg: float = Field(ge=-180, le=180)
+    """direction of the lift at a positive angle, from left (0: a rudder) towards up (90: an elevator) [deg]"""
+    area_m2: Positive
+    """planform area [m2]"""
+    lift_slope_per_rad: Positive
+    """slope of the lift coefficient over the angle of attack [1/rad]"""
+    stall_deg: float = Field(default=15.0, gt=0, le=90)
+    """angle of attack beyond which the coefficient of the force across the chord stays constant [deg]"""
+    max_deg: float = Field(default=0.0, ge=0, le=45)
+    """angle at a command of 1; 0: a fixed fin, without a command [deg]"""
+    lag_s: float = Field(default=0.1, gt=0, le=5)
+    """time constant with which the angle follows the command [s]"""
+
+
 #: Position and direction of the thrusters of the BlueROV2 Heavy: four vectored at 45 deg, then four vertical ones.
 _HEAVY_THRUSTERS = (
     ((0.156, -0.111, -0.085), (1.0, 1.0, 0.0)),
@@ -269,6 +291,8 @@ class VehicleConfig(Section):
         max_length=32,
     )
     """thrusters, in the order of the commands"""
+    fins: tuple[FinConfig, ...] = Field(default=(), max_length=32)
+    """fins; a vehicle with movable fins is steered by them: it has a minimum speed and a turning radius"""
     thrust_coefficients: tuple[Number, ...] = Field(default=(-140.3, 389.9, -404.1, 176.0, 8.9), max_length=12)
     """thrust at rest [N] of a command u from -1 to 1: coefficients of an odd polynomial, that of the highest power
     first; unused with thrust_table"""
@@ -303,6 +327,14 @@ class VehicleConfig(Section):
             raise PydanticCustomError("drag_matrix", "a matrix with a diagonal of 0 or more: drag resists motion")
         return value
 
+    @field_validator("fins")
+    @classmethod
+    def _require_thrust_ahead(cls, value: tuple[FinConfig, ...], info: ValidationInfo) -> tuple[FinConfig, ...]:
+        ahead = all(thruster.direction[0] > 0 for thruster in info.data.get("thrusters", ()))
+        if any(fin.max_deg > 0 for fin in value) and not ahead:
+            raise PydanticCustomError("fins", "movable fins only with thrusters that all push forwards")
+        return value
+
     @field_validator("thrust_coefficients")
     @classmethod
     def _require_thrust(cls, value: tuple[float, ...]) -> tuple[float, ...]:
@@ -333,6 +365,15 @@ class VehicleConfig(Section):
         if (np.roots(denominator).real >= 0).any():
             raise PydanticCustomError("lag", "a stable transfer function")
         return value
+
+    @property
+    def n_commands(self) -> int:
+        """Returns the number of commands of a rigid vehicle: one per thruster, then one per movable fin."""
+        return len(self.thrusters) + sum(fin.max_deg > 0 for fin in self.fins)
+
+    @property
+    def is_steered_by_fins(self) -> bool:
+        return self.dynamics == "rigid" and any(fin.max_deg > 0 for fin in self.fins)
 
 
 class RigConfig(Section):
@@ -837,8 +878,9 @@ class PlanConfig(Section):
     polygon: str | tuple[Vector2, ...] | None = None
     """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with polygons,
     with or without holes, in a CRS that it names, in degrees or in that of the DEM; ${TWIN_DATA} is expanded"""
-    turns: Literal["reverse", "bow_first"] = "reverse"
-    """reverse: every second leg is flown backwards; bow_first: after each leg the vehicle yaws by 180 deg"""
+    turns: Literal["reverse", "bow_first", "arcs"] = "reverse"
+    """reverse: every second leg is flown backwards; bow_first: after each leg the vehicle yaws by 180 deg; arcs: it
+    flies bow first at constant speed and turns in arcs, as a vehicle that is steered by fins has to"""
     altitude_m: float = Field(default=2.2, gt=0, le=100)
     """height of the cameras above the reference plane z = 0 or, with height = "floor", above the sea floor [m]"""
     speed_mps: float = Field(default=0.25, gt=0.01, le=2)
@@ -1229,7 +1271,8 @@ class Scenario(Section):
     def estimator_settings(self) -> EstimatorSettings:
         noise = self.imaging.noise_sd, self.imaging.shot_noise
         settings = self.estimate.model_dump(exclude={"plugin"})
-        return EstimatorSettings(**settings, noisy_images=self.sensor is not None or max(noise) >= _VISIBLE_NOISE)
+        noisy, stops = self.sensor is not None or max(noise) >= _VISIBLE_NOISE, not self.vehicle.is_steered_by_fins
+        return EstimatorSettings(**settings, noisy_images=noisy, stops_if_blind=stops)
 
     def fingerprint(self) -> str:
         """Returns a hash of all values but `record`, 16 hexadecimal digits; of files, only the paths are hashed."""

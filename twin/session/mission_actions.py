@@ -33,11 +33,14 @@ class MissionActions:
     reference agree. The vehicle slows down if many frames of the last second were lost; this is decided at measured
     frames only, because a predicted motion has the speed of the last measured one.
 
+    A vehicle that cannot stop (it flies arcs) goes on along the path by dead reckoning.
+
     `log` (`RunFolder.log`) gets each new action. `n_frames` does not count those of `add_measured_frames`.
     """
 
     def __init__(self, mission: Mission, log: Callable[..., None] | None = None):
         self._log = log
+        self._can_stop = not mission.plan.flies_arcs
         self.rate_hz, self._n_per_keyframe = mission.plan.request.frame_rate_hz, mission.plan.n_frames_per_keyframe
         self.action: Action = "fly"
         self.n_frames: dict[Action, int] = dict.fromkeys(RATES, 0)
@@ -76,6 +79,8 @@ class MissionActions:
         return ActionTimes(self.n_frames["slow"] / self.rate_hz, self.n_frames["hold"] / self.rate_hz)
 
     def _next_action(self, lost: bool) -> Action:
+        if not self._can_stop:
+            return "fly"
         if self._n_blind > BLIND_S * self.rate_hz or self._n_failed >= MAX_FAILED:
             return "hold"
         if lost:

@@ -85,8 +85,8 @@ class SteppedWorld:
         """Moves the vehicle for one frame interval under a constant command and returns the next frame.
 
         Args:
-            command: (n,) thruster commands in [-1, 1], in the order of `vehicle.thrusters`; the thrusters limit larger
-                values. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
+            command: (n,) commands in [-1, 1] of `vehicle.thrusters`, then of the movable `vehicle.fins`; larger values
+                are limited. For vehicle.dynamics = "kinematic" the velocity (3,) in the world [m/s].
             pace: pace along the planned path from this frame to the next, from `actions`.
             keyframe: whether the next frame is a keyframe, which has both images; None: as planned.
 
@@ -99,7 +99,7 @@ class SteppedWorld:
             SurveyAborted: the physics diverged, for example because a command is not finite.
         """
         values, vehicle = np.array(command, dtype=np.float64), self.mission.scenario.vehicle
-        n = len(vehicle.thrusters) if vehicle.dynamics == "rigid" else 3
+        n = vehicle.n_commands if vehicle.dynamics == "rigid" else 3
         if values.shape != (n,):
             raise ValueError(f"the command has the shape {values.shape} (expected: ({n},))")
         return self.flight.step(values, pace, keyframe)

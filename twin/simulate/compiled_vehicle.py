@@ -18,6 +18,7 @@ from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.scenario.model import VehicleConfig
 from twin.simulate.contact import OPEN_WATER, FloorField, contact_error, touches_floor
+from twin.simulate.fins import Fins, add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import Hull, free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
@@ -31,6 +32,8 @@ from twin.simulate.thrusters import (
     thruster_wrench,
 )  # fmt: skip
 
+AT_REST = np.zeros(3)
+
 
 class RigidBodyState(NamedTuple):
     """State and parameters of a rigid body in water; the arrays of the state are modified in place.
@@ -43,6 +46,7 @@ class RigidBodyState(NamedTuple):
     acceleration: Array  #: (6,) rate of change of `velocity` in the last step
     kick: Array  #: (1,) number of timesteps over which the next step integrates: 0.5 in the first (leapfrog), then 1
     thrusters: ThrusterState
+    fins: Fins
     hull: Hull
     sea: Sea
     timestep_s: float
@@ -58,18 +62,20 @@ class CompiledVehicle:
 
     Args:
         sea: motion of the water.
-        world_from_body: (4, 4) initial pose, at rest.
+        world_from_body: (4, 4) initial pose.
         floor: floor that the hull must not touch.
+        start_velocity_mps: (3,) initial velocity in the world.
     """
 
     def __init__(
         self, vehicle: VehicleConfig, sea: Sea, world_from_body: Array, timestep_s: float,
-        floor: FloorField = OPEN_WATER, tether: Tether = NO_TETHER,
+        floor: FloorField = OPEN_WATER, tether: Tether = NO_TETHER, start_velocity_mps: Array = AT_REST,
     ):  # fmt: skip
         thrusters = lagged_thrusters(parameters_of(vehicle), timestep_s)
+        velocity = np.concatenate([start_velocity_mps, np.zeros(3)])
         self.state = RigidBodyState(
-            np.array(world_from_body, float), np.zeros(6), np.zeros(6), np.full(1, 0.5), thrusters,
-            trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, tether,
+            np.array(world_from_body, float), velocity, np.zeros(6), np.full(1, 0.5), thrusters,
+            fins_of(vehicle, timestep_s), trimmed_hull(vehicle), sea, timestep_s, np.zeros(1, np.int64), floor, tether,
             np.full(1, -1),
         )  # fmt: skip
         self._time_s = 0.0
@@ -95,12 +101,13 @@ class CompiledVehicle:
         """Returns the true [angular, linear] velocity (6,) in body axes [rad/s, m/s], at the time of the pose."""
         return body_twist(self.state)
 
-    def step(self, thruster_u: Array, duration_s: float) -> None:
-        """Simulates `duration_s`, whole timesteps (else ValueError), under thruster commands (n,) in [-1, 1].
+    def step(self, command: Array, duration_s: float) -> None:
+        """Simulates `duration_s`, whole timesteps (else ValueError), under commands (n,) in [-1, 1].
 
-        Raises SurveyAborted if the physics diverged, or the hull touches the floor.
+        The commands are those of the thrusters, then those of the movable fins. Raises SurveyAborted if the physics
+        diverged, or the hull touches the floor.
         """
-        advance(self.state, thruster_u, whole_timesteps(duration_s, self.state.timestep_s))
+        advance(self.state, command, whole_timesteps(duration_s, self.state.timestep_s))
         self.advance_clock(duration_s)
 
     def advance_clock(self, duration_s: float) -> None:
@@ -129,11 +136,14 @@ def has_ended(body):
 def advance(body, command, n_steps):
     """Advances the state by `n_steps` timesteps under commands (n,); stops early if the hull touches the floor."""
     thrusters, pose, velocity, acceleration = body.thrusters, body.pose, body.velocity, body.acceleration
-    set_thruster_command(thrusters, command)
+    n_thrusters = len(thrusters.steady_n)
+    set_thruster_command(thrusters, command[:n_thrusters])
+    set_fin_commands(body.fins, command[n_thrusters:])
     for n in range(n_steps):
         now = velocity + 0.5 * body.timestep_s * acceleration
         flow = flow_at(body.sea, body.n_steps[0] * body.timestep_s, pose[:3, 3])
         wrench = thruster_wrench(thrusters)
+        add_fins(wrench, body.fins, velocity_through_water(pose[:3, :3], now, flow))
         add_tether(wrench, body.tether, body.sea, body.n_steps[0] * body.timestep_s, pose[:3, :3], pose[:3, 3], now)
         geometry.copy_into(acceleration, free_joint_acceleration(body.hull, pose[:3, :3], now, flow, wrench))
         velocity += body.kick[0] * body.timestep_s * acceleration
@@ -145,6 +155,7 @@ def advance(body, command, n_steps):
             next_pose[i, 3] += body.timestep_s * velocity[i]
         geometry.copy_into(pose, next_pose)
         step_thrusters(thrusters)
+        step_fins(body.fins)
         if touches_floor(body.floor, pose):
             body.left[0] = n_steps - 1 - n
             return

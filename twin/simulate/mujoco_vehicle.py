@@ -12,7 +12,9 @@ from twin.core.geometry import Array
 from twin.errors import SurveyAborted
 from twin.scenario.model import VehicleConfig
 from twin.scenes.gl import MjModel, mujoco
+from twin.simulate.compiled_vehicle import AT_REST
 from twin.simulate.contact import contact_error
+from twin.simulate.fins import add_fins, fins_of, set_fin_commands, step_fins, velocity_through_water
 from twin.simulate.hull import RATE_LIMIT_RADPS, SPEED_LIMIT_MPS, trimmed_hull, whole_timesteps
 from twin.simulate.hydrodynamics import free_joint_acceleration, twist_from_free_joint
 from twin.simulate.parameters import parameters_of
@@ -32,7 +34,8 @@ class MujocoVehicle:
     Args:
         model: compiled MuJoCo model with a free body "vehicle" whose origin is the centre of gravity.
         sea: motion of the water.
-        world_from_body: (4, 4) initial pose, at rest.
+        world_from_body: (4, 4) initial pose.
+        start_velocity_mps: (3,) initial velocity in the world.
 
     Attributes:
         tether: its tether; `snag` can be modified in place.
@@ -42,8 +45,9 @@ class MujocoVehicle:
     """
 
     def __init__(
-        self, model: MjModel, vehicle: VehicleConfig, sea: Sea, world_from_body: Array, tether: Tether = NO_TETHER
-    ):
+        self, model: MjModel, vehicle: VehicleConfig, sea: Sea, world_from_body: Array, tether: Tether = NO_TETHER,
+        start_velocity_mps: Array = AT_REST,
+    ):  # fmt: skip
         self.tether = tether
         self._model, self._data = model, mujoco.MjData(model)
         self._hull, self.sea = trimmed_hull(vehicle), sea
@@ -55,9 +59,11 @@ class MujocoVehicle:
         self._acceleration = np.zeros(6)
         self._kick = 0.5  # the first step advances the velocity by half a timestep, see the class docstring
         self.thrusters = lagged_thrusters(parameters_of(vehicle), model.opt.timestep)
+        self._fins = fins_of(vehicle, model.opt.timestep)
         self._history: deque[str] = deque(maxlen=3)
         self._data.qpos[first_q : first_q + 3] = world_from_body[:3, 3]
         self._data.qpos[first_q + 3 : first_q + 7] = geometry.quaternion_wxyz(world_from_body[:3, :3])
+        self._velocity[:3] = start_velocity_mps
         mujoco.mj_step1(model, self._data)
         self.after_timestep: Callable[[Array], None] | None = None
         self.touched: Callable[[Array], str] = lambda _: ""
@@ -92,16 +98,20 @@ class MujocoVehicle:
     def _acceleration_at(self, velocity: Array, wrench: Array) -> Array:
         at = self._data.xpos[self._body]
         flow = flow_at(self.sea, self.time_s, at)
+        add_fins(wrench, self._fins, velocity_through_water(self._rotation, velocity, flow))
         add_tether(wrench, self.tether, self.sea, self.time_s, self._rotation, at, velocity)
         return free_joint_acceleration(self._hull, self._rotation, velocity, flow, wrench)
 
-    def step(self, thruster_u: Array, duration_s: float) -> None:
+    def step(self, command: Array, duration_s: float) -> None:
         """Simulates as `CompiledVehicle.step` does, with all obstacles."""
         n_steps = whole_timesteps(duration_s, self._model.opt.timestep)
-        set_thruster_command(self.thrusters, thruster_u)
+        n_thrusters = len(self.thrusters.steady_n)
+        set_thruster_command(self.thrusters, command[:n_thrusters])
+        set_fin_commands(self._fins, command[n_thrusters:])
         for _ in range(n_steps):
             self._advance(thruster_wrench(self.thrusters))
             step_thrusters(self.thrusters)
+            step_fins(self._fins)
             if self.after_timestep is not None:
                 self.after_timestep(self.inertial)
             if obstacle := self.touched(self.world_from_body):

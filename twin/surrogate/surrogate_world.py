@@ -45,7 +45,7 @@ class SurrogateWorld(World):
             vehicle = CompiledVehicle(
                 scenario.vehicle, make_sea(scenario, rng["sea"]), mission.start_of_body,
                 physics_timestep_s(rig.frame_rate_hz), floor_of(mission),
-                tether_of(scenario.tether, mission.start_of_body[:3, 3]),
+                tether_of(scenario.tether, mission.start_of_body[:3, 3]), mission.start_velocity_mps,
             )  # fmt: skip
         else:
             vehicle = KinematicVehicle(mission.start_of_body)

@@ -177,7 +177,8 @@ class SurrogateVision:
         if (errors := self.frame_errors) is None:
             self._tracking_cov = None
             interval_s = 1 / self.rig.frame_rate_hz
-            factor, self._blind_s = braking_factor(self._blind_s, interval_s), self._blind_s + interval_s
+            factor = braking_factor(self._blind_s, interval_s, self.settings.stops_if_blind)
+            self._blind_s += interval_s
             if factor < 1:
                 self._last_motion = geometry.exp(factor * geometry.log(self._last_motion))
             return constant_velocity_motion(self._last_motion), NOT_MATCHED

@@ -13,7 +13,7 @@ from twin import terrains
 from twin.controllers import segments
 from twin.controllers.camera_surface import CameraSurface
 from twin.controllers.survey_area import SurveyArea
-from twin.controllers.survey_plan import SurveyPlan
+from twin.controllers.survey_plan import FRAMES_BETWEEN_TRACKS, SurveyPlan
 from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import MapGrid, StereoRig
@@ -28,7 +28,7 @@ from twin.plugin.guard import check_loadable
 from twin.plugin.loading import CONTROLLERS, ESTIMATORS
 from twin.scenario.model import BeaconConfig, Scenario, Source, TaskConfig
 from twin.simulate.hull import physics_timestep_s
-from twin.simulate.sea import make_sea
+from twin.simulate.sea import make_sea, mean_current_mps
 from twin.simulate.sensors import imu_rate_hz
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.chart import chart_of
@@ -123,9 +123,21 @@ class Mission:
 
     @property
     def start(self) -> Array:
-        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow along the first leg."""
+        """Returns world_from_camera (4, 4) at the start of the survey: vehicle level, bow along the first leg.
+
+        If it flies arcs, its bow points along its velocity through the mean current.
+        """
         start = self.plan.reference(1, 0.0)
-        return geometry.pose(geometry.rotations_of_down_camera(np.asarray(start.yaw)), start.position)
+        yaw = np.asarray(start.yaw)
+        if self.plan.flies_arcs:
+            x, y, _ = start.velocity - mean_current_mps(make_sea(self.scenario), float(start.position[2]))
+            yaw = np.arctan2(y, x)
+        return geometry.pose(geometry.rotations_of_down_camera(yaw), start.position)
+
+    @property
+    def start_velocity_mps(self) -> Array:
+        """Returns the velocity (3,) at the start of the survey: at rest, or at the planned speed if it flies arcs."""
+        return self.plan.reference(1, 0.0).velocity + 0.0  # no negative zero
 
     @property
     def start_of_body(self) -> Array:
@@ -171,11 +183,16 @@ class Mission:
         times_s, keyframes = self.plan.frames_of_track(track)
         return FrameSequence(self.plan.references(track, times_s), keyframes, False, times_s, track)
 
-    def station_keeping_frames(self, track: int) -> FrameSequence:
-        """Returns the planned frames of each half of the station keeping after a track; between them, GA runs."""
-        n = self._n_holding
-        times_s = np.full(n, self.plan.track_duration_s(track))
-        return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), True, times_s, track)
+    def station_keeping_frames(self, track: int, half: int = 0) -> FrameSequence:
+        """Returns the planned frames of a half (0 or 1) of the station keeping after a track; between them, GA runs.
+
+        A vehicle that flies arcs goes on straight ahead.
+        """
+        n, times_s = self._n_holding, np.full(self._n_holding, self.plan.track_duration_s(track))
+        if self.plan.flies_arcs:
+            times_s -= (FRAMES_BETWEEN_TRACKS - half * n - np.arange(n)) / self.plan.request.frame_rate_hz
+        holding = not self.plan.flies_arcs
+        return FrameSequence(self.plan.references(track, times_s), np.zeros(n, np.bool_), holding, times_s, track)
 
     def next_frames(self, track: int, path_time_s: float, pace: Pace) -> FrameSequence:
         """Returns the frames of a track after a path time at a pace: the next one, or all that remain at full pace.
@@ -190,6 +207,8 @@ class Mission:
 
     @property
     def _n_holding(self) -> int:
+        if self.plan.flies_arcs:
+            return FRAMES_BETWEEN_TRACKS // 2
         return max(1, round(self.scenario.control.hold_s / 2 * self.plan.request.frame_rate_hz))
 
     @property
@@ -323,7 +342,7 @@ def _greatest_altitude_m(plan: SurveyPlan, terrain: terrains.Terrain) -> float:
 def _half_extent_m(plan: SurveyPlan) -> tuple[float, float]:
     """Returns half the greatest extent of a footprint on the reference plane along x and y [m]."""
     across_m, along_m = plan.request.footprint_m
-    if plan.turns_on_the_spot:
+    if plan.turns_on_the_spot or plan.flies_arcs:
         diagonal_m = float(np.hypot(along_m, across_m))
         return diagonal_m / 2, diagonal_m / 2
     c, s = abs(np.cos(plan.area.heading)), abs(np.sin(plan.area.heading))

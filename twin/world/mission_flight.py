@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 from twin.controllers.camera_surface import CameraSurface
-from twin.controllers.detours import end_of
+from twin.controllers.curves import end_of
 from twin.controllers.segments import Point, Reference, Segment
 from twin.core.geometry import Array
 from twin.core.records import Frame
@@ -114,7 +114,7 @@ class Flight:
     def _parts_of(self, track: int) -> Iterator[tuple[FrameSequence, bool]]:
         yield self._mission.planned_frames(track), False
         yield self._mission.station_keeping_frames(track), False
-        yield self._mission.station_keeping_frames(track), True
+        yield self._mission.station_keeping_frames(track, 1), True
 
     def _enter(self, sequence: FrameSequence, aligns: bool = False) -> None:
         if self._change != _UNCHANGED:

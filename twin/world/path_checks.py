@@ -18,6 +18,7 @@ from twin.errors import TwinError
 from twin.scenario.model import FaultConfig, PlanConfig, Scenario, VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.simulate.sea import Sea, strongest_currents_mps
+from twin.simulate.steady_flight import minimum_speed_mps
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.objects.scattering import disc_of
@@ -205,7 +206,7 @@ def check_lamp(number: int, position_m: Array, camera_m: Array, terrain: Terrain
     along = np.append(np.arange(0.0, lengths[-1], max(LAMP_STEP_M, lengths[-1] / LAMP_POINTS)), lengths[-1])
     x, y = (np.interp(along, lengths, corners[:, k]) for k in range(2))
     camera = np.column_stack([x, y, plan.camera_height_at(x, y)])
-    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + plan.turns_on_the_spot]
+    headings = [plan.area.heading, plan.area.heading + np.pi][: 1 + (plan.turns_on_the_spot or plan.flies_arcs)]
     offset = position_m - camera_m
     x, y, z = np.concatenate([camera + rotate_lever_arm(heading, offset) for heading in headings]).T
     above = np.nan_to_num(z - terrain.height_at(x, y), nan=np.inf)
@@ -244,8 +245,22 @@ def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan) -> None:
     distinct = np.unique(rounded, axis=0)
     yaw, velocity = distinct[:, 0], distinct[:, 1:]
     for current in strongest_currents_mps(sea, lowest_m, highest_m):
-        if current.any() or plan.follows_floor or plan.request.cross_rise_m:
+        if vehicle.is_steered_by_fins:
+            if current.any():
+                _check_speed_through(vehicle, current, velocity)
+        elif current.any() or plan.follows_floor or plan.request.cross_rise_m:
             _check_thrust_in(vehicle, current, plan.speed_mps, yaw, velocity)
+
+
+def _check_speed_through(vehicle: VehicleConfig, current: Array, velocity: Array) -> None:
+    """Raises TwinError if the planned velocities (n, 3) need a speed through the water that fins cannot use."""
+    through = np.linalg.norm(velocity - current, axis=1)
+    least, most = minimum_speed_mps(vehicle), top_speed_mps(vehicle, np.array([1.0, 0.0, 0.0]))
+    if through.min() < least or through.max() > most:
+        raise TwinError(
+            "current.velocity_mps", f"{np.linalg.norm(current):.2f} m/s: at the planned speed over the ground, the"
+            f" speed through the water is {through.min():.2f} to {through.max():.2f} m/s", f"{least:.2f} to {most:.2f}",
+        )  # fmt: skip
 
 
 def _check_coverage(sea: Sea, lowest_m: float, highest_m: float, duration_s: float) -> None:

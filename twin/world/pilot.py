@@ -20,6 +20,7 @@ from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import CONTROLLERS
 from twin.plugin.protocols import ControllerSetup
 from twin.simulate.autopilot import allocation_without, nominal_controller, thruster_lag_s
+from twin.simulate.fin_control import fin_autopilot
 from twin.simulate.parameters import moves_along_all_axes
 from twin.world.computer import frames_of_latency
 from twin.world.mission import Mission
@@ -42,6 +43,8 @@ def make_pilot(mission: Mission, monitor: ThrusterMonitor | None = None) -> Pilo
     n_late = frames_of_latency(mission.scenario)
     if scenario.control.plugin is not None:
         return _late(_plugin_pilot(mission, scenario.control.plugin), n_late)
+    if scenario.vehicle.is_steered_by_fins:
+        return _late(AuvPilot(mission), n_late)
     return (
         RovPilot(mission, monitor) if scenario.vehicle.dynamics == "rigid" else _late(_kinematic_pilot(mission), n_late)
     )
@@ -79,7 +82,7 @@ def _plugin_pilot(mission: Mission, name: str) -> PilotOfEstimates:
     """Returns the pilot that gives the commands of the plug-in; a call raises PluginFailed if they are unusable."""
     scenario, rig = mission.scenario, mission.rig
     nominal = nominal_controller(scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz)
-    n = len(scenario.vehicle.thrusters) if scenario.vehicle.dynamics == "rigid" else 3
+    n = scenario.vehicle.n_commands if scenario.vehicle.dynamics == "rigid" else 3
     setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
     plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
 
@@ -109,6 +112,41 @@ class PilotState(NamedTuple):
     controller: ControllerState
     latency_s: float  #: time until a command reaches the thrusters
     waiting: Array  #: (k, n) commands that have not reached them, the oldest first
+
+
+class AuvPilot:
+    """Pilot of a vehicle that is steered by fins; a command (n,) in [-1, 1] per thruster, then per movable fin.
+
+    With a latency, pose and reference are predicted to the time at which the command takes effect.
+    """
+
+    def __init__(self, mission: Mission):
+        rig, scenario = mission.rig, mission.scenario
+        self._camera_from_body, self._lever_arm_m = geometry.inverse(rig.body_from_camera), rig.body_from_camera[:3, 3]
+        self._from_camera_twist = geometry.adjoint(rig.body_from_camera)
+        self._smoothing = 1 / (1 + _VELOCITY_SMOOTHING_S * rig.frame_rate_hz)
+        self._twist: Array | None = None
+        self._late_s = frames_of_latency(scenario) / rig.frame_rate_hz
+        self._allocation = nominal_controller(scenario.vehicle, 1.0, rig.frame_rate_hz).allocation
+        self._autopilot = fin_autopilot(scenario.vehicle, mission.plan.speed_mps, rig.frame_rate_hz)
+        self._n_thrusters = len(scenario.vehicle.thrusters)
+
+    def __call__(self, estimate: Estimate, reference: Reference) -> Array:
+        yaw, late_s, body = float(reference.yaw), self._late_s, estimate.world_from_camera @ self._camera_from_body
+        if self._twist is None:  # at the first frame, no velocity is measured
+            self._twist = np.concatenate([np.zeros(3), body[:3, :3].T @ reference.velocity])
+        else:
+            measured = self._from_camera_twist @ estimate.camera_velocity
+            self._twist = self._twist + self._smoothing * (measured - self._twist)
+        body = body @ geometry.exp(late_s * self._twist)
+        velocity = reference.velocity + late_s * reference.acceleration
+        target = reference.position - rotate_lever_arm(yaw, self._lever_arm_m)
+        target = target + late_s * (reference.velocity + velocity) / 2
+        acceleration, is_measured = reference.acceleration, estimate.is_measured
+        inputs = self._autopilot.inputs(body, self._twist, target, velocity, acceleration, is_measured)
+        n, allocation = self._n_thrusters, self._allocation
+        thrusts = np.interp(inputs[:n], allocation.thrust_table_n, allocation.command_table)
+        return np.concatenate([thrusts, inputs[n:] / self._autopilot.most[n:]])
 
 
 class RovPilot:

@@ -18,7 +18,8 @@ from twin.core.height_field import HeightField, height_field, image_overlap
 from twin.core.records import MapGrid, StereoRig
 from twin.errors import TwinError
 from twin.judge.swaths import ImagePairs, KeyframePoses, image_pairs, swath_numbers, travel_direction
-from twin.scenario.model import Scenario
+from twin.scenario.model import PlanConfig, Scenario, VehicleConfig
+from twin.simulate.steady_flight import minimum_speed_mps, turning_radius_m
 from twin.terrains import Terrain
 from twin.world.asked_area import survey_area
 from twin.world.path_checks import climb_slope, hole_part
@@ -141,7 +142,7 @@ def _check_number(field: str, number: float, limit: int, items: str, remedy: str
 def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest:
     """Returns the requirements of a survey; without a terrain, its area lies at the origin.
 
-    Raises TwinError if the area cannot be placed, or the vehicle cannot turn on the spot.
+    Raises TwinError if the area cannot be placed, or the vehicle cannot turn as planned.
     """
     p, rig = scenario.plan, scenario.believed_rig()
     if p.turns != "reverse" and scenario.vehicle.dynamics == "kinematic":
@@ -150,8 +151,24 @@ def survey_request(scenario: Scenario, terrain: Terrain | None) -> SurveyRequest
     return SurveyRequest(
         p.area_m if area is None else area.size_m, p.altitude_m, p.speed_mps, p.overlap_along, p.overlap_across,
         p.tracks, rig.width_px, rig.height_px, rig.focal_px, rig.frame_rate_hz, area=area, turns=p.turns,
+        turn_radius_m=_turn_radius_m(p, scenario.vehicle),
         cross_lines=p.cross_lines, cross_rise_m=p.cross_rise_m,
     )  # fmt: skip
+
+
+def _turn_radius_m(asked: PlanConfig, vehicle: VehicleConfig) -> float:
+    """Returns the radius of turns of a vehicle that is steered by fins, else 0; raises TwinError if it cannot fly."""
+    if not vehicle.is_steered_by_fins:
+        if asked.turns == "arcs":
+            raise TwinError("plan.turns", "'arcs': the vehicle is not steered by fins", '"reverse" or "bow_first"')
+        return 0.0
+    if asked.turns != "arcs":
+        problem = f"{asked.turns!r}: a vehicle that is steered by fins can neither reverse nor turn on the spot"
+        raise TwinError("plan.turns", problem, '"arcs"')
+    if asked.speed_mps < (least := minimum_speed_mps(vehicle)):
+        problem = f"{asked.speed_mps:g}: too slow for the fins to keep the height"
+        raise TwinError("plan.speed_mps", problem, f"at least {least:.2f}")
+    return turning_radius_m(vehicle, asked.speed_mps)
 
 
 def _lies_over(plan: SurveyPlan, terrain: Terrain) -> bool:

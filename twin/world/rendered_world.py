@@ -44,6 +44,7 @@ class RenderedWorld(World):
                 make_sea(scenario, rng["sea"]),
                 mission.start_of_body,
                 tether_of(scenario.tether, mission.start_of_body[:3, 3]),
+                mission.start_velocity_mps,
             )
             if scenario.vehicle.dynamics == "rigid"
             else KinematicVehicle(mission.start_of_body)

@@ -33,7 +33,9 @@ def contradictions(scenario: Scenario) -> Iterator[TwinError]:
     if scenario.plan.cross_rise_m and scenario.vehicle.dynamics == "kinematic":
         problem, allowed = "a kinematic vehicle moves in a horizontal plane", '0, or vehicle.dynamics = "rigid"'
         yield TwinError("plan.cross_rise_m", problem, allowed)
-    if scenario.vehicle.dynamics == "rigid" and not moves_along_all_axes(scenario.vehicle):
+    if scenario.vehicle.is_steered_by_fins:
+        yield from _of_fins(scenario)
+    elif scenario.vehicle.dynamics == "rigid" and not moves_along_all_axes(scenario.vehicle):
         problem = f"{len(scenario.vehicle.thrusters)} thrusters cannot push along all axes and turn about the vertical"
         yield TwinError("vehicle.thrusters", problem, 'thrusters that can, or vehicle.dynamics = "kinematic"')
     if "beacons" in scenario.navigation.aiding and not scenario.beacons:
@@ -107,6 +109,19 @@ def _of_lens(scenario: Scenario) -> Iterator[TwinError]:
             yield TwinError(f"lens.{key}", "needs the f-number and the pixel size of the sensor", "with [sensor]")
     if 0 < lens.focus_m < NEAREST_FOCUS_M:
         yield TwinError("lens.focus_m", f"{lens.focus_m:g}: too near", f"0, or {NEAREST_FOCUS_M:g} or more")
+
+
+def _of_fins(scenario: Scenario) -> Iterator[TwinError]:
+    """Yields an error for each key that asks a vehicle that is steered by fins to stop, sidestep or climb."""
+    problem = "a vehicle that is steered by fins flies level, bow first, at a minimum speed"
+    if scenario.plan.pattern != "lawnmower":
+        yield TwinError("plan.pattern", f"{scenario.plan.pattern!r}: {problem}", '"lawnmower"')
+    plan = ("cross_lines", "fill_gaps", "height")
+    yield from keys_without_effect("plan", scenario.plan, plan, f"cannot be flown: {problem}", "the default")
+    control = ("hold_s", "natural_frequency_radps", "height")
+    yield from keys_without_effect("control", scenario.control, control, f"has no effect: {problem}", "the default")
+    for k, _ in enumerate(scenario.tasks):
+        yield TwinError(f"tasks.{k}", f"cannot be flown: {problem}", "no [[tasks]]")
 
 
 def _of_tasks(scenario: Scenario) -> Iterator[TwinError]:

@@ -155,12 +155,14 @@ class World(ABC):
                 self.vehicle.step(command, interval_s)
                 return
             thrusters, pose = self.vehicle.thrusters, self.vehicle.world_from_body
-            arriving, thrusters.factors[:] = self.faults.thrusts(command)
+            n = len(thrusters.factors)  # commands of fins follow those of the thrusters
+            arriving, factors = self.faults.thrusts(command)
+            thrusters.factors[:] = factors[:n]
             self.faults.catch_tether(self.vehicle.tether, pose[:3, 3])
             self.faults.blow(self.vehicle.sea.single_gusts, pose[:3, 1])
             self.vehicle.step(arriving, interval_s)
             if scenario.control.thruster_feedback == "speed":
-                commanded_n = commanded_thrusts_n(scenario.vehicle, command)
+                commanded_n = commanded_thrusts_n(scenario.vehicle, command[:n])
                 self.thruster_monitor.add(len(self) * interval_s, commanded_n, thrusters.steady_n)
 
     def __len__(self) -> int:

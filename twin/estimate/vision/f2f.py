@@ -68,11 +68,13 @@ class FrameToFrame:
         filter: pose of the last frame in the reference camera, and velocity.
     """
 
-    def __init__(self, rig: StereoRig, patch_px: int, imu_noise: ImuErrorModel | None = None):
+    def __init__(
+        self, rig: StereoRig, patch_px: int, imu_noise: ImuErrorModel | None = None, stops_if_blind: bool = True
+    ):
         self.rig, self.patch_px, self._imu_noise = rig, patch_px, imu_noise
         self.reference: _Reference | None = None
         self.started = False
-        self.filter: MotionFilter | InertialFilter = MotionFilter()
+        self.filter: MotionFilter | InertialFilter = MotionFilter(stops_if_blind)
         self._reference_cov = np.zeros((6, 6))  # of the pose of the reference in the last keyframe
         self._common_cov = np.zeros((6, 6))  # see `cov_since_keyframe`
 

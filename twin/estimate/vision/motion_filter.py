@@ -25,7 +25,8 @@ class MotionFilter:
         velocity: (6,) twist of the camera in its own axes [rad/s, m/s].
     """
 
-    def __init__(self):
+    def __init__(self, stops_if_blind: bool = True):
+        self._stops = stops_if_blind
         self.pose, self.velocity = np.eye(4), np.zeros(6)
         self._blind_s = 0.0  # time since the last measurement
         self._cov = np.zeros((12, 12))
@@ -48,7 +49,7 @@ class MotionFilter:
 
     def predict(self, interval_s: float, _: ImuReadings | None = None) -> None:
         """Predicts the pose of the next frame; after a time without measurements, the velocity decays."""
-        self.velocity = braking_factor(self._blind_s, interval_s) * self.velocity
+        self.velocity = braking_factor(self._blind_s, interval_s, self._stops) * self.velocity
         self._blind_s += interval_s
         motion = geometry.exp(self.velocity * interval_s)
         self.pose = geometry.nearest_rigid(self.pose @ motion)
