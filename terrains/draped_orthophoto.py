@@ -16,7 +16,7 @@ from rasterio.warp import transform_bounds
 from twin.core.georeference import Georeference
 from twin.core.user_files import open_raster
 from twin.errors import TwinError
-from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits
+from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits, white_level
 
 Image = NDArray[np.uint8]
 Bounds = tuple[float, float, float, float]  #: west, south, east, north in a CRS
@@ -30,8 +30,10 @@ _MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than th
 
 def lay_orthophoto(
     texture: Image, file: Path, extent_m: tuple[float, float], georeference: Georeference | None
-) -> NDArray[np.bool_]:
-    """Replaces the texture of a floor by an orthophoto where it has valid pixels; returns whether it covers each texel.
+) -> tuple[NDArray[np.bool_], int]:
+    """Replaces the texture of a floor by an orthophoto where it has valid pixels.
+
+    Returns whether it covers each texel (rows, cols), and its value of white, 255 for 8 bits.
 
     It is transformed to the CRS of the DEM; without a CRS, it is taken to be in that one. If more than 1.5 of its
     pixels fit along the side of a texel, they are averaged over the texel, else interpolated.
@@ -57,9 +59,9 @@ def lay_orthophoto(
         if source.transform.is_identity:
             raise _error(file, "has no coordinates",
                          "a GeoTIFF with coordinates; terrain.texture_file for a plain image")  # fmt: skip
-        colour, covered = _read(source, file, grid, (rows, cols), georeference)
+        colour, covered, white = _read(source, file, grid, (rows, cols), georeference)
     texture[covered] = colour[covered]
-    return covered
+    return covered, white
 
 
 def _error(file: Path, problem: str, allowed: str) -> TwinError:
@@ -68,7 +70,7 @@ def _error(file: Path, problem: str, allowed: str) -> TwinError:
 
 def _read(
     source: rasterio.DatasetReader, file: Path, grid: Affine, shape: tuple[int, int], georeference: Georeference
-) -> tuple[Image, NDArray[np.bool_]]:
+) -> tuple[Image, NDArray[np.bool_], int]:
     bands = _colour_bands(source, file)
     floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
     if source.crs is not None and floor_crs is None:
@@ -87,10 +89,11 @@ def _read(
         add_alpha=ColorInterp.alpha not in source.colorinterp,
     ) as warped:  # fmt: skip
         values, covered = warped.read(bands), warped.dataset_mask() > 0
+    white = white_level(_brightest(source, bands)) if values.dtype == np.uint16 else 255
     if values.dtype == np.uint16:
-        values = eight_bits(values, _brightest(source, bands))
+        values = eight_bits(values, white)
     colour = np.moveaxis(values.astype(np.uint8), 0, 2)
-    return np.ascontiguousarray(np.broadcast_to(colour, (*shape, 3))), covered
+    return np.ascontiguousarray(np.broadcast_to(colour, (*shape, 3))), covered, white
 
 
 def _brightest(source: rasterio.DatasetReader, bands: list[int]) -> int:

@@ -41,10 +41,11 @@ def decoded(file: Path, field: str, allowed: str, flags: int) -> NDArray[np.gene
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
 
 
-def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
-    """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower 8, 10, 12 or 14 only.
+def white_level(brightest: int) -> int:
+    """Returns the greatest value of the fewest of 8, 10, 12, 14 or 16 bits that contain the brightest value."""
+    return next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
 
-    White is the greatest value of the fewest bits that contain `brightest`.
-    """
-    white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
+
+def eight_bits(values: NDArray[np.uint16], white: int) -> NDArray[np.uint8]:
+    """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower bits only (`white`)."""
     return np.clip(np.rint(values * (255.0 / white)), 0, 255).astype(np.uint8)

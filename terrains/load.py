@@ -9,19 +9,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.georeference import Georeference
 from twin.core.user_files import reading
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, decoded, height_error
 from twin.terrains.ground_cover import DEFAULT_COVERS
+from twin.terrains.height_file import HeightFile
 from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
+from twin.terrains.input_statement import InputStatement
 from twin.terrains.terrain import Terrain, texture_shape
 from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
-from twin.terrains.vertical_axis import Direction, VerticalAxis, upward_sign
+from twin.terrains.vertical_axis import Direction, VerticalAxis, direction_of
 from twin.terrains.walls import walls_of
 
 Heights = NDArray[np.float64]
 
 _MOST_HEIGHT_M = 20_000.0
+_LEAST_LEVEL = 16.0  # mean of an orthophoto, 0 to 255, below which its white is doubtful
 
 
 def load(
@@ -41,11 +43,11 @@ def load(
         TwinError: a file is missing, invalid or too large, the direction of heights unclear, or the cover unknown.
     """
     file = Path(height_file)
-    given, spacing_m, axis, georeference = _read_heights(file, height_spacing_m, height_range_m)
-    _check(given, file)
-    upward_m = upward_sign(given, axis, z, file) * axis.metres_per_unit
-    values = given[::-1] * upward_m
-    has_height = np.isfinite(values)
+    given = _read_heights(file, height_spacing_m, height_range_m)
+    _check(given.values, file)
+    direction, evidence = direction_of(given.values, given.axis, z, file)
+    values = given.values[::-1] * given.axis.metres_per_unit * (1.0 if direction == "up" else -1.0)
+    has_height, spacing_m, georeference = np.isfinite(values), given.spacing_m, given.georeference
     raw, known = fill_holes(values), known_nodes(has_height)
     if (most_m := float(np.abs(raw).max())) > _MOST_HEIGHT_M:  # larger than any on Earth
         raise height_error(file, f"has a height of {most_m:g} m", f"heights within {_MOST_HEIGHT_M:g} m of zero")
@@ -58,37 +60,49 @@ def load(
     texel_m = extent_m[0] / shape[1]
     cover, rng = texture.cover or DEFAULT_COVERS["file"], np.random.default_rng(seed)
     if texture.photo_file is not None:
-        texels = texture_from_photo(texture, shape, extent_m)
+        texels, colours = texture_from_photo(texture, shape, extent_m), Path(texture.photo_file).name
     else:
-        texels = generate_texture(cover, height_m, shape, texel_m, rng)
-    covered = share = None
+        texels, colours = generate_texture(cover, height_m, shape, texel_m, rng), f"generated: {cover}"
+    covered, share, doubts = None, None, given.doubts
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
         from twin.terrains.draped_orthophoto import lay_orthophoto
 
-        covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
+        photo = Path(texture.orthophoto_file)
+        covered, white = lay_orthophoto(texels, photo, extent_m, georeference)
         share = float(covered.mean())
+        colours = f"{photo.name} (white = {white}) over {100 * share:.3g} % of the floor, else {colours}"
+        if covered.any() and (level := float(texels[covered].mean())) < _LEAST_LEVEL:
+            doubts += (f"{photo.name!r} is nearly black: its mean is {level:.1f} of 255, with white at {white}.",)
     walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
     filled = None if has_height.all() else ~has_height
-    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, filled, georeference, share, walls, known)
+    finite = given.values[np.isfinite(given.values)]
+    stated = InputStatement(
+        file.name, given.crs, given.ground_scale, spacing_m,
+        "terrain.height_spacing_m" if georeference is None else "its coordinates",
+        given.axis.metres_per_unit, given.axis.unit_evidence, direction, evidence,
+        float(finite.min()), float(finite.max()), given.nodata,
+        float(1 - has_height.mean()), colours, doubts,
+    )  # fmt: skip
+    return Terrain(
+        height_m, spacing_m, west_m, south_m, texels, texel_m, filled, georeference, share, walls, known, stated
+    )
 
 
-def _read_heights(
-    file: Path, height_spacing_m: float, height_range_m: float
-) -> tuple[Heights, float, VerticalAxis, Georeference | None]:
-    """Returns what `elevation_model.read_geotiff` returns of a GeoTIFF, of any file of heights."""
+def _read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightFile:
     suffix, named = file.suffix.lower(), VerticalAxis(texts=(file.stem,))
     if suffix in (".tif", ".tiff"):
         from twin.terrains.elevation_model import read_geotiff  # imported here: it imports rasterio
 
         return read_geotiff(file, height_spacing_m)
     if suffix == ".png":
-        return _read_png(file) * height_range_m, height_spacing_m, named._replace(band_name="height"), None
+        axis = named._replace(band_name="height", unit_evidence="terrain.height_range_m")
+        return HeightFile(_read_png(file) * height_range_m, height_spacing_m, axis)
     if suffix == ".npy":
         values = _read_npy(file)
-        check_no_undeclared_holes(values, file, "NaN in place of {}")
-        return values, height_spacing_m, named, None
+        doubts = check_no_undeclared_holes(values, file, "NaN in place of {}")
+        return HeightFile(values, height_spacing_m, named, doubts=tuple(doubts))
     raise height_error(file, "is not a height file")
 
 

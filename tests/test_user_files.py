@@ -216,6 +216,20 @@ def test_a_loop_of_links_among_compared_runs_is_one_error(tmp_path):
         load_runs([tmp_path / "a", tmp_path / "b"])
 
 
+@pytest.mark.parametrize("kind", ["fifo", "link", "loop", "parent"])
+def test_what_a_mesh_names_is_a_regular_file_in_its_folder_or_refused(tmp_path, kind):
+    mesh, named = tmp_path / "mesh" / "a.obj", tmp_path / "mesh" / "a.mtl"
+    mesh.parent.mkdir()
+    (tmp_path / "secret.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    mesh.write_text(f"mtllib {'../secret' if kind == 'parent' else 'a'}.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    if kind == "fifo":
+        os.mkfifo(named)
+    elif kind != "parent":
+        named.symlink_to({"link": "/dev/zero", "loop": "a.mtl"}[kind])
+    with pytest.raises(TwinError, match="needs the file .*, which is not beside it or cannot be read"):
+        read_mesh(mesh, "terrain.mesh_file", (0.5, 0.5, 0.5))
+
+
 def test_an_accessor_without_data_is_refused_by_its_size(tmp_path):
     file = tmp_path / "mesh.glb"
     trimesh.creation.box().export(file)

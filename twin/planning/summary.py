@@ -74,7 +74,7 @@ def summarise(mission: Mission) -> PlanSummary:
     predicted = _predicted_metrics(floor, error)
     known = {f"{section}.{key}" for section, metrics in predicted.items() for key in metrics}
     require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
-    holes = (note.removesuffix(".") for note in mission.hole_notes)
+    holes = (note.removesuffix(".") for note in mission.floor_notes)
     warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
     return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
 
@@ -261,6 +261,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,
             "holes": _holes(mission),
+            "input": mission.stated_input,
             "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,
             "energy": planned_energy(mission)._asdict(),

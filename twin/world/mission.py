@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -154,6 +154,16 @@ class Mission:
         share = unknown_share(self.plan, self.terrain)
         area = [f"{100 * share:.3g} % of the asked area has no height and is not part of it."] if share > 0 else []
         return self.terrain.hole_notes + area
+
+    @property
+    def floor_notes(self) -> list[str]:
+        """Returns sentences on what is doubtful in the files of the floor, and those on floor without a height."""
+        return [*(self.terrain.stated.doubts if self.terrain.stated else ()), *self.hole_notes]
+
+    @property
+    def stated_input(self) -> dict[str, Any]:
+        """Returns the input statement of the floor as JSON; {} for a generated floor."""
+        return self.terrain.stated.as_json() if self.terrain.stated else {}
 
     @property
     def tracks(self) -> range:
