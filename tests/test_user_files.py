@@ -25,7 +25,7 @@ from twin.report.run_comparison import load_runs
 from twin.report.run_folder import read_raster
 from twin.scenario.file import load_scenario
 from twin.terrains.objects.mesh_file import read_mesh
-from twin.world.asked_area import read_geojson
+from twin.world.asked_area import read_area
 
 ROOT = Path(__file__).parent.parent
 PLACED = from_origin(500000.0, 8000000.0, 0.5, 0.5)
@@ -199,7 +199,7 @@ def test_an_impossible_polygon_is_one_error(tmp_path, ring):
     (tmp_path / "area.json").write_text(f'{{"type": "Polygon", "coordinates": [{ring}]}}')
     floor = load(write_tif(tmp_path / "dem.tif"))
     with pytest.raises(TwinError, match=r"^plan.polygon: [^\n]*$"):
-        read_geojson(tmp_path / "area.json", floor)
+        read_area(tmp_path / "area.json", floor)
 
 
 def test_a_scalar_matrix_of_opencv_is_one_error(tmp_path):
@@ -265,7 +265,7 @@ def samples(folder):
     return {
         dem: load, folder / "dem.npy": load, photo: lambda file: load(dem, orthophoto_file=file),
         folder / "photo.png": lambda file: load(dem, photo_file=file),
-        folder / "area.json": lambda file: read_geojson(file, floor),
+        folder / "area.json": lambda file: read_area(file, floor),
         folder / "rig.yaml": read_yaml, folder / "scene.toml": load_scenario,
         **{folder / f"mesh.{suffix}": mesh for suffix in ("ply", "obj", "glb")},
     }  # fmt: skip

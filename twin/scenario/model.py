@@ -799,8 +799,9 @@ class PlanConfig(Section):
     along_contours: bool = False
     """true: legs along the contours of the sea floor, across its mean slope in the area; replaces heading_deg"""
     polygon: str | tuple[Vector2, ...] | None = None
-    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with polygons,
-    with or without holes, in a CRS that it names, in degrees or in that of the DEM; ${TWIN_DATA} is expanded"""
+    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a file with polygons, with
+    or without holes: GeoJSON in a CRS that it names, in degrees or in that of the DEM, KML, or a .plan of
+    QGroundControl; ${TWIN_DATA} is expanded"""
     turns: Literal["reverse", "bow_first"] = "reverse"
     """reverse: every second leg is flown backwards; bow_first: after each leg the vehicle yaws by 180 deg"""
     altitude_m: float = Field(default=2.2, gt=0, le=100)
