@@ -16,7 +16,7 @@ from rasterio.warp import transform_bounds
 from twin.core.georeference import Georeference
 from twin.core.user_files import open_raster
 from twin.errors import TwinError
-from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits, white_level
+from twin.terrains.file_header import ORTHOPHOTO_FIELD, check_count, eight_bits
 
 Image = NDArray[np.uint8]
 Bounds = tuple[float, float, float, float]  #: west, south, east, north in a CRS
@@ -30,10 +30,8 @@ _MAX_SHARP = 16  #: a very large orthophoto may be this many times finer than th
 
 def lay_orthophoto(
     texture: Image, file: Path, extent_m: tuple[float, float], georeference: Georeference | None
-) -> tuple[NDArray[np.bool_], int]:
-    """Replaces the texture of a floor by an orthophoto where it has valid pixels.
-
-    Returns whether it covers each texel (rows, cols), and its value of white, 255 for 8 bits.
+) -> NDArray[np.bool_]:
+    """Replaces the texture of a floor by an orthophoto where it has valid pixels; returns whether it covers each texel.
 
     It is transformed to the CRS of the DEM; without a CRS, it is taken to be in that one. If more than 1.5 of its
     pixels fit along the side of a texel, they are averaged over the texel, else interpolated.
@@ -59,9 +57,9 @@ def lay_orthophoto(
         if source.transform.is_identity:
             raise _error(file, "has no coordinates",
                          "a GeoTIFF with coordinates; terrain.texture_file for a plain image")  # fmt: skip
-        colour, covered, white = _read(source, file, grid, (rows, cols), georeference)
+        colour, covered = _read(source, file, grid, (rows, cols), georeference)
     texture[covered] = colour[covered]
-    return covered, white
+    return covered
 
 
 def _error(file: Path, problem: str, allowed: str) -> TwinError:
@@ -70,7 +68,7 @@ def _error(file: Path, problem: str, allowed: str) -> TwinError:
 
 def _read(
     source: rasterio.DatasetReader, file: Path, grid: Affine, shape: tuple[int, int], georeference: Georeference
-) -> tuple[Image, NDArray[np.bool_], int]:
+) -> tuple[Image, NDArray[np.bool_]]:
     bands = _colour_bands(source, file)
     floor_crs = CRS.from_wkt(georeference.crs_wkt) if georeference.crs_wkt else None
     if source.crs is not None and floor_crs is None:
@@ -89,19 +87,21 @@ def _read(
         add_alpha=ColorInterp.alpha not in source.colorinterp,
     ) as warped:  # fmt: skip
         values, covered = warped.read(bands), warped.dataset_mask() > 0
-    white = white_level(_brightest(source, bands)) if values.dtype == np.uint16 else 255
     if values.dtype == np.uint16:
-        values = eight_bits(values, white)
+        values = eight_bits(values, _brightest(source, bands))
     colour = np.moveaxis(values.astype(np.uint8), 0, 2)
-    return np.ascontiguousarray(np.broadcast_to(colour, (*shape, 3))), covered, white
+    return np.ascontiguousarray(np.broadcast_to(colour, (*shape, 3))), covered
 
 
 def _brightest(source: rasterio.DatasetReader, bands: list[int]) -> int:
-    """Returns the greatest value of an orthophoto: that of the bits that the file states (NBITS), else of a sample."""
+    """Returns the greatest value of an orthophoto: that of the bits that the file states (NBITS), else of a sample.
+
+    In the sample it is the 99.9th percentile, since a defective pixel may have any value.
+    """
     if bits := source.tags(bands[0], ns="IMAGE_STRUCTURE").get("NBITS"):
         return 2 ** int(bits) - 1
     shape = (len(bands), min(source.height, _MOST_SAMPLED), min(source.width, _MOST_SAMPLED))
-    return int(source.read(bands, out_shape=shape).max())
+    return int(np.percentile(source.read(bands, out_shape=shape), 99.9))
 
 
 def _colour_bands(source: rasterio.DatasetReader, file: Path) -> list[int]:

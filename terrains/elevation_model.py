@@ -1,4 +1,4 @@
-"""Heights, grid, coordinate reference system (CRS) and vertical axis of a GeoTIFF."""
+"""Heights, grid, coordinate reference system (CRS) and vertical axis of a GeoTIFF, or of a grid as text."""
 
 from __future__ import annotations
 
@@ -17,10 +17,9 @@ from rasterio.warp import transform
 from twin.core.georeference import Georeference
 from twin.core.user_files import open_raster
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, height_error
-from twin.terrains.height_file import HeightFile
 from twin.terrains.holes import check_no_undeclared_holes
-from twin.terrains.input_statement import ASSUMED
-from twin.terrains.vertical_axis import VerticalAxis, cf_direction, unit_length_m
+from twin.terrains.input_statement import HeightFile
+from twin.terrains.vertical_axis import ASSUMED, VerticalAxis, cf_direction, unit_length_m
 
 Part = dict[str, Any] | None  #: horizontal or vertical part of a CRS as PROJJSON; None: the CRS has no such part
 
@@ -33,15 +32,15 @@ _MAX_SCALE_ERROR = 0.005
 _EQUATOR_M, _ECCENTRICITY2 = 6_378_137.0, 0.00669438  #: ellipsoid WGS 84
 
 
-def read_geotiff(file: Path, height_spacing_m: float) -> HeightFile:
-    """Reads a GeoTIFF with one band of heights, and possibly an alpha band, which is 0 where there is no height.
+def read_raster_heights(file: Path, height_spacing_m: float, driver: str = "GTiff") -> HeightFile:
+    """Reads a raster with one band of heights, and possibly an alpha band, which is 0 where there is no height.
 
     The grid spacing is `height_spacing_m` without coordinates.
 
     Raises:
         TwinError: the file cannot be read, is an image or too large, or its grid or unit of height is not supported.
     """
-    with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS) as source:
+    with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS, [driver]) as source:
         if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
             raise height_error(file, f"is an image, not heights: {source.count} band(s) of {source.dtypes[0]}")
         check_count(source.width, source.height, file, HEIGHT_FIELD)
@@ -77,7 +76,8 @@ def _values(source: rasterio.DatasetReader, file: Path) -> tuple[NDArray[np.floa
         if source.colorinterp[1] != ColorInterp.alpha and not np.isin(alpha, [0, alpha.max()]).all():
             raise height_error(file, "has a second band that is not a mask")
         values[~(alpha > 0)] = np.nan
-    doubts = check_no_undeclared_holes(values, file, "gdal_edit.py -a_nodata {} " + file.name)
+    remedy = "gdal_edit.py -a_nodata {} " if source.driver == "GTiff" else "gdal_translate -a_nodata {} -of GTiff "
+    doubts = check_no_undeclared_holes(values, file, remedy + file.name)
     return values * scale + offset, doubts
 
 

@@ -13,7 +13,7 @@ from twin.errors import TwinError
 from twin.terrains.terrain import MAX_NODES, MAX_TEXELS
 
 HEIGHT_FIELD = "terrain.height_file"
-HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height per cell"
+HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), ESRI grid (.asc), XYZ grid (.xyz), 16-bit PNG or .npy with one height per cell"
 TEXTURE_FIELD = "terrain.texture_file"
 ORTHOPHOTO_FIELD = "terrain.orthophoto_file"
 #: Largest number of values of a file by its key, and what the values are called.
@@ -41,11 +41,10 @@ def decoded(file: Path, field: str, allowed: str, flags: int) -> NDArray[np.gene
         return cv2.imdecode(np.frombuffer(data, np.uint8), flags)
 
 
-def white_level(brightest: int) -> int:
-    """Returns the greatest value of the fewest of 8, 10, 12, 14 or 16 bits that contain the brightest value."""
-    return next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
+def eight_bits(values: NDArray[np.uint16], brightest: int) -> NDArray[np.uint8]:
+    """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower 8, 10, 12 or 14 only.
 
-
-def eight_bits(values: NDArray[np.uint16], white: int) -> NDArray[np.uint8]:
-    """Returns an image of 8 bits from one of 16 bits, of which the pixels may use the lower bits only (`white`)."""
+    White is the greatest value of the fewest bits that contain `brightest`.
+    """
+    white = next(2**bits - 1 for bits in (8, 10, 12, 14, 16) if brightest < 2**bits)
     return np.clip(np.rint(values * (255.0 / white)), 0, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Terrains from files: heights from GeoTIFF, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
+"""Terrains from files: heights from GeoTIFF, grids as text, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from twin.core.user_files import reading
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, decoded, height_error
 from twin.terrains.ground_cover import DEFAULT_COVERS
-from twin.terrains.height_file import HeightFile
 from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
-from twin.terrains.input_statement import InputStatement
+from twin.terrains.input_statement import HeightFile, InputStatement
 from twin.terrains.terrain import Terrain, texture_shape
 from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
 from twin.terrains.vertical_axis import Direction, VerticalAxis, direction_of
@@ -23,7 +22,13 @@ from twin.terrains.walls import walls_of
 Heights = NDArray[np.float64]
 
 _MOST_HEIGHT_M = 20_000.0
-_LEAST_LEVEL = 16.0  # mean of an orthophoto, 0 to 255, below which its white is doubtful
+_DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".xyz": "XYZ"}  # drivers of GDAL by suffix
+#: Programs that convert files of other formats, which may name further files, or points that have to be gridded.
+_POINTS = "pdal translate {} floor.tif --writers.gdal.resolution=CELL_M --writers.gdal.output_type=mean"
+_CONVERSIONS = {
+    ".nc": "gdal_translate NETCDF:{}:VARIABLE floor.tif", ".bag": "gdal_translate -b 1 {} floor.tif",
+    ".las": _POINTS, ".laz": _POINTS,
+}  # fmt: skip
 
 
 def load(
@@ -63,17 +68,14 @@ def load(
         texels, colours = texture_from_photo(texture, shape, extent_m), Path(texture.photo_file).name
     else:
         texels, colours = generate_texture(cover, height_m, shape, texel_m, rng), f"generated: {cover}"
-    covered, share, doubts = None, None, given.doubts
+    covered = share = None
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
         from twin.terrains.draped_orthophoto import lay_orthophoto
 
-        photo = Path(texture.orthophoto_file)
-        covered, white = lay_orthophoto(texels, photo, extent_m, georeference)
+        covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
         share = float(covered.mean())
-        colours = f"{photo.name} (white = {white}) over {100 * share:.3g} % of the floor, else {colours}"
-        if covered.any() and (level := float(texels[covered].mean())) < _LEAST_LEVEL:
-            doubts += (f"{photo.name!r} is nearly black: its mean is {level:.1f} of 255, with white at {white}.",)
+        colours = f"{Path(texture.orthophoto_file).name} over {100 * share:.3g} % of the floor, else {colours}"
     walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
     filled = None if has_height.all() else ~has_height
@@ -83,7 +85,7 @@ def load(
         "terrain.height_spacing_m" if georeference is None else "its coordinates",
         given.axis.metres_per_unit, given.axis.unit_evidence, direction, evidence,
         float(finite.min()), float(finite.max()), given.nodata,
-        float(1 - has_height.mean()), colours, doubts,
+        float(1 - has_height.mean()), colours, given.doubts,
     )  # fmt: skip
     return Terrain(
         height_m, spacing_m, west_m, south_m, texels, texel_m, filled, georeference, share, walls, known, stated
@@ -92,10 +94,10 @@ def load(
 
 def _read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightFile:
     suffix, named = file.suffix.lower(), VerticalAxis(texts=(file.stem,))
-    if suffix in (".tif", ".tiff"):
-        from twin.terrains.elevation_model import read_geotiff  # imported here: it imports rasterio
+    if suffix in _DRIVERS:
+        from twin.terrains.elevation_model import read_raster_heights  # imported here: it imports rasterio
 
-        return read_geotiff(file, height_spacing_m)
+        return read_raster_heights(file, height_spacing_m, _DRIVERS[suffix])
     if suffix == ".png":
         axis = named._replace(band_name="height", unit_evidence="terrain.height_range_m")
         return HeightFile(_read_png(file) * height_range_m, height_spacing_m, axis)
@@ -103,6 +105,10 @@ def _read_heights(file: Path, height_spacing_m: float, height_range_m: float) ->
         values = _read_npy(file)
         doubts = check_no_undeclared_holes(values, file, "NaN in place of {}")
         return HeightFile(values, height_spacing_m, named, doubts=tuple(doubts))
+    if suffix in _CONVERSIONS:
+        raise height_error(
+            file, f"is not read as {suffix}", f"a GeoTIFF, as {_CONVERSIONS[suffix].format(file.name)} writes it"
+        )
     raise height_error(file, "is not a height file")
 
 

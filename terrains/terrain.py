@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from twin.core.geometry import Array
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
-from twin.terrains.input_statement import InputStatement
+
+if TYPE_CHECKING:
+    from twin.terrains.input_statement import InputStatement
 
 Index = NDArray[np.int64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.errors import TwinError
-from twin.terrains.file_header import TEXTURE_FIELD, decoded, eight_bits, white_level
+from twin.terrains.file_header import TEXTURE_FIELD, decoded, eight_bits
 from twin.terrains.ground_cover import COVERS, paint
 from twin.terrains.noise import fractal_field, pink_noise
 from twin.terrains.quilting import BLOCK_FRACTION, MIN_BLOCK_PX, even_lighting, quilt
@@ -92,7 +92,7 @@ def read_image(file: Path) -> Image:
     """Returns an image file as (rows, cols, 3) uint8 RGB; raises TwinError if it is none or too large."""
     image = decoded(file, TEXTURE_FIELD, _PHOTOS, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_ANYDEPTH)
     if image is not None and image.dtype == np.uint16:
-        image = eight_bits(np.asarray(image, np.uint16), white_level(int(image.max())))
+        image = eight_bits(np.asarray(image, np.uint16), int(image.max()))
     if image is None or image.dtype != np.uint8:
         raise TwinError(TEXTURE_FIELD, f"{str(file)!r} is not an image", _PHOTOS)
     return np.asarray(image, dtype=np.uint8)

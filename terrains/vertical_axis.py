@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from twin.errors import TwinError
 from twin.terrains.file_header import height_error
-from twin.terrains.input_statement import ASSUMED
 
 Direction = Literal["up", "down"]
 
+ASSUMED = "assumed: it names none"  #: evidence of a unit that a file does not state
 #: Lengths [m] of the units that a raster band may have, by their names in lower case.
 UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),

@@ -80,13 +80,18 @@ def test_a_value_apart_that_may_mark_holes_is_a_doubt_and_a_far_one_an_error(tmp
         stated(write(tmp_path / "dem.tif", values))
 
 
-@pytest.mark.parametrize(("hot", "white", "doubtful"), [(None, 4095, False), (65535, 65535, True)])
-def test_an_orthophoto_whose_white_is_one_hot_pixel_is_a_doubt(tmp_path, hot, white, doubtful):
-    photo = np.random.default_rng(1).integers(500, 4000, (60, 80, 3)).astype(np.uint16)
-    photo[3, 3] = hot or 4000
-    found = stated(write(tmp_path / "dem.tif"), orthophoto_file=str(write(tmp_path / "photo.tif", photo)))
-    assert found.texture == f"photo.tif (white = {white}) over 100 % of the floor, else generated: reef"
-    assert [" is nearly black: its mean is" in doubt for doubt in found.doubts] == [True] * doubtful
+def test_a_defective_pixel_does_not_darken_an_orthophoto_of_12_bits(tmp_path):
+    photo, textures = np.random.default_rng(1).integers(500, 4000, (60, 80, 3)).astype(np.uint16), []
+    for hot in (4000, 65535):
+        photo[30, 40] = hot
+        dem, colours = write(tmp_path / "dem.tif"), write(tmp_path / "photo.tif", photo)
+        floor = terrains.load(dem, terrains.TextureSource(0.1, orthophoto_file=str(colours)), 0.1, 3.0, 0)
+        textures.append(floor.texture)
+    np.testing.assert_allclose(textures[0].mean(), photo.mean() * 255 / 4095, rtol=0.01)
+    assert np.ptp(textures, axis=0).any(axis=2).sum() <= 9
+    assert (
+        floor.stated is not None and floor.stated.texture == "photo.tif over 100 % of the floor, else generated: reef"
+    )
 
 
 DOUBT = "'dem.tif' has the value 0 in 4 cells, far from all others (-6.1 to -5.9), and does not declare it as nodata."

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from twin.core.geometry import Array
 from twin.core.user_files import IMAGE_FORMATS, read_bytes, reading, resolved
 from twin.errors import TwinError
-from twin.terrains.file_header import eight_bits, white_level
+from twin.terrains.file_header import eight_bits
 from twin.terrains.objects.coloured_mesh import Mesh, joined, welded_faces, with_colours
 from twin.terrains.objects.mesh_header import FORMATS, face_count
 
@@ -183,7 +183,7 @@ def _rgb(image: Any) -> NDArray[np.uint8]:
     if not image.mode.startswith("I"):
         return np.asarray(image.convert("RGB"), np.uint8)
     values = np.clip(np.asarray(image), 0, 65535)
-    return np.repeat(eight_bits(values, white_level(int(values.max())))[..., None], 3, axis=2)
+    return np.repeat(eight_bits(values, int(values.max()))[..., None], 3, axis=2)
 
 
 def _sampled(image: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:

@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import escape
 
+import numpy as np
+
+from twin.core.records import Array
 from twin.errors import TwinError
 from twin.exports.planned_path import PlannedPath
 
@@ -14,6 +17,7 @@ from twin.exports.planned_path import PlannedPath
 _WAYPOINT, _CHANGE_SPEED = 16, 178
 _RELATIVE_ALTITUDE, _NO_POSITION = 3, 2
 _SUBMARINE, _ARDUPILOT = 12, 3
+_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
 
 
 def write_qgc(path: PlannedPath, file: Path) -> None:
@@ -25,16 +29,15 @@ def write_qgc(path: PlannedPath, file: Path) -> None:
         problem = f"the path is up to {highest_m:.2f} m above the zero of the elevations, not below the sea surface"
         raise TwinError("--to qgc", problem, "--origin E,N,H, with H the elevation of z = 0 above the sea surface")
     items = [_simple_item(_CHANGE_SPEED, _NO_POSITION, [1, path.speed_mps, -1, 0, 0, 0, 0])]
-    rows = zip(path.longitude_latitude.tolist(), path.crs[:, 2], path.heading_deg, path.ends_track, strict=True)
-    for (longitude, latitude), altitude_m, heading_deg, ends_track in rows:
-        hold_s, altitude = path.hold_s if ends_track else 0.0, round(float(altitude_m), 3)
-        params = [hold_s, 0, 0, round(float(heading_deg), 2), latitude, longitude, altitude]
+    rows = np.column_stack([path.holds_s, path.heading_deg.round(2), _geographic(path)]).tolist()
+    for hold_s, heading_deg, longitude, latitude, altitude_m in rows:
+        altitude = round(altitude_m, 3)
+        params = [hold_s, 0, 0, heading_deg, latitude, longitude, altitude]
         shown = {"AMSLAltAboveTerrain": None, "Altitude": altitude, "AltitudeMode": 1}
         items.append(shown | _simple_item(_WAYPOINT, _RELATIVE_ALTITUDE, params))
-    longitude, latitude = path.longitude_latitude[0].tolist()
     mission = {
         "version": 2, "firmwareType": _ARDUPILOT, "vehicleType": _SUBMARINE, "globalPlanAltitudeMode": 1,
-        "cruiseSpeed": path.speed_mps, "hoverSpeed": path.speed_mps, "plannedHomePosition": [latitude, longitude, 0.0],
+        "cruiseSpeed": path.speed_mps, "hoverSpeed": path.speed_mps, "plannedHomePosition": [*rows[0][3:1:-1], 0.0],
         "items": [item | {"doJumpId": number} for number, item in enumerate(items, 1)],
     }  # fmt: skip
     tree = {
@@ -51,35 +54,32 @@ def _simple_item(command: int, frame: int, params: list[Any]) -> dict[str, Any]:
 def write_kml(path: PlannedPath, file: Path) -> None:
     """Writes KML 2.2 with a line for each track, at elevations above sea level."""
     places = []
-    for track in range(1, int(path.track.max()) + 1):
-        on_track = path.track == track
-        points = zip(path.longitude_latitude[on_track], path.crs[on_track, 2], strict=True)
-        text = " ".join(f"{longitude:.9f},{latitude:.9f},{height:.3f}" for (longitude, latitude), height in points)
+    for track in sorted(set(path.track.tolist())):
+        points = " ".join(f"{x:.9f},{y:.9f},{height:.3f}" for x, y, height in _geographic(path)[path.track == track])
         places.append(
             f"<Placemark><name>track {track}</name><LineString><altitudeMode>absolute</altitudeMode>"
-            f"<coordinates>{text}</coordinates></LineString></Placemark>\n"
+            f"<coordinates>{points}</coordinates></LineString></Placemark>\n"
         )
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>'
-    file.write_text(f"{head}{escape(path.name)}</name>\n{''.join(places)}</Document></kml>\n", encoding="utf-8")
+    head = f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{escape(path.name)}</name>\n'
+    file.write_text(f"{head}{''.join(places)}</Document></kml>\n", encoding="utf-8")
 
 
 def write_gpx(path: PlannedPath, file: Path) -> None:
     """Writes GPX 1.1 with one route; `ele` is the elevation, negative below sea level."""
-    rows = zip(path.longitude_latitude, path.crs[:, 2], path.track, strict=True)
     points = "".join(
-        f'<rtept lat="{latitude:.9f}" lon="{longitude:.9f}"><ele>{height:.3f}</ele><name>track {track}</name></rtept>\n'
-        for (longitude, latitude), height, track in rows
+        f'<rtept lat="{y:.9f}" lon="{x:.9f}"><ele>{height:.3f}</ele></rtept>\n' for x, y, height in _geographic(path)
     )
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="twin"'
-    head += ' xmlns="http://www.topografix.com/GPX/1/1"><rte><name>'
-    file.write_text(f"{head}{escape(path.name)}</name>\n{points}</rte></gpx>\n", encoding="utf-8")
+    head = f'{_XML}<gpx version="1.1" creator="twin" xmlns="http://www.topografix.com/GPX/1/1">'
+    file.write_text(f"{head}<rte><name>{escape(path.name)}</name>\n{points}</rte></gpx>\n", encoding="utf-8")
 
 
 def write_csv(path: PlannedPath, file: Path) -> None:
-    lines = ["track,x_m,y_m,z_m,easting,northing,elevation_m,longitude_deg,latitude_deg,heading_deg,hold_s"]
-    holds = path.hold_s * path.ends_track
-    rows = zip(path.track, path.scene_m, path.crs, path.longitude_latitude, path.heading_deg, holds, strict=True)
-    for track, scene, crs, (longitude, latitude), heading, hold_s in rows:
-        metres = ",".join(f"{value:.3f}" for value in (*scene, *crs))
-        lines.append(f"{track},{metres},{longitude:.9f},{latitude:.9f},{heading:.2f},{hold_s:g}")
-    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    columns = path.track, path.scene_m, path.crs, path.longitude_latitude, path.heading_deg, path.holds_s
+    head = "track,x_m,y_m,z_m,easting,northing,elevation_m,longitude_deg,latitude_deg,heading_deg,hold_s"
+    form = ["%d"] + ["%.3f"] * 6 + ["%.9f"] * 2 + ["%.2f", "%g"]
+    np.savetxt(file, np.column_stack(columns), form, ",", header=head, comments="")
+
+
+def _geographic(path: PlannedPath) -> Array:
+    """Returns longitude, latitude and elevation (n, 3) of the waypoints [deg, deg, m]."""
+    return np.column_stack([path.longitude_latitude, path.crs[:, 2]])

@@ -23,16 +23,12 @@ class PlannedPath(NamedTuple):
 
     name: str
     speed_mps: float  #: cruise speed
-    hold_s: float  #: time of station keeping after each track
     track: NDArray[np.int64]  #: (n,) number of the track of each waypoint, from 1
     scene_m: Array  #: (n, 3) x, y, z in the scene
     crs: Array  #: (n, 3) easting and northing in the CRS of the scene, in its unit; elevation [m]
     longitude_latitude: Array  #: (n, 2) on WGS 84 [deg]
     heading_deg: Array  #: (n,) direction of the bow, clockwise from true north, 0 to 360
-
-    @property
-    def ends_track(self) -> NDArray[np.bool_]:
-        return np.append(np.diff(self.track) > 0, True)
+    holds_s: Array  #: (n,) time of station keeping at each waypoint: the last ones of the tracks
 
 
 def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
@@ -53,14 +49,15 @@ def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
         tracks.append(np.full(len(kept), track))
         positions.append(body[kept])
         yaws.append(bow[kept])
-    scene_m, yaw = np.concatenate(positions), np.concatenate(yaws)
+    scene_m, yaw, track = np.concatenate(positions), np.concatenate(yaws), np.concatenate(tracks)
     easting, northing = origin.from_scene(*scene_m[:, :2].T)
     bow = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))]) @ place.north_from_scene.T
     return PlannedPath(
-        mission.scenario.name, mission.plan.speed_mps, mission.scenario.control.hold_s, np.concatenate(tracks), scene_m,
+        mission.scenario.name, mission.plan.speed_mps, track, scene_m,
         np.column_stack([easting, northing, origin.elevation_m + scene_m[:, 2]]),
         transformed(origin.crs_wkt, WGS84, easting, northing),
         np.degrees(np.arctan2(bow[:, 0], bow[:, 1])) % 360,
+        mission.scenario.control.hold_s * np.append(np.diff(track) > 0, True),
     )  # fmt: skip
 
 

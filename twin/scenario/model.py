@@ -147,7 +147,8 @@ class TerrainConfig(Section):
     mesh_scale: float = Field(default=1.0, ge=1e-4, le=1e4)
     """metres per unit of mesh_file"""
     height_file: FilePath | None = None
-    """DEM: GeoTIFF, 16-bit PNG or .npy; in metres unless a GeoTIFF names another unit; ${TWIN_DATA} is expanded"""
+    """DEM: GeoTIFF, ESRI grid (.asc) with its .prj, XYZ grid, 16-bit PNG or .npy; in metres unless a GeoTIFF names
+    another unit; ${TWIN_DATA} is expanded"""
     height_spacing_m: float = Field(default=0.01, gt=0, le=10)
     """grid spacing of a PNG or .npy height file [m]"""
     height_range_m: float = Field(default=1.0, gt=0, le=1000)

@@ -1,9 +1,8 @@
-"""Survey areas in files of other programs: polygons of KML, survey areas of a plan of QGroundControl."""
+"""Survey areas in files of other programs: polygons of KML, surveys of a plan of QGroundControl."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import shapely
@@ -13,7 +12,7 @@ from twin.core.user_files import read_bytes, read_json, reading
 KEY = "plan.polygon"
 MOST_BYTES = 10_000_000  #: of a file of an area
 _KML = "KML with one Polygon or more"
-_QGC = "a .plan of QGroundControl with a survey or an inclusion polygon of its geofence, and no circles"
+_QGC = "a .plan of QGroundControl with one survey or more"
 
 
 def kml_polygons(file: Path) -> list[shapely.Polygon]:
@@ -25,14 +24,10 @@ def kml_polygons(file: Path) -> list[shapely.Polygon]:
     with reading(file, KEY, _KML):
         if b"<!" in data.replace(b"<!--", b"").replace(b"<![CDATA[", b"") or b"\0" in data:
             raise ValueError("a document type or an encoding other than UTF-8")
-        polygons = [_kml_polygon(found) for found in ElementTree.fromstring(data).iter() if _is(found, "Polygon")]
+        polygons = [_kml_polygon(found) for found in ElementTree.fromstring(data).iterfind(".//{*}Polygon")]
         if not polygons:
             raise ValueError("no polygon")
         return polygons
-
-
-def _is(element: ElementTree.Element, name: str) -> bool:
-    return element.tag.rpartition("}")[2] == name
 
 
 def _kml_polygon(element: ElementTree.Element) -> shapely.Polygon:
@@ -50,28 +45,13 @@ def _kml_ring(coordinates: ElementTree.Element) -> list[tuple[float, float]]:
 
 
 def qgc_polygons(file: Path) -> list[shapely.Polygon]:
-    """Returns the areas of a plan of QGroundControl in longitude and latitude.
+    """Returns the areas of the surveys in a plan of QGroundControl, in longitude and latitude.
 
-    They are those of its surveys or, without a survey, the inclusion polygons of its geofence, less the exclusion
-    polygons. Raises TwinError if it is not valid, has none of these, or has circles in its geofence.
+    Raises TwinError if it is not valid or has no survey; its geofence, a limit of the vehicle, is left out.
     """
     tree = read_json(file, KEY, _QGC, MOST_BYTES)
     with reading(file, KEY, _QGC):
-        fence = tree.get("geoFence", {})
-        if fence.get("circles"):
-            raise ValueError("its geofence has circles")
         surveys = [item for item in tree["mission"]["items"] if item.get("complexItemType") == "survey"]
-        fences = {
-            side: [one for one in fence.get("polygons", []) if one["inclusion"] is side] for side in (True, False)
-        }
-        polygons = [_qgc_polygon(item) for item in surveys or fences[True]]
-        if not polygons:
-            raise ValueError("neither a survey nor an inclusion polygon")
-        if not fences[False]:
-            return polygons
-        left = shapely.union_all(polygons) - shapely.union_all([_qgc_polygon(one) for one in fences[False]])
-        return [part for part in shapely.get_parts(left) if isinstance(part, shapely.Polygon) and not part.is_empty]
-
-
-def _qgc_polygon(item: dict[str, Any]) -> shapely.Polygon:
-    return shapely.Polygon([(longitude, latitude) for latitude, longitude in item["polygon"]])
+        if not surveys:
+            raise ValueError("no survey")
+        return [shapely.Polygon([corner[::-1] for corner in item["polygon"]]) for item in surveys]
