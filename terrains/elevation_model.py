@@ -18,8 +18,7 @@ from twin.core.georeference import Georeference
 from twin.core.user_files import open_raster
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, height_error
 from twin.terrains.holes import check_no_undeclared_holes
-from twin.terrains.input_statement import HeightFile
-from twin.terrains.vertical_axis import ASSUMED, VerticalAxis, cf_direction, unit_length_m
+from twin.terrains.vertical_axis import ASSUMED, HeightFile, VerticalAxis, cf_direction, unit_length_m
 
 Part = dict[str, Any] | None  #: horizontal or vertical part of a CRS as PROJJSON; None: the CRS has no such part
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,9 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from twin.core.geometry import Array
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
-
-if TYPE_CHECKING:
-    from twin.terrains.input_statement import InputStatement
+from twin.terrains.input_statement import InputStatement
 
 Index = NDArray[np.int64]
 
@@ -125,7 +123,8 @@ class Terrain:
             " neither planned over nor judged, and drawn with the nearest height."
         )
         small = f"{n_small} cells of the floor, in small holes, have the nearest height."
-        return [note for note, count in ((unknown, n_unknown), (small, n_small)) if count]
+        doubts = () if self.stated is None else self.stated.doubts
+        return [*doubts, *(note for note, count in ((unknown, n_unknown), (small, n_small)) if count)]
 
     def in_hole(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point lies in a cell with an unknown node; false outside the terrain."""

@@ -1,4 +1,4 @@
-"""Vertical axis of a height file: direction and unit of its values. `terrain.z` may give the direction."""
+"""What a height file states: direction and unit of its values, CRS. `terrain.z` may give the direction."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.georeference import Georeference
 from twin.errors import TwinError
 from twin.terrains.file_header import height_error
 
@@ -43,6 +44,19 @@ class VerticalAxis(NamedTuple):
     datum: str = ""  #: name of the vertical CRS; "" if there is none
     in_crs: bool = False  #: whether the file names a CRS; there, a sea floor has no positive elevations
     unit_evidence: str = ASSUMED  #: what states the unit
+
+
+class HeightFile(NamedTuple):
+    """Values of a file of heights, before holes are filled, with what the file states of them."""
+
+    values: NDArray[np.float64]  #: (rows, cols), row 0 = north; NaN where the file has no height
+    spacing_m: float  #: distance between neighbouring values
+    axis: VerticalAxis
+    georeference: Georeference | None = None  #: position of the centre in the CRS of the file; None without coordinates
+    crs: str = ""  #: name of the horizontal CRS; "" without one
+    ground_scale: float | None = None  #: distance on the ground / distance in a projected CRS, at the centre
+    nodata: str = ""  #: value or band by which the file declares cells without a height; "" if it declares none
+    doubts: tuple[str, ...] = ()  #: sentences on values that may mark cells without a height
 
 
 def unit_length_m(name: str, file: Path) -> float:

@@ -13,7 +13,7 @@ from test_terrains_input import EAST, NORTH, write
 
 from twin.core import geometry
 from twin.errors import TwinError
-from twin.exports.command import ExportOptions, export_any, export_path
+from twin.exports.command import ExportOptions, export_any
 from twin.exports.planned_path import TOLERANCE_M, planned_path
 from twin.scenario.file import load_scenario
 from twin.world.asked_area import read_area
@@ -32,7 +32,8 @@ def scenario(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def written(scenario, tmp_path_factory):
-    files = export_path(scenario, ["qgc,kml", "gpx", "csv"], tmp_path_factory.mktemp("plans"))
+    overrides = [f"terrain.height_file={scenario.terrain.height_file}", *KEYS]
+    files = export_any("reef", ["qgc,kml", "gpx", "csv"], tmp_path_factory.mktemp("plans"), overrides)
     return {name: file.read_text() for name, (file,) in files.items()}
 
 
@@ -117,7 +118,7 @@ def test_all_formats_have_the_same_waypoints(written):
 @pytest.mark.parametrize(
     ("names", "options", "problem"),
     [
-        (["qgc", "euroc"], {}, "'euroc' cannot be written together with formats of a planned path"),
+        (["qgc", "euroc"], {}, "has formats of a planned path and of a run"),
         (["qgx"], {}, "'qgx' is not a format"),
         (["kml"], {}, "reef has no place on the Earth"),
         (["qgc"], {"crs": "EPSG:32633", "origin": "432000,5571000,-1"}, r"the path is up to 1.\d+ m above the zero"),

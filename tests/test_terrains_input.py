@@ -11,6 +11,7 @@ from rasterio.transform import from_origin
 from twin import terrains
 from twin.app.console import print_plan
 from twin.errors import TwinError
+from twin.judge.summary_statistics import finite_tree
 from twin.planning.summary import as_json, summarise
 from twin.report.input_rows import input_rows
 from twin.report.run_folder import load_run
@@ -114,7 +115,7 @@ def mission(tmp_path):
 
 
 def test_a_plan_shows_the_statement_and_warns_of_its_doubts(mission, capsys):
-    summary, statement = summarise(mission), mission.stated_input
+    summary, statement = summarise(mission), finite_tree(mission.stated_input)
     assert statement["doubts"] == [DOUBT]
     assert as_json(summary, "")["input"] == statement and DOUBT.removesuffix(".") in summary.warnings
     print_plan(summary)
@@ -125,8 +126,8 @@ def test_a_plan_shows_the_statement_and_warns_of_its_doubts(mission, capsys):
 @pytest.mark.long
 def test_metrics_and_report_of_a_run_have_the_statement_and_a_damaged_one_is_refused(mission, tmp_path):
     result = run(mission.scenario, tmp_path / "flown", outputs=None)
-    assert result.metrics["input"] == mission.stated_input and result.metrics["warnings"][0] == DOUBT
-    statement, folder = mission.stated_input, write_folder(tmp_path / "run")
+    assert result.metrics["input"] == finite_tree(mission.stated_input) and result.metrics["warnings"][0] == DOUBT
+    statement, folder = finite_tree(mission.stated_input), write_folder(tmp_path / "run")
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["input"] == {}  # of a generated floor
     (folder / "metrics.json").write_text(json.dumps(metrics | {"input": statement}))

@@ -92,7 +92,7 @@ def _run(
 def _log_warnings(mission: Mission, world: World, folder: RunFolder) -> None:
     if (share := mission.terrain.orthophoto_share) is not None and share < 1.0:
         folder.log("orthophoto covers a part of the floor; the rest has the other texture", share=round(share, 4))
-    for warning in (*mission.floor_notes, *world.warnings):
+    for warning in (*mission.hole_notes, *world.warnings):
         folder.log("warning", text=warning)
 
 

@@ -24,13 +24,12 @@ from twin.exchange import geotiff
 from twin.exchange.geotiff import Raster
 from twin.exports import path_files
 from twin.exports.camera_models import true_calibration
-from twin.exports.formats import FORMATS, PATH_FORMATS, check_needs, chosen_formats, names_a_path
+from twin.exports.formats import FORMATS, PATH_FORMATS, check_needs, chosen_formats
 from twin.exports.planned_path import planned_path
 from twin.exports.recorded_frames import missing_files, recorded_frames, recorded_imu
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.scenario.file import load_scenario
-from twin.scenario.model import Scenario
 from twin.world.mission import prepare
 
 
@@ -104,44 +103,29 @@ def export_any(
     progress: Callable[[str, float], None] = lambda _, __: None,
     warn: Callable[[str], None] = lambda _: None,
 ) -> dict[str, list[Path]]:  # fmt: skip
-    """Writes a run (`export`), or the planned path of a scenario or a run (`export_path`), as the formats require.
+    """Writes a run (`export`), by default into its folder `export`, or the planned path of a scenario or a run.
 
-    Without `out`, the former goes into the folder `export` of the run, the latter into `runs`.
+    The formats decide which. The files of a path are named after the scenario; their folder is by default `runs`.
+    Raises TwinError as `export`, or if the survey cannot be planned or has no place on the Earth.
     """
-    folder, _ = Path(source), chosen_formats(names, [*FORMATS, *PATH_FORMATS])
-    if names_a_path(names):
-        file = folder / SCENARIO_FILE if folder.is_dir() else source
-        scenario, target = load_scenario(file, overrides, options.allow_plugins), out or Path("runs")
-        with writing(target):
-            return export_path(scenario, names, target, options)
-    if overrides:
+    folder, chosen = Path(source), chosen_formats(names)
+    paths = [name for name in chosen if name in PATH_FORMATS]
+    target = out or (Path("runs") if paths else folder / "export")
+    if paths and paths != chosen:
+        raise TwinError("--to", "has formats of a planned path and of a run", f"{', '.join(PATH_FORMATS)}, or others")
+    if overrides and not paths:
         raise TwinError("--set", "has no effect on a run, which has been flown", ", ".join(PATH_FORMATS))
-    target = out or folder / "export"
     with writing(target):
-        return export(folder, names, target, options, progress, warn)
-
-
-def export_path(
-    scenario: Scenario,
-    names: Sequence[str],
-    out: Path,
-    options: ExportOptions = ExportOptions(),  # noqa: B008 (immutable)
-) -> dict[str, list[Path]]:
-    """Writes the planned path of a scenario in several formats, as files in the folder `out`; returns the files.
-
-    Raises ScenarioError if the survey cannot be planned, and TwinError if a format or an option is not valid or the
-    scene has no place on the Earth.
-    """
-    chosen = chosen_formats(names, PATH_FORMATS)
-    files = {name: out / f"{file_stem(scenario.name)}{PATH_FORMATS[name][1]}" for name in chosen}
-    for file in files.values():
-        output_file(file)
-    mission = prepare(scenario)
-    path = planned_path(mission, _given_georeference(options) or mission.terrain.georeference)
-    out.mkdir(parents=True, exist_ok=True)
-    for name, file in files.items():
-        getattr(path_files, PATH_FORMATS[name][2])(path, file)
-    return {name: [file] for name, file in files.items()}
+        if not paths:
+            return export(folder, chosen, target, options, progress, warn)
+        file = folder / SCENARIO_FILE if folder.is_dir() else source
+        mission = prepare(load_scenario(file, overrides, options.allow_plugins))
+        path = planned_path(mission, _given_georeference(options) or mission.terrain.georeference)
+        files = {name: output_file(target / f"{file_stem(path.name)}{PATH_FORMATS[name][1]}") for name in paths}
+        target.mkdir(parents=True, exist_ok=True)
+        for name, file in files.items():
+            getattr(path_files, PATH_FORMATS[name][2])(path, file)
+        return {name: [file] for name, file in files.items()}
 
 
 def format_rows() -> list[tuple[str, ...]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -51,7 +51,7 @@ _TABLE = (
     ("obj", "map", "exports.textured_mesh:export_obj",
      "mesh of the map with the orthomosaic as texture, Wavefront OBJ"),
 )  # fmt: skip
-#: Formats of the planned path of a scenario: description, suffix and writer.
+#: Formats of the planned path of a scenario: description, suffix, and writer in `path_files`.
 PATH_FORMATS = {
     "qgc": ("planned path: mission of QGroundControl for ArduSub", ".plan", "write_qgc"),
     "kml": ("planned path: KML 2.2, a line for each track", ".kml", "write_kml"),
@@ -85,20 +85,15 @@ _NEEDS: dict[str, tuple[Callable[[RunContents], bool], str, str]] = {
 }  # fmt: skip
 
 
-def names_a_path(names: Sequence[str]) -> bool:
-    """Returns whether one of the named formats is that of a planned path."""
-    return any(part.strip() in PATH_FORMATS for name in names for part in name.split(","))
-
-
-def chosen_formats(names: Sequence[str], known: Collection[str] = FORMATS) -> list[str]:
-    """Returns the formats in names, each once; a name may list several with commas; raises TwinError if not known."""
-    parts = [part.strip() for name in names for part in name.split(",") if part.strip()]
+def chosen_formats(names: Sequence[str]) -> list[str]:
+    """Returns the formats in names, each once; a name may list several with commas; raises TwinError if unknown."""
+    parts, known = (
+        [part.strip() for name in names for part in name.split(",") if part.strip()],
+        [*FORMATS, *PATH_FORMATS],
+    )
     for part in parts:
         if part not in known:
             close = difflib.get_close_matches(part, known, 1)
-            if part in FORMATS or part in PATH_FORMATS:
-                problem = f"{part!r} cannot be written together with formats of a planned path"
-                raise TwinError("--to", problem, ", ".join(known))
             hint = f"; did you mean {close[0]!r}?" if close else ""
             raise TwinError("--to", f"{part[:40]!r} is not a format{hint}", ", ".join(known))
     if not parts:

@@ -40,11 +40,12 @@ def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
     if origin is None or place is None or origin.crs_wkt is None:
         allowed = "a DEM with a projected CRS, or --crs EPSG:CODE --origin E,N,H"
         raise TwinError("--to", f"{mission.scenario.name} has no place on the Earth", allowed)
+    body_in_camera_m = geometry.inverse(mission.rig.body_from_camera)[:3, 3]
     tracks, positions, yaws = [], [], []
     for track in mission.tracks:
         reference = mission.plan.references(track, mission.plan.frames_of_track(track)[0])
         bow = np.asarray(reference.yaw)
-        body = _body_positions(mission, reference.position, bow)
+        body = reference.position + geometry.rotations_of_down_camera(bow) @ body_in_camera_m
         kept = _simplified(np.column_stack([body, _TURN_M * np.cos(bow), _TURN_M * np.sin(bow)]))
         tracks.append(np.full(len(kept), track))
         positions.append(body[kept])
@@ -59,12 +60,6 @@ def planned_path(mission: Mission, origin: Georeference | None) -> PlannedPath:
         np.degrees(np.arctan2(bow[:, 0], bow[:, 1])) % 360,
         mission.scenario.control.hold_s * np.append(np.diff(track) > 0, True),
     )  # fmt: skip
-
-
-def _body_positions(mission: Mission, camera_m: Array, yaw: Array) -> Array:
-    """Returns the origins (n, 3) of a level vehicle whose left camera is at (n, 3), with the bow at `yaw` (n,)."""
-    camera_from_body = geometry.inverse(mission.rig.body_from_camera)
-    return camera_m + geometry.rotations_of_down_camera(yaw) @ camera_from_body[:3, 3]
 
 
 def _simplified(points: Array) -> NDArray[np.int64]:

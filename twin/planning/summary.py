@@ -74,7 +74,7 @@ def summarise(mission: Mission) -> PlanSummary:
     predicted = _predicted_metrics(floor, error)
     known = {f"{section}.{key}" for section, metrics in predicted.items() for key in metrics}
     require = judge_requirements({n: v for n, v in mission.scenario.require.items() if n in known}, predicted)
-    holes = (note.removesuffix(".") for note in mission.floor_notes)
+    holes = (note.removesuffix(".") for note in mission.hole_notes)
     warnings = (*holes, *_missed(require), *_short_overlap(mission, floor), *_limits_of_validity(mission, error))
     return PlanSummary(mission, plane, floor, error, computing_cost(mission, plane.n_keyframes), require, warnings)
 

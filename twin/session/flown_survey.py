@@ -79,7 +79,7 @@ class FlownSurvey:
         plan = scenario.plan.model_dump(include={"pattern", "overlap_along", "overlap_across"})
         plan |= {"both_ways": mission.plan.follows_floor} | mission.plan.swath_notes
         warnings = [
-            *plugin_notes(scenario), *mission.floor_notes, *self.world_warnings,
+            *plugin_notes(scenario), *mission.hole_notes, *self.world_warnings,
             *calibration_notes(result, mission.rig), *result.quality.repeat_notes, *result.quality.reading_notes,
             *filter(None, [actions.sentence, self.gaps.sentence]),
         ]  # fmt: skip

@@ -22,7 +22,7 @@ from twin.errors import TwinError
 from twin.imaging.scene.mesh_raster import DrawnMesh, Target, draw_meshes
 from twin.imaging.scene.object_shadows import FROM_ABOVE
 from twin.imaging.scene.object_view import Objects, draw_objects
-from twin.scenario.model import Scenario
+from twin.scenario.model import Scenario, TerrainConfig
 from twin.terrains.holes import known_nodes
 from twin.terrains.input_statement import InputStatement
 from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
@@ -68,19 +68,16 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     low = _lowest(upward, grid)
     under_m = np.asarray(minimum_filter(np.where(np.isfinite(low), low, top_m), 3) - MARGIN_M, np.float32)
     texture = _texture(drawn, grid, colours, scenario)
-    terrain = replace(_terrain(top_m, grid, texture, covered), stated=_stated(read, scenario, grid.cell_m, covered))
+    terrain = replace(_terrain(top_m, grid, texture, covered), stated=_stated(read, t, grid.cell_m, covered))
     return MeshFloor(terrain, _terrain(under_m, grid, colours, covered), tiles)
 
 
-def _stated(read: TexturedMesh, scenario: Scenario, spacing_m: float, covered: NDArray[np.bool_]) -> InputStatement:
-    t, heights = scenario.terrain, read.mesh.vertices_m[:, 2]
-    assert t.mesh_file is not None
-    scaled = "mesh_scale" in t.model_fields_set
+def _stated(read: TexturedMesh, t: TerrainConfig, spacing_m: float, covered: NDArray[np.bool_]) -> InputStatement:
+    heights, up = read.mesh.vertices_m[:, 2], "by the format of the file" if t.mesh_up is None else "terrain.mesh_up"
     return InputStatement(
-        Path(t.mesh_file).name, "", None, spacing_m, "median edge of the mesh, terrain.grid_m at most", t.mesh_scale,
-        "terrain.mesh_scale" if scaled else ASSUMED, "up", "by the format of the file" if t.mesh_up is None else
-        "terrain.mesh_up", float(heights.min()), float(heights.max()), "", float(1 - covered.mean()),
-        f"{len(read.images)} textures of the mesh" if read.images else "colours of the vertices",
+        Path(t.mesh_file or "").name, "", None, spacing_m, "edges of the mesh, terrain.grid_m", t.mesh_scale,
+        "terrain.mesh_scale" if "mesh_scale" in t.model_fields_set else ASSUMED, "up", up, float(heights.min()),
+        float(heights.max()), "", float(1 - covered.mean()), f"{len(read.images) or 'no'} textures of the mesh",
     )  # fmt: skip
 
 

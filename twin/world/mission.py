@@ -156,14 +156,9 @@ class Mission:
         return self.terrain.hole_notes + area
 
     @property
-    def floor_notes(self) -> list[str]:
-        """Returns sentences on what is doubtful in the files of the floor, and those on floor without a height."""
-        return [*(self.terrain.stated.doubts if self.terrain.stated else ()), *self.hole_notes]
-
-    @property
     def stated_input(self) -> dict[str, Any]:
         """Returns the input statement of the floor as JSON; {} for a generated floor."""
-        return self.terrain.stated.as_json() if self.terrain.stated else {}
+        return self.terrain.stated._asdict() if self.terrain.stated else {}
 
     @property
     def tracks(self) -> range:
