@@ -1,4 +1,4 @@
-"""Heights, grid, coordinate reference system (CRS) and vertical axis of a GeoTIFF."""
+"""Heights, grid, coordinate reference system (CRS) and vertical axis of a GeoTIFF, or of a grid as text."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from twin.core.georeference import Georeference
 from twin.core.user_files import open_raster
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, height_error
 from twin.terrains.holes import check_no_undeclared_holes
-from twin.terrains.vertical_axis import VerticalAxis, cf_direction, unit_length_m
+from twin.terrains.vertical_axis import ASSUMED, HeightFile, VerticalAxis, cf_direction, unit_length_m
 
 Part = dict[str, Any] | None  #: horizontal or vertical part of a CRS as PROJJSON; None: the CRS has no such part
 
@@ -31,36 +31,40 @@ _MAX_SCALE_ERROR = 0.005
 _EQUATOR_M, _ECCENTRICITY2 = 6_378_137.0, 0.00669438  #: ellipsoid WGS 84
 
 
-def read_geotiff(
-    file: Path, height_spacing_m: float
-) -> tuple[NDArray[np.float64], float, VerticalAxis, Georeference | None]:
-    """Reads a GeoTIFF with one band of heights, and possibly an alpha band, which is 0 where there is no height.
+def read_raster_heights(file: Path, height_spacing_m: float, driver: str = "GTiff") -> HeightFile:
+    """Reads a raster with one band of heights, and possibly an alpha band, which is 0 where there is no height.
 
-    Returns:
-        Values (rows, cols), row 0 = north, NaN where the file has no data; grid spacing [m], `height_spacing_m` without
-        coordinates; vertical axis; position of the centre of the raster in its CRS, None without coordinates.
+    The grid spacing is `height_spacing_m` without coordinates.
+
     Raises:
         TwinError: the file cannot be read, is an image or too large, or its grid or unit of height is not supported.
     """
-    with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS) as source:
+    with open_raster(file, HEIGHT_FIELD, HEIGHT_FORMATS, [driver]) as source:
         if source.count > 2 or source.dtypes[0] in ("uint8", "int8"):
             raise height_error(file, f"is an image, not heights: {source.count} band(s) of {source.dtypes[0]}")
         check_count(source.width, source.height, file, HEIGHT_FIELD)
         horizontal, vertical = _crs_parts(source.crs)
         axis = _vertical_axis(source, horizontal, vertical, file)
-        georeference, spacing_m = None, height_spacing_m
+        georeference, spacing_m, ground_scale = None, height_spacing_m, None
         if not source.transform.is_identity:
             _check_grid(source, file)
             factor = _axis_unit_m(horizontal)
-            _check_ground_scale(source, factor, file)
+            ground_scale = _checked_ground_scale(source, factor, file)
             spacing_m = float(source.transform.a * factor)
             wkt = _output_crs(source.crs, horizontal, vertical)
             georeference = Georeference(*_centre(source), 0.0, wkt, factor, axis.datum)
-        return _values(source, file), spacing_m, axis, georeference
+        values, doubts = _values(source, file)
+        name = "" if horizontal is None else str(horizontal["name"])
+        nodata = "" if source.nodatavals[0] is None else f"{source.nodatavals[0]:g}"
+        nodata = " and ".join(filter(None, [nodata, "the second band" if source.count == 2 else ""]))
+        return HeightFile(values, spacing_m, axis, georeference, name, ground_scale, nodata, tuple(doubts))
 
 
-def _values(source: rasterio.DatasetReader, file: Path) -> NDArray[np.float64]:
-    """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes."""
+def _values(source: rasterio.DatasetReader, file: Path) -> tuple[NDArray[np.float64], list[str]]:
+    """Returns the values (rows, cols) of the heights with the scale and the offset of their band; NaN in holes.
+
+    Also returns the doubts of `check_no_undeclared_holes`.
+    """
     scale, offset = source.scales[0], source.offsets[0]
     if not (math.isfinite(scale) and math.isfinite(offset) and scale != 0):
         problem = f"has the band scale {scale:g} and offset {offset:g}"
@@ -71,8 +75,9 @@ def _values(source: rasterio.DatasetReader, file: Path) -> NDArray[np.float64]:
         if source.colorinterp[1] != ColorInterp.alpha and not np.isin(alpha, [0, alpha.max()]).all():
             raise height_error(file, "has a second band that is not a mask")
         values[~(alpha > 0)] = np.nan
-    check_no_undeclared_holes(values, file, "gdal_edit.py -a_nodata {} " + file.name)
-    return values * scale + offset
+    remedy = "gdal_edit.py -a_nodata {} " if source.driver == "GTiff" else "gdal_translate -a_nodata {} -of GTiff "
+    doubts = check_no_undeclared_holes(values, file, remedy + file.name)
+    return values * scale + offset, doubts
 
 
 def _crs_parts(crs: CRS | None) -> tuple[Part, Part]:
@@ -107,6 +112,7 @@ def _vertical_axis(source: rasterio.DatasetReader, horizontal: Part, vertical: P
         (file.stem, *names, *(file_tags.get(key, "") for key in _FILE_TAGS)),
         "" if vertical is None else str(vertical["name"]),
         source.crs is not None,
+        "vertical CRS or unit of the band" if vertical is not None else "unit of the band" if unit else ASSUMED,
     )
 
 
@@ -139,10 +145,13 @@ def _in_degrees(source: rasterio.DatasetReader) -> bool:
     return source.crs is not None and source.crs.is_geographic
 
 
-def _check_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: Path) -> None:
-    """Raises TwinError if a metre of a projected CRS is not a metre on the ground, e.g. in Web Mercator (EPSG:3857)."""
+def _checked_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: Path) -> float | None:
+    """Returns the ground scale of a projected CRS (m on the ground / m in the CRS) at the centre; else None.
+
+    Raises TwinError if it is far from 1, e.g. in Web Mercator (EPSG:3857).
+    """
     if source.crs is None or not source.crs.is_projected:
-        return
+        return None
     scale, longitude, latitude = _ground_scale(source, unit_m)
     if np.abs(scale - 1).max() > _MAX_SCALE_ERROR:
         remedy = f"gdalwarp -t_srs EPSG:{_utm_epsg(longitude, latitude)} -tr CELL_M CELL_M {file.name} projected.tif"
@@ -150,6 +159,7 @@ def _check_ground_scale(source: rasterio.DatasetReader, unit_m: float, file: Pat
             file, f"is in a CRS with the ground scale {np.sqrt(scale.prod()):.3f} (m on the ground / m in the CRS)"
             " there", f"a CRS with true distances, e.g. by {remedy}",
         )  # fmt: skip
+    return float(np.sqrt(scale.prod()))
 
 
 def _ground_scale(source: rasterio.DatasetReader, unit_m: float) -> tuple[NDArray[np.float64], float, float]:

@@ -13,7 +13,7 @@ from twin.errors import TwinError
 from twin.terrains.terrain import MAX_NODES, MAX_TEXELS
 
 HEIGHT_FIELD = "terrain.height_file"
-HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), 16-bit PNG or .npy with one height per cell"
+HEIGHT_FORMATS = "GeoTIFF (.tif, .tiff), ESRI grid (.asc), XYZ grid (.xyz), 16-bit PNG or .npy with one height per cell"
 TEXTURE_FIELD = "terrain.texture_file"
 ORTHOPHOTO_FIELD = "terrain.orthophoto_file"
 #: Largest number of values of a file by its key, and what the values are called.

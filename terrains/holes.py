@@ -18,19 +18,24 @@ _SMALL = 2
 _LEAST_GAP, _MOST_RANGES = 100.0, 10.0
 
 
-def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> None:
-    """Raises TwinError if the least or greatest value can only mark holes; `remedy` says how to declare "{}"."""
-    finite = values[np.isfinite(values)]
+def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: str) -> list[str]:
+    """Raises TwinError if the least or greatest value can only mark holes; `remedy` says how to declare "{}".
+
+    Returns a sentence for each of them that may mark holes: in several cells, and far from the others for their range.
+    """
+    doubts, finite = list[str](), values[np.isfinite(values)]
     for value in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
         heights = finite[(finite != value) & ~np.isin(finite, _NODATA)]
         if heights.size == 0:
             continue
-        low, high = heights.min(), heights.max()
-        if max(low - value, value - high) > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
-            raise height_error(
-                file, f"has the value {value:g} in {np.count_nonzero(finite == value)} cells, far from all others"
-                f" ({low:g} to {high:g}), and does not declare it as nodata", remedy.format(f"{value:g}"),
-            )  # fmt: skip
+        low, high, n_cells = heights.min(), heights.max(), np.count_nonzero(finite == value)
+        gap, problem = max(low - value, value - high), f"has the value {value:g} in {n_cells} cells, far from all others"
+        problem += f" ({low:g} to {high:g}), and does not declare it as nodata"
+        if gap > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
+            raise height_error(file, problem, remedy.format(f"{value:g}"))
+        if n_cells > 1 and gap > high - low:
+            doubts.append(f"{file.name!r} {problem}.")
+    return doubts
 
 
 def fill_holes(height_m: NDArray[np.float64]) -> NDArray[np.float64]:

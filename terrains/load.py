@@ -1,4 +1,4 @@
-"""Terrains from files: heights from GeoTIFF, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
+"""Terrains from files: heights from GeoTIFF, grids as text, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
 
 from __future__ import annotations
 
@@ -9,19 +9,26 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.core.georeference import Georeference
 from twin.core.user_files import reading
 from twin.terrains.file_header import HEIGHT_FIELD, HEIGHT_FORMATS, check_count, decoded, height_error
 from twin.terrains.ground_cover import DEFAULT_COVERS
 from twin.terrains.holes import check_no_undeclared_holes, fill_holes, known_nodes
+from twin.terrains.input_statement import InputStatement
 from twin.terrains.terrain import Terrain, texture_shape
 from twin.terrains.textures import TextureSource, generate_texture, texture_from_photo
-from twin.terrains.vertical_axis import Direction, VerticalAxis, upward_sign
+from twin.terrains.vertical_axis import Direction, HeightFile, VerticalAxis, direction_of
 from twin.terrains.walls import walls_of
 
 Heights = NDArray[np.float64]
 
 _MOST_HEIGHT_M = 20_000.0
+_DRIVERS = {".tif": "GTiff", ".tiff": "GTiff", ".asc": "AAIGrid", ".xyz": "XYZ"}  # drivers of GDAL by suffix
+#: Programs that convert files of other formats, which may name further files, or points that have to be gridded.
+_POINTS = "pdal translate {} floor.tif --writers.gdal.resolution=CELL_M --writers.gdal.output_type=mean"
+_CONVERSIONS = {
+    ".nc": "gdal_translate NETCDF:{}:VARIABLE floor.tif", ".bag": "gdal_translate -b 1 {} floor.tif",
+    ".las": _POINTS, ".laz": _POINTS,
+}  # fmt: skip
 
 
 def load(
@@ -41,11 +48,11 @@ def load(
         TwinError: a file is missing, invalid or too large, the direction of heights unclear, or the cover unknown.
     """
     file = Path(height_file)
-    given, spacing_m, axis, georeference = _read_heights(file, height_spacing_m, height_range_m)
-    _check(given, file)
-    upward_m = upward_sign(given, axis, z, file) * axis.metres_per_unit
-    values = given[::-1] * upward_m
-    has_height = np.isfinite(values)
+    given = _read_heights(file, height_spacing_m, height_range_m)
+    _check(given.values, file)
+    direction, evidence = direction_of(given.values, given.axis, z, file)
+    values = given.values[::-1] * given.axis.metres_per_unit * (1.0 if direction == "up" else -1.0)
+    has_height, spacing_m, georeference = np.isfinite(values), given.spacing_m, given.georeference
     raw, known = fill_holes(values), known_nodes(has_height)
     if (most_m := float(np.abs(raw).max())) > _MOST_HEIGHT_M:  # larger than any on Earth
         raise height_error(file, f"has a height of {most_m:g} m", f"heights within {_MOST_HEIGHT_M:g} m of zero")
@@ -58,9 +65,9 @@ def load(
     texel_m = extent_m[0] / shape[1]
     cover, rng = texture.cover or DEFAULT_COVERS["file"], np.random.default_rng(seed)
     if texture.photo_file is not None:
-        texels = texture_from_photo(texture, shape, extent_m)
+        texels, colours = texture_from_photo(texture, shape, extent_m), Path(texture.photo_file).name
     else:
-        texels = generate_texture(cover, height_m, shape, texel_m, rng)
+        texels, colours = generate_texture(cover, height_m, shape, texel_m, rng), f"generated: {cover}"
     covered = share = None
     if texture.orthophoto_file is not None:
         # imported here: rasterio takes 20 MB of memory, and most terrains do not need it
@@ -68,27 +75,40 @@ def load(
 
         covered = lay_orthophoto(texels, Path(texture.orthophoto_file), extent_m, georeference)
         share = float(covered.mean())
+        colours = f"{Path(texture.orthophoto_file).name} over {100 * share:.3g} % of the floor, else {colours}"
     walls = walls_of(height_m, spacing_m, texture, cover, texel_m, rng, covered)
     west_m, south_m = -extent_m[0] / 2, -extent_m[1] / 2
     filled = None if has_height.all() else ~has_height
-    return Terrain(height_m, spacing_m, west_m, south_m, texels, texel_m, filled, georeference, share, walls, known)
+    finite = given.values[np.isfinite(given.values)]
+    stated = InputStatement(
+        file.name, given.crs, given.ground_scale, spacing_m,
+        "terrain.height_spacing_m" if georeference is None else "its coordinates",
+        given.axis.metres_per_unit, given.axis.unit_evidence, direction, evidence,
+        float(finite.min()), float(finite.max()), given.nodata,
+        float(1 - has_height.mean()), colours, given.doubts,
+    )  # fmt: skip
+    return Terrain(
+        height_m, spacing_m, west_m, south_m, texels, texel_m, filled, georeference, share, walls, known, stated
+    )
 
 
-def _read_heights(
-    file: Path, height_spacing_m: float, height_range_m: float
-) -> tuple[Heights, float, VerticalAxis, Georeference | None]:
-    """Returns what `elevation_model.read_geotiff` returns of a GeoTIFF, of any file of heights."""
+def _read_heights(file: Path, height_spacing_m: float, height_range_m: float) -> HeightFile:
     suffix, named = file.suffix.lower(), VerticalAxis(texts=(file.stem,))
-    if suffix in (".tif", ".tiff"):
-        from twin.terrains.elevation_model import read_geotiff  # imported here: it imports rasterio
+    if suffix in _DRIVERS:
+        from twin.terrains.elevation_model import read_raster_heights  # imported here: it imports rasterio
 
-        return read_geotiff(file, height_spacing_m)
+        return read_raster_heights(file, height_spacing_m, _DRIVERS[suffix])
     if suffix == ".png":
-        return _read_png(file) * height_range_m, height_spacing_m, named._replace(band_name="height"), None
+        axis = named._replace(band_name="height", unit_evidence="terrain.height_range_m")
+        return HeightFile(_read_png(file) * height_range_m, height_spacing_m, axis)
     if suffix == ".npy":
         values = _read_npy(file)
-        check_no_undeclared_holes(values, file, "NaN in place of {}")
-        return values, height_spacing_m, named, None
+        doubts = check_no_undeclared_holes(values, file, "NaN in place of {}")
+        return HeightFile(values, height_spacing_m, named, doubts=tuple(doubts))
+    if suffix in _CONVERSIONS:
+        raise height_error(
+            file, f"is not read as {suffix}", f"a GeoTIFF, as {_CONVERSIONS[suffix].format(file.name)} writes it"
+        )
     raise height_error(file, "is not a height file")
 
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from twin.core.geometry import Array
 from twin.core.georeference import Georeference
 from twin.errors import TwinError
+from twin.terrains.input_statement import InputStatement
 
 Index = NDArray[np.int64]
 
@@ -58,6 +59,7 @@ class Terrain:
         walls: texture of the steep parts; None: the texture is projected from above everywhere.
         known: (ny, nx) bool, nodes with a height in the source or in a small hole of it (`holes.known_nodes`); only
             over these is a survey planned and judged. None: all nodes.
+        stated: how the files of the floor were read; None for a generated floor.
     """
 
     height_m: NDArray[np.float32]
@@ -71,6 +73,7 @@ class Terrain:
     orthophoto_share: float | None = None
     walls: Walls | None = None
     known: NDArray[np.bool_] | None = None
+    stated: InputStatement | None = None
 
     @property
     def size_m(self) -> tuple[float, float]:
@@ -120,7 +123,8 @@ class Terrain:
             " neither planned over nor judged, and drawn with the nearest height."
         )
         small = f"{n_small} cells of the floor, in small holes, have the nearest height."
-        return [note for note, count in ((unknown, n_unknown), (small, n_small)) if count]
+        doubts = () if self.stated is None else self.stated.doubts
+        return [*doubts, *(note for note, count in ((unknown, n_unknown), (small, n_small)) if count)]
 
     def in_hole(self, x_m: ArrayLike, y_m: ArrayLike) -> NDArray[np.bool_]:
         """Returns whether each point lies in a cell with an unknown node; false outside the terrain."""

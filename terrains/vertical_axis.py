@@ -1,4 +1,4 @@
-"""Vertical axis of a height file: direction and unit of its values. `terrain.z` may give the direction."""
+"""What a height file states: direction and unit of its values, CRS. `terrain.z` may give the direction."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from twin.core.georeference import Georeference
 from twin.errors import TwinError
 from twin.terrains.file_header import height_error
 
 Direction = Literal["up", "down"]
 
+ASSUMED = "assumed: it names none"  #: evidence of a unit that a file does not state
 #: Lengths [m] of the units that a raster band may have, by their names in lower case.
 UNITS_M = {
     **dict.fromkeys(("m", "metre", "metres", "meter", "meters"), 1.0),
@@ -41,6 +43,20 @@ class VerticalAxis(NamedTuple):
     texts: tuple[str, ...] = ()  #: file name, names and tags that may name the quantity of the values
     datum: str = ""  #: name of the vertical CRS; "" if there is none
     in_crs: bool = False  #: whether the file names a CRS; there, a sea floor has no positive elevations
+    unit_evidence: str = ASSUMED  #: what states the unit
+
+
+class HeightFile(NamedTuple):
+    """Values of a file of heights, before holes are filled, with what the file states of them."""
+
+    values: NDArray[np.float64]  #: (rows, cols), row 0 = north; NaN where the file has no height
+    spacing_m: float  #: distance between neighbouring values
+    axis: VerticalAxis
+    georeference: Georeference | None = None  #: position of the centre in the CRS of the file; None without coordinates
+    crs: str = ""  #: name of the horizontal CRS; "" without one
+    ground_scale: float | None = None  #: distance on the ground / distance in a projected CRS, at the centre
+    nodata: str = ""  #: value or band by which the file declares cells without a height; "" if it declares none
+    doubts: tuple[str, ...] = ()  #: sentences on values that may mark cells without a height
 
 
 def unit_length_m(name: str, file: Path) -> float:
@@ -58,28 +74,30 @@ def cf_direction(tags: dict[str, str]) -> Direction | None:
     return "down" if tags.get("standard_name", "").lower().startswith(_CF_DEPTHS) else None
 
 
-def upward_sign(values: NDArray[np.float64], axis: VerticalAxis, asked: Direction | None, file: Path) -> float:
-    """Returns +1 if the values (rows, cols), not finite in holes, increase upwards, -1 if they are depths.
+def direction_of(
+    values: NDArray[np.float64], axis: VerticalAxis, asked: Direction | None, file: Path
+) -> tuple[Direction, str]:
+    """Returns the direction in which the values (rows, cols), not finite in holes, increase, and the evidence for it.
 
     `asked` is `terrain.z` of the scenario, which takes precedence; None: determined from the file. Raises TwinError if
     the file does not make clear which way its values increase.
     """
     if asked is not None:
-        return 1.0 if asked == "up" else -1.0
+        return asked, "terrain.z"
     heights = values[np.isfinite(values)]
     low, high = float(heights.min()), float(heights.max())
     shown = f"{file.name!r} with values from {low:g} to {high:g}"
     if axis.direction == "down" and high <= 0:
         raise _ambiguous(f"{shown} states that they increase downwards, but none is positive")
     if axis.direction is not None:
-        return 1.0 if axis.direction == "up" else -1.0
+        return axis.direction, "vertical CRS or CF attributes"
     named = [text for text in (axis.band_name, *axis.texts) if _DEPTH_WORD.search(text)]
     if not named and low > (0 if axis.in_crs else high - low) and not _HEIGHT_BAND.search(axis.band_name):
         raise _ambiguous(f"{shown}, all positive, does not state whether they are heights or depths")
     if not named or high <= 0:  # depths as negative numbers increase upwards
-        return 1.0
+        return "up", "name of the band" if _HEIGHT_BAND.search(axis.band_name) else f"assumed: values from {low:g}"
     if low >= 0 and _DEPTH_BAND.search(axis.band_name):
-        return -1.0
+        return "down", "name of the band"
     raise _ambiguous(f"{shown} may hold depths ({named[0]!r})")
 
 

@@ -46,7 +46,7 @@ MUTANTS = [
         ("twin/core/height_field.py", "return np.asarray(east, np.float64), -np.asarray(south, np.float64)", "return np.asarray(east, np.float64), np.asarray(south, np.float64)", "interpolation"),
         # terrains and their objects
         ("terrains/generate.py", "west_m, south_m = -(nx - 1) * grid_m / 2, -(ny - 1) * grid_m / 2", "west_m, south_m = -nx * grid_m / 2, -(ny - 1) * grid_m / 2", "terrains_floor"),
-        ("terrains/load.py", "given[::-1] * upward_m", "given * upward_m", "terrains_load"),
+        ("terrains/load.py", "values = given.values[::-1]", "values = given.values", "terrains_load"),
         ("terrains/objects/detail.py", "x, y, z = np.cross(ab, ac).T", "x, y, z = np.cross(ac, ab).T", "imaging_mesh_parts"),
         ("terrains/objects/scattering.py", "np.hypot(east, north) / (2 * reach_m)", "np.hypot(east, north) / reach_m", "world_placement terrains_objects"),
         ("terrains/objects/mesh_file.py", "row = np.floor(((1 - uv[:, 1]) % 1.0) * height)", "row = np.floor((uv[:, 1] % 1.0) * height)", "terrains_objects"),

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rasterio
+from rasterio.crs import CRS
 from rasterio.transform import from_origin
 
 from twin import terrains
@@ -43,19 +44,36 @@ def write_npy(file: Path, array: np.ndarray) -> Path:
     return file
 
 
-@pytest.mark.parametrize("form", ("tif", "npy", "png"))
+@pytest.mark.parametrize("form", ("tif", "npy", "png", "asc", "xyz"))
 def test_every_format_gives_the_same_floor_north_up_and_centred(tmp_path: Path, form: str) -> None:
     file = tmp_path / f"dem.{form}"
     if form == "tif":
         write_tiff(file, HEIGHTS)
     elif form == "npy":
         write_npy(file, HEIGHTS)
+    elif form == "asc":
+        lines = ["ncols 3", "nrows 3", "xllcorner 100", "yllcorner 198.5", "cellsize 0.5", "NODATA_value -9999"]
+        file.write_text("\n".join([*lines, *(" ".join(map(str, row)) for row in HEIGHTS)]))
+    elif form == "xyz":
+        east, north = np.meshgrid(100.25 + 0.5 * np.arange(3), 199.75 - 0.5 * np.arange(3))
+        np.savetxt(file, np.column_stack([east.ravel(), north.ravel(), HEIGHTS.ravel()]), "%.3f")
     else:
         write_png(file, np.rint((HEIGHTS - 1) / 3 * 65535).astype(np.uint16))
     terrain = load(file)
     assert terrain.height_at([0.5, -0.5, 0.0], [0.5, -0.5, 0.0]) == pytest.approx([3.0, 0.0, 1.0], abs=3 / 65535)
     assert terrain.size_m == pytest.approx((1.0, 1.0)) and terrain.lowest_m == 0.0
     assert terrain.texture.shape == (10, 10, 3) and terrain.n_filled == 0
+    if form in ("asc", "xyz"):
+        assert terrain.georeference == load(write_tiff(tmp_path / "dem.tif", HEIGHTS)).georeference
+
+
+def test_a_grid_as_text_has_the_crs_of_the_prj_file_beside_it(tmp_path: Path) -> None:
+    crs = CRS.from_epsg(32755)
+    (tmp_path / "dem.asc").write_text("ncols 2\nnrows 2\nxllcorner 5e5\nyllcorner 8e6\ncellsize 1\n-1 -2\n-3 -4\n")
+    (tmp_path / "dem.prj").write_text(crs.to_wkt("WKT1_ESRI"))
+    origin = load(tmp_path / "dem.asc").georeference
+    assert origin is not None and origin.crs_wkt is not None
+    assert CRS.from_wkt(origin.crs_wkt).to_epsg() == 32755 and origin.easting == 500_001.0
 
 
 def test_holes_are_filled_with_the_nearest_height_and_counted(tmp_path: Path) -> None:
@@ -102,6 +120,9 @@ BAD = [
     ("all nodata", lambda p: write_tiff(p / "dem.tif", np.full((3, 3), -1.0), nodata=-1.0), "no valid height"),
     ("1 row", lambda p: write_npy(p / "dem.npy", HEIGHTS[:1]), "1 row(s) and 3 column(s)"),
     ("1 column", lambda p: write_tiff(p / "dem.tif", HEIGHTS[:, :1]), "3 row(s) and 1 column(s)"),
+    ("scattered XYZ", lambda p: _bytes(p / "dem.xyz", b"0 0 1\n1.3 0.2 2\n0.1 1.4 3\n2 2 4\n"), "cannot be read: "),
+    ("LAZ", lambda p: _bytes(p / "dem.laz", b"LASF"), "is not read as .laz"),
+    ("NetCDF", lambda p: _bytes(p / "dem.nc", b"CDF"), "is not read as .nc"),
     ("degrees", lambda p: write_tiff(p / "dem.tif", HEIGHTS, crs="EPSG:4326"), "is in degrees"),
 ]
 

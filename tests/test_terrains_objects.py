@@ -109,6 +109,14 @@ def test_the_base_colour_of_a_glb_material_is_its_colour_without_a_texture(tmp_p
     np.testing.assert_array_equal(np.unique(shown, axis=0), [expected])
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_triangles_that_a_file_lists_twice_count_once(turned, tmp_path):
+    ball = trimesh.creation.icosphere(1)
+    again = ball.faces[:5, ::-1] if turned else ball.faces[:5]
+    trimesh.Trimesh(ball.vertices, np.vstack([ball.faces, again]), process=False).export(tmp_path / "ball.ply")
+    np.testing.assert_array_equal(read(tmp_path / "ball.ply").faces, ball.faces)
+
+
 def test_a_mesh_in_coordinates_of_a_map_projection_keeps_its_shape(tmp_path):
     """Single precision rounds a northing of 5000 km to 0.5 m."""
     fine = CUBE.subdivide().subdivide()

@@ -1,5 +1,6 @@
 """Files of strangers: only named formats are read, alone and within limits; a damaged file gives one TwinError."""
 
+import functools
 import http.server
 import json
 import os
@@ -25,7 +26,7 @@ from twin.report.run_comparison import load_runs
 from twin.report.run_folder import read_raster
 from twin.scenario.file import load_scenario
 from twin.terrains.objects.mesh_file import read_mesh
-from twin.world.asked_area import read_geojson
+from twin.world.asked_area import read_area
 
 ROOT = Path(__file__).parent.parent
 PLACED = from_origin(500000.0, 8000000.0, 0.5, 0.5)
@@ -199,7 +200,7 @@ def test_an_impossible_polygon_is_one_error(tmp_path, ring):
     (tmp_path / "area.json").write_text(f'{{"type": "Polygon", "coordinates": [{ring}]}}')
     floor = load(write_tif(tmp_path / "dem.tif"))
     with pytest.raises(TwinError, match=r"^plan.polygon: [^\n]*$"):
-        read_geojson(tmp_path / "area.json", floor)
+        read_area(tmp_path / "area.json", floor)
 
 
 def test_a_scalar_matrix_of_opencv_is_one_error(tmp_path):
@@ -216,6 +217,35 @@ def test_a_loop_of_links_among_compared_runs_is_one_error(tmp_path):
         load_runs([tmp_path / "a", tmp_path / "b"])
 
 
+@pytest.mark.parametrize("kind", ["fifo", "link", "large"])
+def test_the_crs_beside_a_grid_as_text_is_a_small_regular_file_or_refused(tmp_path, kind):
+    """GDAL reads it as a whole, and would wait for a pipe."""
+    (tmp_path / "dem.asc").write_text("ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 1\n-1 -2\n-3 -4\n")
+    assert load(tmp_path / "dem.asc").highest_m == 3.0
+    if kind == "fifo":
+        os.mkfifo(tmp_path / "dem.prj")
+    elif kind == "link":
+        (tmp_path / "dem.prj").symlink_to("/dev/zero")
+    else:
+        (tmp_path / "dem.prj").write_text(" " * 2**21)
+    with pytest.raises(TwinError, match="'dem.prj' is not a regular file of at most 1048576 bytes"):
+        load(tmp_path / "dem.asc")
+
+
+@pytest.mark.parametrize("kind", ["fifo", "link", "loop", "parent"])
+def test_what_a_mesh_names_is_a_regular_file_in_its_folder_or_refused(tmp_path, kind):
+    mesh, named = tmp_path / "mesh" / "a.obj", tmp_path / "mesh" / "a.mtl"
+    mesh.parent.mkdir()
+    (tmp_path / "secret.mtl").write_text("newmtl a\nKd 1 0 0\n")
+    mesh.write_text(f"mtllib {'../secret' if kind == 'parent' else 'a'}.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    if kind == "fifo":
+        os.mkfifo(named)
+    elif kind != "parent":
+        named.symlink_to({"link": "/dev/zero", "loop": "a.mtl"}[kind])
+    with pytest.raises(TwinError, match="needs the file .*, which is not beside it or cannot be read"):
+        read_mesh(mesh, "terrain.mesh_file", (0.5, 0.5, 0.5))
+
+
 def test_an_accessor_without_data_is_refused_by_its_size(tmp_path):
     file = tmp_path / "mesh.glb"
     trimesh.creation.box().export(file)
@@ -226,6 +256,9 @@ def test_an_accessor_without_data_is_refused_by_its_size(tmp_path):
     file.write_bytes(data[:12] + len(text).to_bytes(4, "little") + data[16:20] + text)
     with pytest.raises(TwinError, match="1000000000 elements of an accessor"):
         read_mesh(file, "terrain.mesh_file", (0.5, 0.5, 0.5))
+
+
+SYSTEM = ("/proc/self/", "/dev/null", sys.prefix, sys.base_prefix, str(ROOT / "twin"), str(ROOT / "terrains"))
 
 
 def samples(folder):
@@ -240,6 +273,27 @@ def samples(folder):
     rasterio.shutil.copy(photo, folder / "photo.png", driver="PNG")
     corners = [[500002.0, 7999998.0], [500008.0, 7999998.0], [500008.0, 7999990.0], [500002.0, 7999998.0]]
     (folder / "area.json").write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
+    kml_corners = " ".join(
+        f"{145 + 1e-6 * east:.9f},{-18 + 1e-6 * north:.9f},0" for east, north in np.array(corners) % 10
+    )
+    (folder / "area.kml").write_text(
+        '<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>'
+        f"{kml_corners}</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
+    )
+    survey = {"complexItemType": "survey", "polygon": [[-18.0, 145.0], [-18.0, 145.1], [-18.1, 145.1]]}
+    (folder / "area.plan").write_text(json.dumps({"mission": {"items": [{"type": "SimpleItem"}, survey]}}))
+    for name, driver, kind in (
+        ("dem.asc", "AAIGrid", np.float32),
+        ("dem.xyz", "XYZ", np.float32),
+        ("h.png", "PNG", np.uint16),
+    ):
+        values = HEIGHTS.astype(np.float32) if kind is np.float32 else (HEIGHTS + 9) * 1000
+        rasterio.shutil.copy(write_tif(folder / "copied.tif", values.astype(kind)), folder / name, driver=driver)
+    (folder / "h.png.aux.xml").unlink(missing_ok=True)
+    (folder / "named.obj").write_text(
+        "mtllib named.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nusemtl a\n" + "f 1/1 2/2 3/3\n"
+    )
+    (folder / "named.mtl").write_text("newmtl a\nKd 1 0 0\nmap_Kd photo.png\n")
     (folder / "rig.yaml").write_text(
         "%YAML:1.0\n---\nM1: !!opencv-matrix\n   rows: 1\n   cols: 2\n   dt: d\n   data: [1., 2.]\nT: &a {x: 1}\n"
     )
@@ -251,7 +305,9 @@ def samples(folder):
     return {
         dem: load, folder / "dem.npy": load, photo: lambda file: load(dem, orthophoto_file=file),
         folder / "photo.png": lambda file: load(dem, photo_file=file),
-        folder / "area.json": lambda file: read_geojson(file, floor),
+        **{folder / f"area.{suffix}": lambda file: read_area(file, floor) for suffix in ("json", "kml", "plan")},
+        **{folder / name: load for name in ("dem.asc", "dem.xyz", "h.png")},
+        folder / "named.mtl": lambda file: mesh(file.with_suffix(".obj")),
         folder / "rig.yaml": read_yaml, folder / "scene.toml": load_scenario,
         **{folder / f"mesh.{suffix}": mesh for suffix in ("ply", "obj", "glb")},
     }  # fmt: skip
@@ -268,10 +324,22 @@ def damaged(data, rng):
     return bytes(data[: rng.integers(0, len(data) + 1)] if rng.random() < 0.1 else data)
 
 
+def _stay_inside(folder, event, values):
+    """Ends the process if Python opens a file outside the folder, or a socket."""
+    outside = event == "open" and isinstance(values[0], str) and not Path(values[0]).is_relative_to(folder)
+    if event in ("socket.connect", "subprocess.Popen", "os.system") or (outside and not values[0].startswith(SYSTEM)):
+        sys.stderr.write(f"{event} {values}\n")
+        os._exit(3)
+
+
 def fuzz(folder, n, seed):
-    """Reads `n` damaged copies of each sample; only TwinError may come out."""
-    rng = np.random.default_rng(seed)
-    for file, reader in samples(folder).items():
+    """Reads `n` damaged copies of each sample; only TwinError may come out, and no other file may be opened."""
+    rng, read_files = np.random.default_rng(seed), samples(folder)
+    for file, reader in read_files.items():
+        if file.name not in ("area.kml", "area.plan"):  # the DEM of the samples names no CRS
+            reader(file)  # loads the modules and the tables that it needs
+    sys.addaudithook(functools.partial(_stay_inside, folder))
+    for file, reader in read_files.items():
         data = file.read_bytes()
         for _ in range(n):
             file.write_bytes(damaged(data, rng))
@@ -287,8 +355,8 @@ def fuzz(folder, n, seed):
 
 @pytest.mark.long
 def test_only_twin_errors_come_out_of_damaged_files(tmp_path):
-    # in a process of its own, which measures its memory; a sample takes up to 20 ms
-    code = f"import test_user_files as t, pathlib; t.fuzz(pathlib.Path({str(tmp_path)!r}), 40, 3); t.report_memory()"
+    # 2000 files in a process of its own, which measures its memory
+    code = f"import test_user_files as t, pathlib; t.fuzz(pathlib.Path({str(tmp_path)!r}), 125, 3); t.report_memory()"
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=300
     )

@@ -334,6 +334,16 @@ def test_the_tiling_of_a_photo_has_no_effect_on_a_mesh_and_is_an_error(tmp_path)
         mission_of(exported(sheet(), tmp_path), "terrain.texture_tiling=repeat")
 
 
+@pytest.mark.parametrize(
+    ("overrides", "unit"), [([], "assumed: it names none"), (["terrain.mesh_scale=1.0"], "terrain.mesh_scale")]
+)
+def test_the_statement_of_a_mesh_says_whether_its_unit_was_assumed(overrides, unit, tmp_path):
+    mission = mission_of(exported(sheet(), tmp_path), *overrides)
+    stated = mission.stated_input
+    assert (stated["unit_evidence"], stated["crs"], stated["texture"]) == (unit, "", "1 textures of the mesh")
+    assert stated["greatest"] - stated["least"] == pytest.approx(np.ptp(REEF.height_m), abs=1e-6)
+
+
 def test_slivers_are_not_divided_without_bound(monkeypatch):
     monkeypatch.setattr("twin.terrains.objects.floor_mesh.MAX_DIVIDED", 300)
     corners = np.array([[0, 0, 0], [40, 0, 0], [0, 0.01, 0]], np.float32)

@@ -16,7 +16,7 @@ from twin.exchange import geotiff
 from twin.report.run_folder import load_run, read_raster
 from twin.scenario.file import load_scenario
 from twin.scenario.model import PlanConfig
-from twin.world.asked_area import read_geojson, survey_area
+from twin.world.asked_area import read_area, survey_area
 from twin.world.mission import prepare
 
 UTM = "EPSG:32755"
@@ -122,7 +122,7 @@ def test_a_geojson_polygon_is_read_in_the_crs_of_the_dem_or_its_own(dem, tmp_pat
         tree = {"type": "FeatureCollection", "features": [{"type": "Feature", "geometry": tree}]}
     (tmp_path / "area.geojson").write_text(json.dumps(tree), "utf-8-sig" if form == "byte order mark" else "utf-8")
     terrain = mission(dem).terrain
-    np.testing.assert_allclose(read_geojson(tmp_path / "area.geojson", terrain)[0][0], CORNERS, atol=1e-3)
+    np.testing.assert_allclose(read_area(tmp_path / "area.geojson", terrain)[0][0], CORNERS, atol=1e-3)
     area = survey_area(PlanConfig(polygon=str(tmp_path / "area.geojson"), heading_deg=20), terrain)
     np.testing.assert_allclose(area.outline(), CORNERS, atol=1e-3)
 
@@ -153,7 +153,7 @@ def test_holes_and_parts_of_a_geojson_file_are_parts_of_the_area(dem, tmp_path):
 def test_a_damaged_geojson_file_is_an_error(dem, tmp_path, content):
     (tmp_path / "bad.geojson").write_text(content)
     with pytest.raises(TwinError) as caught:
-        read_geojson(tmp_path / "bad.geojson", mission(dem).terrain)
+        read_area(tmp_path / "bad.geojson", mission(dem).terrain)
     assert caught.value.field == "plan.polygon"
 
 

@@ -173,21 +173,20 @@ def compare(*runs: str | Path | RunResult) -> dict[str, Any]:
 
 
 def export(run: str | Path | RunResult, formats: str | Sequence[str], out: str | Path | None = None) -> dict[str, Any]:
-    """Writes a run in the formats of other programs; returns the written files of each format.
+    """Writes a run, or the planned path of a scenario, in the formats of other programs; returns the files by format.
 
     Args:
-        run: a run or its folder.
+        run: a run or its folder; for the formats of a planned path, also a scenario.
         formats: names of formats, as `twin export --list` prints them.
-        out: folder to write; default: the folder `export` in the run folder.
+        out: folder to write; default: the folder `export` in the run folder, for a planned path `runs`.
 
     Raises:
         TwinError: a format is unknown, the run lacks contents that it needs, or a file cannot be written.
     """
     from twin.exports import command
 
-    folder = _folder(run)
     names = [formats] if isinstance(formats, str) else list(formats)
-    return command.export(folder, names, Path(out) if out is not None else folder / "export")
+    return command.export_any(_folder(run), names, None if out is None else Path(out))
 
 
 def study(

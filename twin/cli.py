@@ -524,9 +524,12 @@ def new_plugin(
 
 @app.command()
 def export(
-    folder: Annotated[Path | None, argument("Folder of a run.", "RUN")] = None,
+    source: Annotated[
+        str | None, argument("Folder of a run; a scenario for the formats of its planned path.", "RUN|SCENE")
+    ] = None,
     to: Annotated[list[str], option("Format to write; repeatable, or separated by commas.", "FORMAT")] = [],  # noqa: B006 (typer copies it)
-    out: Annotated[Path | None, option("Folder to write. Default: RUN/export.")] = None,
+    overrides: Overrides = [],  # noqa: B006 (typer copies it)
+    out: Annotated[Path | None, option("Folder to write. Default: RUN/export; for a scenario, runs.")] = None,
     crs: Annotated[str | None, option("CRS of the exported coordinates, as in EPSG:32633.")] = None,
     origin: Annotated[
         str | None, option("Scene origin in --crs; H is its elevation \\[m], by default 0.", "E,N,H")
@@ -535,19 +538,18 @@ def export(
     show_list: Annotated[bool, option("List the formats.", flag="--list")] = False,
     allow_plugins: AllowPlugins = False,
 ) -> None:
-    """Write a run in the formats of other programs: data sets, camera models, truth, maps."""
+    """Write a run, or the planned path of a scenario, in the formats of other programs."""
     from twin.exports import command as export_command
 
     if show_list:
         console.print_table("Formats of twin export", export_command.format_rows())
         return
-    if folder is None:
-        raise TwinError("RUN", "is missing", "the folder of a run, or --list")
-    target = folder / "export" if out is None else out
+    if source is None:
+        raise TwinError("RUN", "is missing", "the folder of a run, a scenario, or --list")
     options = export_command.ExportOptions(crs, origin, jpeg, allow_plugins)
-    with console.replay_bar() as progress, outputs.writing(target):
+    with console.replay_bar() as progress:
         warnings: list[str] = []
-        written = export_command.export(folder, to, target, options, progress, warnings.append)
+        written = export_command.export_any(source, to, out, overrides, options, progress, warnings.append)
     for warning in warnings:
         print(f"Warning: {warning}", file=sys.stderr)
     for name, paths in written.items():

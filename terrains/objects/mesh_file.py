@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from twin.core.geometry import Array
-from twin.core.user_files import IMAGE_FORMATS, reading
+from twin.core.user_files import IMAGE_FORMATS, read_bytes, reading, resolved
 from twin.errors import TwinError
 from twin.terrains.file_header import eight_bits
 from twin.terrains.objects.coloured_mesh import Mesh, joined, welded_faces, with_colours
@@ -38,8 +38,9 @@ class TexturedMesh(NamedTuple):
 def read_mesh(file: Path, field: str, albedo: tuple[float, float, float], y_up: bool = False) -> Mesh:
     """Returns the mesh of a PLY, OBJ or GLB file, in its unit; a mesh far from the origin is moved to it.
 
-    A mesh may be open, as photogrammetric models are, but no edge may belong to more than two triangles. A texture is
-    sampled at the vertices, after the triangles have been divided.
+    A mesh may be open, as photogrammetric models are, but no edge may belong to more than two triangles, of which those
+    with the same corners as an earlier one are left out. A texture is sampled at the vertices, after the triangles have
+    been divided.
 
     Args:
         field: scenario key of the file, for error messages.
@@ -87,7 +88,10 @@ def _parts_of(file: Path, field: str) -> Iterator[list[Any]]:
     with reading(file, field, FORMATS, MAX_BYTES):
         if (n_faces := face_count(file)) > MAX_FACES:
             raise TwinError(field, f"{file.name!r} has {n_faces} triangles", f"at most {MAX_FACES} triangles")
-        yield _near_origin(_loaded(file, field))
+        parts = _near_origin(_loaded(file, field))
+        for part in parts:
+            part.update_faces(part.unique_faces())
+        yield parts
 
 
 def _loaded(file: Path, field: str) -> list[Any]:
@@ -100,10 +104,13 @@ def _loaded(file: Path, field: str) -> list[Any]:
     class Resolver(FilePathResolver):
         def get(self, name: str) -> bytes:
             try:
-                data = super().get(name)
+                folder = resolved(file).parent
+                near = [resolved(folder / part.strip()) for part in (name, Path(name).name)]
+                found = [path for path in near if path.is_relative_to(folder) and path.exists()]
+                data = read_bytes(found[0], field, FORMATS, MAX_BYTES)
                 if not name.lower().endswith((".mtl", ".bin")):
                     Image.open(io.BytesIO(data)).close()
-            except (OSError, ValueError):
+            except (OSError, ValueError, IndexError, TwinError):
                 unread.append(name.strip())
                 raise
             return data

@@ -85,8 +85,11 @@ def print_table(title: str, rows: list[tuple[str, ...]]) -> None:
 
 def print_plan(summary: PlanSummary) -> None:
     from twin.planning import summary as plan_summary
+    from twin.report.input_rows import input_rows
 
     print_table(f"Plan of {summary.mission.scenario.name}", plan_summary.rows(summary))
+    if stated := input_rows(summary.mission.stated_input):
+        print_table("Input", [*stated])
     print_table("Over the floor", plan_summary.floor_rows(summary))
     if summary.require:
         print_requirements(summary.require, " expected", "ok")

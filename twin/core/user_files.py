@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import warnings
 from collections.abc import Iterator, Sequence
@@ -32,8 +33,11 @@ _SIGNATURES = {
     "JPEG": rb"\xff\xd8\xff",
     "BMP": rb"BM",
     "WEBP": rb"RIFF....WEBP",
+    "AAIGrid": rb"(?i)\s*(ncols|nrows)\s",
+    "XYZ": rb"\s*[-+.\d]|(?i:\s*x[\s,;]+y)",
 }
-IMAGE_DRIVERS = tuple(_SIGNATURES)  #: drivers that read plain images
+IMAGE_DRIVERS = ("GTiff", "PNG", "JPEG", "BMP", "WEBP")  #: drivers that read plain images
+_MOST_CRS_BYTES = 2**20  # largest file of a CRS beside a grid as text, which GDAL reads as a whole
 _MOST_TILE_PX = 2**24  # largest number of pixels of a tile that exceeds the raster
 _BESIDE = re.compile(r"<(SRS|GeoTransform|NoDataValue|Scale|Offset|UnitType|GCPList)\b")
 _ONE_FILE = "one file that contains them, as gdal_translate IN OUT writes it"
@@ -154,9 +158,13 @@ def open_raster(
     # GDAL looks for no file beside the opened one: overviews and masks beside it may be of any driver
     with reading(file, key, allowed), warnings.catch_warnings(), rasterio.Env(GDAL_DISABLE_READDIR_ON_OPEN="EMPTY_DIR"):
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        with rasterio.open(file, driver=_driver(file, drivers)) as source:
+        driver = _driver(file, drivers)
+        for crs in (file.with_suffix(suffix) for suffix in (".prj", ".PRJ") if driver == "AAIGrid"):
+            if os.path.lexists(crs) and (crs.is_symlink() or not is_file(crs) or crs.stat().st_size > _MOST_CRS_BYTES):
+                raise ValueError(f"{crs.name!r} is not a regular file of at most {_MOST_CRS_BYTES} bytes")
+        with rasterio.open(file, driver=driver) as source:
             _check_contents(source)
-            if source.driver == "GTiff":
+            if source.driver in ("GTiff", "AAIGrid", "XYZ"):
                 _check_beside(file, key, source.transform.is_identity)
             yield source
 

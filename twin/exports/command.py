@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from twin.app.outputs import new_folder
+from twin.app.outputs import file_stem, new_folder, output_file, writing
 from twin.core.georeference import Georeference
 from twin.core.output_folder import sole_writer
 from twin.core.records import ElevationMap, Image
@@ -22,12 +22,15 @@ from twin.datasets.run_contents import POSES, RecordedFrame, RunContents
 from twin.errors import TwinError
 from twin.exchange import geotiff
 from twin.exchange.geotiff import Raster
+from twin.exports import path_files
 from twin.exports.camera_models import true_calibration
-from twin.exports.formats import FORMATS, check_needs, chosen_formats
+from twin.exports.formats import FORMATS, PATH_FORMATS, check_needs, chosen_formats
+from twin.exports.planned_path import planned_path
 from twin.exports.recorded_frames import missing_files, recorded_frames, recorded_imu
 from twin.report.replay_description import replayed_rig
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.scenario.file import load_scenario
+from twin.world.mission import prepare
 
 
 class ExportOptions(NamedTuple):
@@ -94,9 +97,42 @@ def _completed(folder: Path) -> Iterator[Path]:
         raise
 
 
+def export_any(
+    source: str | Path, names: Sequence[str], out: Path | None, overrides: Sequence[str] = (),
+    options: ExportOptions = ExportOptions(),  # noqa: B008 (immutable)
+    progress: Callable[[str, float], None] = lambda _, __: None,
+    warn: Callable[[str], None] = lambda _: None,
+) -> dict[str, list[Path]]:  # fmt: skip
+    """Writes a run (`export`), by default into its folder `export`, or the planned path of a scenario or a run.
+
+    The formats decide which. The files of a path are named after the scenario; their folder is by default `runs`.
+    Raises TwinError as `export`, or if the survey cannot be planned or has no place on the Earth.
+    """
+    folder, chosen = Path(source), chosen_formats(names)
+    paths = [name for name in chosen if name in PATH_FORMATS]
+    target = out or (Path("runs") if paths else folder / "export")
+    if paths and paths != chosen:
+        raise TwinError("--to", "has formats of a planned path and of a run", f"{', '.join(PATH_FORMATS)}, or others")
+    if overrides and not paths:
+        raise TwinError("--set", "has no effect on a run, which has been flown", ", ".join(PATH_FORMATS))
+    with writing(target):
+        if not paths:
+            return export(folder, chosen, target, options, progress, warn)
+        file = folder / SCENARIO_FILE if folder.is_dir() else source
+        mission = prepare(load_scenario(file, overrides, options.allow_plugins))
+        path = planned_path(mission, _given_georeference(options) or mission.terrain.georeference)
+        files = {name: output_file(target / f"{file_stem(path.name)}{PATH_FORMATS[name][1]}") for name in paths}
+        target.mkdir(parents=True, exist_ok=True)
+        for name, file in files.items():
+            getattr(path_files, PATH_FORMATS[name][2])(path, file)
+        return {name: [file] for name, file in files.items()}
+
+
 def format_rows() -> list[tuple[str, ...]]:
-    return [("format", "contents", "needs")] + [
-        (name, form.description, ", ".join(sorted(form.needs))) for name, form in FORMATS.items()
+    return [
+        ("format", "contents", "needs"),
+        *((name, form.description, ", ".join(sorted(form.needs))) for name, form in FORMATS.items()),
+        *((name, description, "a scenario or a run") for name, (description, *_) in PATH_FORMATS.items()),
     ]
 
 
@@ -148,9 +184,16 @@ def _check_poses(run: Run, frames: Sequence[RecordedFrame]) -> None:
 
 
 def _georeference(folder: Path, options: ExportOptions) -> Georeference | None:
+    if (given := _given_georeference(options)) is not None:
+        return given
+    file = folder / "dem.tif"
+    return geotiff.read_georeference(file) if file.is_file() else None
+
+
+def _given_georeference(options: ExportOptions) -> Georeference | None:
+    """Returns the position that --crs and --origin state; None without them; raises TwinError if not valid."""
     if options.origin is None and options.crs is None:
-        file = folder / "dem.tif"
-        return geotiff.read_georeference(file) if file.is_file() else None
+        return None
     if options.origin is None or options.crs is None:
         raise TwinError("--crs", "is given without --origin, or --origin without --crs", "both or none of them")
     try:

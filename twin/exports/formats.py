@@ -51,6 +51,13 @@ _TABLE = (
     ("obj", "map", "exports.textured_mesh:export_obj",
      "mesh of the map with the orthomosaic as texture, Wavefront OBJ"),
 )  # fmt: skip
+#: Formats of the planned path of a scenario: description, suffix, and writer in `path_files`.
+PATH_FORMATS = {
+    "qgc": ("planned path: mission of QGroundControl for ArduSub", ".plan", "write_qgc"),
+    "kml": ("planned path: KML 2.2, a line for each track", ".kml", "write_kml"),
+    "gpx": ("planned path: GPX 1.1, a route", ".gpx", "write_gpx"),
+    "csv": ("planned path: waypoints in the scene, in its CRS and on WGS 84", ".csv", "write_csv"),
+}
 FORMATS = {name: ExportFormat(text, tuple(needs.split()), writer) for name, needs, writer, text in _TABLE}
 
 
@@ -80,14 +87,17 @@ _NEEDS: dict[str, tuple[Callable[[RunContents], bool], str, str]] = {
 
 def chosen_formats(names: Sequence[str]) -> list[str]:
     """Returns the formats in names, each once; a name may list several with commas; raises TwinError if unknown."""
-    parts = [part.strip() for name in names for part in name.split(",") if part.strip()]
+    parts, known = (
+        [part.strip() for name in names for part in name.split(",") if part.strip()],
+        [*FORMATS, *PATH_FORMATS],
+    )
     for part in parts:
-        if part not in FORMATS:
-            close = difflib.get_close_matches(part, FORMATS, 1)
+        if part not in known:
+            close = difflib.get_close_matches(part, known, 1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
-            raise TwinError("--to", f"{part[:40]!r} is not a format{hint}", ", ".join(FORMATS))
+            raise TwinError("--to", f"{part[:40]!r} is not a format{hint}", ", ".join(known))
     if not parts:
-        raise TwinError("--to", "is missing", ", ".join(FORMATS))
+        raise TwinError("--to", "is missing", ", ".join(known))
     return list(dict.fromkeys(parts))
 
 

@@ -8,18 +8,17 @@ import uuid
 from collections.abc import Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from twin.core.georeference import Georeference
 from twin.core.records import Array
 from twin.core.user_files import MOST_IMAGE_BYTES, read_bytes
 from twin.datasets.calibration import RecordedCamera
 from twin.datasets.image_copy import copy_all
 from twin.datasets.run_contents import RecordedFrame, RunContents
 from twin.exports.attitude import yaw_pitch_roll_deg
+from twin.exports.geographic_place import WGS84, Place, place_of, transformed
 
 VERSION = "v2.1.0"
 _START = datetime(1970, 1, 1, tzinfo=UTC)  # a run has no date
@@ -43,9 +42,6 @@ _RECORDED = {
     "image-sensor": {"name": "stereo camera"},
     "image-quality": "processed",
 }
-_WGS84 = "EPSG:4326"
-_UTM_LATITUDES = -80.0, 84.0  # [deg]
-_LINE_M = 100.0  # length of the line to the grid north of the scene whose direction is transformed
 _LOCAL = (
     " The file cannot state where on the Earth the images are: positions and orientations are local (metres, z up), in"
     " image-acquisition-settings, and yaw counts from the y axis."
@@ -61,7 +57,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     date. For a replay, the images are recorded ones of "unknown" platform, licence and copyright.
     """
     path = contents.trajectories["final"] if "final" in contents.trajectories else contents.poses
-    items, place = dict[str, Any](), _place(contents.georeference)
+    items, place = dict[str, Any](), place_of(contents.georeference)
     for image in copy_all(contents, folder / "images"):
         pose = path.world_from_camera[image.frame.index] @ contents.believed.left_from(image.camera)
         items[image.file.name] = _item(place, image.frame, image.file, pose)
@@ -71,7 +67,7 @@ def export(contents: RunContents, folder: Path) -> list[Path]:
     return [target, folder / "images"]
 
 
-def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
+def _header(contents: RunContents, place: Place | None) -> dict[str, Any]:
     identifier = _uuid(f"{contents.name} {json.dumps(contents.scenario, sort_keys=True, default=str)}".encode())
     header: dict[str, Any] = {
         "image-set-name": contents.name,
@@ -98,7 +94,7 @@ def _header(contents: RunContents, place: _Place | None) -> dict[str, Any]:
         header |= {"image-platform": {"name": f"{vehicle}, simulated"}}
     if place is None:
         return header | {"image-abstract": header["image-abstract"] + _LOCAL}
-    return header | {"image-coordinate-reference-system": _WGS84}
+    return header | {"image-coordinate-reference-system": WGS84}
 
 
 def _illumination(scenario: Mapping[str, Any]) -> str:
@@ -120,7 +116,7 @@ def _calibration(camera: RecordedCamera) -> dict[str, Any]:
     }
 
 
-def _item(place: _Place | None, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
+def _item(place: Place | None, frame: RecordedFrame, image: Path, pose: Array) -> dict[str, Any]:
     digest = hashlib.sha256(read_bytes(image, most_bytes=MOST_IMAGE_BYTES)).hexdigest()
     time = _START + timedelta(seconds=frame.time_s)
     turn = np.eye(3) if place is None else place.north_from_scene
@@ -136,45 +132,7 @@ def _item(place: _Place | None, frame: RecordedFrame, image: Path, pose: Array) 
     }
 
 
-class _Place(NamedTuple):
-    origin: Georeference  #: position of the scene in its CRS
-    zone: str  #: UTM zone, for example "33N"
-    epsg: int  #: EPSG code of the zone on WGS 84
-    #: (3, 3) rotations from the scene axes to (east, true north, up) and to the grid axes of the zone, at the origin.
-    north_from_scene: Array
-    utm_from_scene: Array
-
-
-def _transformed(source: str, target: str, x: ArrayLike, y: ArrayLike) -> Array:
-    from rasterio.warp import transform
-
-    return np.column_stack(transform(source, target, np.atleast_1d(x), np.atleast_1d(y))[:2])
-
-
-def _place(origin: Georeference | None) -> _Place | None:
-    """Returns the place of the scene; None without a projected CRS, or near a pole, where there is no UTM zone."""
-    from rasterio.crs import CRS
-
-    if origin is None or origin.crs_wkt is None or not CRS.from_wkt(origin.crs_wkt).is_projected:
-        return None
-    line = [origin.easting, origin.easting], [origin.northing, origin.northing + _LINE_M / origin.metres_per_unit]
-    longitude, latitude = (float(value) for value in _transformed(origin.crs_wkt, _WGS84, *line)[0])
-    if not _UTM_LATITUDES[0] <= latitude < _UTM_LATITUDES[1]:
-        return None
-    number = int((longitude + 180) % 360 // 6) + 1
-    epsg = (32600 if latitude >= 0 else 32700) + number
-    local = f"+proj=tmerc +lat_0={latitude} +lon_0={longitude} +datum=WGS84"
-    turns = (_turn(_transformed(origin.crs_wkt, target, *line)) for target in (local, f"EPSG:{epsg}"))
-    return _Place(origin, f"{number}{'N' if latitude >= 0 else 'S'}", epsg, *turns)
-
-
-def _turn(line: Array) -> Array:
-    """Returns the rotation (3, 3) about the vertical that turns the y axis to the direction of a line (2, 2)."""
-    east, north = (line[1] - line[0]) / np.linalg.norm(line[1] - line[0])
-    return np.array([[north, east, 0.0], [-east, north, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _position(place: _Place | None, pose: Array) -> dict[str, Any]:
+def _position(place: Place | None, pose: Array) -> dict[str, Any]:
     """Returns the fields of the position (in EPSG:4326) and the pose (4, 4) (in UTM on WGS 84) of a camera.
 
     Without a place, iFDO has no field for either; both are then settings of the acquisition, in scene coordinates [m].
@@ -185,8 +143,8 @@ def _position(place: _Place | None, pose: Array) -> dict[str, Any]:
         return {"image-acquisition-settings": settings}
     scene, crs = place.origin.from_scene(x, y), place.origin.crs_wkt or ""
     altitude_m = z + place.origin.elevation_m
-    longitude, latitude = _transformed(crs, _WGS84, *scene)[0]
-    easting_m, northing_m = _transformed(crs, f"EPSG:{place.epsg}", *scene)[0]
+    longitude, latitude = transformed(crs, WGS84, *scene)[0]
+    easting_m, northing_m = transformed(crs, f"EPSG:{place.epsg}", *scene)[0]
     return {
         "image-latitude": round(float(latitude), 9),
         "image-longitude": round(float(longitude), 9),

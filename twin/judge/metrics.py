@@ -56,6 +56,7 @@ class EvaluationInput:
     warnings: Sequence[str] = ()  #: sentences on limits of the simulation or the data set
     idealisations: Sequence[str] = ()  #: sentences on effects of a real survey that the scenario leaves out
     water: Mapping[str, float] = field(default_factory=dict)  #: visibility_m and secchi_m of a survey
+    stated_input: Mapping[str, Any] = field(default_factory=dict)  #: input statement of the files of the floor
     actions: ActionTimes = ActionTimes()  #: durations for which the mission slowed and stopped the vehicle
     gaps: Gaps = Gaps()
     energy: Energy = Energy()
@@ -101,6 +102,7 @@ def _contents(survey: EvaluationInput, sections: dict[str, Any], warnings: Seque
         "warning": " ".join(found),
         "idealisations": list(survey.idealisations),
         "water": metrics["water"] | finite_tree(dict(survey.water)),
+        "input": finite_tree(dict(survey.stated_input)),
         "require": judge_requirements(survey.require, metrics),
     }
 
@@ -183,6 +185,7 @@ def empty_metrics() -> dict[str, Any]:
         "schema": SCHEMA,
         **dict.fromkeys(_IDENTITY),
         **{"warnings": [], "warning": "", "idealisations": [], "water": {"visibility_m": None, "secchi_m": None}},
+        "input": {},
         **finite_tree(_sections(survey, truth)),
         "timing": _timing({"stages": Stopwatch().summary()}, 0, 0),
         "require": {},

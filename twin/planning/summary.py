@@ -289,6 +289,7 @@ def as_json(summary: PlanSummary, picture: str) -> dict[str, Any]:
             "floor": {key: values._asdict() for key, values in floor_spreads(summary).items()},
             "coverage": summary.floor.coverage,
             "holes": _holes(mission),
+            "input": mission.stated_input,
             "expected": _predicted_metrics(summary.floor, summary.error),
             "require": summary.require,
             "latency": summary.latency and summary.latency._asdict(),

@@ -20,6 +20,12 @@ _TRACK = {"track": 0} | dict.fromkeys(
     ("before_ga_rmse_m", "after_ga_rmse_m", "farthest_error_m", "ga_ms", "nodes", "edges")
 )
 _TASK = {"name": "", "track": 0} | dict.fromkeys((*MAP_KEYS, "area_map_le90_m", "error_before_m", "error_after_m"))
+#: Input statement of a floor that was read from files (`twin.terrains.input_statement`).
+_INPUT = {
+    **dict.fromkeys(("file", "crs", "spacing_evidence", "unit_evidence", "direction", "direction_evidence"), ""),
+    **dict.fromkeys(("spacing_m", "metres_per_unit", "least", "greatest", "share_without_height"), 0.0),
+    **{"ground_scale": None, "nodata": "", "texture": "", "doubts": [""]},
+}
 _INDEX = {
     "frames": [0],
     "tracks": [0],
@@ -37,6 +43,8 @@ def checked_metrics(metrics: Any) -> dict[str, Any]:
     optional = dict.fromkeys(("version", "scenario_hash", "reason", "warning", "schema"), _OptionalText)
     sentences = {"warnings": [""], "idealisations": [""]}
     require = {_ANY: {"value": None, "limit": 0.0, "passed": False}}
+    if isinstance(metrics, dict) and metrics.get("input"):
+        template |= {"input": _INPUT}
     return conform(
         metrics,
         template | texts | optional | sentences | {"tracks": [_TRACK], "tasks": [_TASK], "require": require},

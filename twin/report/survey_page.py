@@ -15,6 +15,7 @@ from twin.core.user_files import read_text
 from twin.report.headline import REPLAY_ALIGNMENTS, badge, closed_form_comparison, first_lines, headline, key_figures
 from twin.report.html import render_page
 from twin.report.images import jpeg_bytes, read_rgb
+from twin.report.input_rows import input_rows
 from twin.report.mesh_picture import surface_picture
 from twin.report.run_folder import SCENARIO_FILE, Run, load_run
 from twin.report.stage_tables import PROCESSING_STAGES, stage_rows, stage_times
@@ -48,6 +49,7 @@ def context(run: Run) -> dict[str, Any]:
         "first_lines": first_lines(metrics) if metrics else [],
         "headline": headline(run.metrics, run.scenario),
         "metrics": metrics,
+        "input": input_rows(metrics.get("input") or {}),
         "key_figures": key_figures(metrics),
         "estimates": [(key, LABELS[key], (metrics.get("trajectory") or {}).get(key)) for key in ESTIMATES],
         "stages": [(row, LABELS[row.stage]) for row in stage_rows(metrics, run.scenario)],

@@ -147,7 +147,8 @@ class TerrainConfig(Section):
     mesh_scale: float = Field(default=1.0, ge=1e-4, le=1e4)
     """metres per unit of mesh_file"""
     height_file: FilePath | None = None
-    """DEM: GeoTIFF, 16-bit PNG or .npy; in metres unless a GeoTIFF names another unit; ${TWIN_DATA} is expanded"""
+    """DEM: GeoTIFF, ESRI grid (.asc) with its .prj, XYZ grid, 16-bit PNG or .npy; in metres unless a GeoTIFF names
+    another unit; ${TWIN_DATA} is expanded"""
     height_spacing_m: float = Field(default=0.01, gt=0, le=10)
     """grid spacing of a PNG or .npy height file [m]"""
     height_range_m: float = Field(default=1.0, gt=0, le=1000)
@@ -876,8 +877,9 @@ class PlanConfig(Section):
     along_contours: bool = False
     """true: legs along the contours of the sea floor, across its mean slope in the area; replaces heading_deg"""
     polygon: str | tuple[Vector2, ...] | None = None
-    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a GeoJSON file with polygons,
-    with or without holes, in a CRS that it names, in degrees or in that of the DEM; ${TWIN_DATA} is expanded"""
+    """area to cover by legs instead of a rectangle: corners x, y in the scene [m], or a file with polygons, with
+    or without holes: GeoJSON in a CRS that it names, in degrees or in that of the DEM, KML, or a .plan of
+    QGroundControl; ${TWIN_DATA} is expanded"""
     turns: Literal["reverse", "bow_first", "arcs"] = "reverse"
     """reverse: every second leg is flown backwards; bow_first: after each leg the vehicle yaws by 180 deg; arcs: it
     flies bow first at constant speed and turns in arcs, as a vehicle that is steered by fins has to"""

@@ -95,6 +95,7 @@ class FlownSurvey:
             warnings=warnings,
             idealisations=idealisations(scenario),
             water=mission.clarity._asdict(),
+            stated_input=mission.stated_input,
             actions=actions,
             gaps=self.gaps,
             energy=flown_energy(mission, self.truth.trajectory),

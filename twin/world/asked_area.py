@@ -1,4 +1,4 @@
-"""Placement of the survey area in the scene: centre, heading, and polygon from a list or a GeoJSON file."""
+"""Placement of the survey area in the scene: centre, heading, and polygon from a list or a file."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from twin.core.user_files import read_json
 from twin.errors import TwinError
 from twin.scenario.model import PlanConfig
 from twin.terrains import Terrain
+from twin.world.area_files import KEY, MOST_BYTES, kml_polygons, qgc_polygons
 
-_MAX_GEOJSON_BYTES = 10_000_000
 _POLYGONS = "GeoJSON with one Polygon or more"
 _MOST_NODES = 1_000_000  #: of the floor, from which its mean slope is computed
 _LEAST_SLOPE = 1e-3  #: below it, a floor counts as level
@@ -48,7 +48,7 @@ def survey_area(plan: PlanConfig, terrain: Terrain) -> SurveyArea:
                        ("centre_crs", plan.centre_crs is not None)):  # fmt: skip
         if given:
             raise TwinError(f"plan.{key}", f"{getattr(plan, key)!r} has no effect with plan.polygon", "one of the two")
-    polygons = [[plan.polygon]] if not isinstance(plan.polygon, str) else read_geojson(Path(plan.polygon), terrain)
+    polygons = [[plan.polygon]] if not isinstance(plan.polygon, str) else read_area(Path(plan.polygon), terrain)
     area = polygons_area(polygons, heading)
     _check_inside("plan.polygon", area.outline(), terrain)
     return polygons_area(polygons, _contour_heading(area, terrain)) if plan.along_contours else area
@@ -105,21 +105,26 @@ def _check_inside(field: str, points: Array, terrain: Terrain) -> None:
         raise TwinError(field, f"({x:.2f}, {y:.2f}) lies outside the terrain", terrain.extent)
 
 
-def read_geojson(file: Path, terrain: Terrain) -> list[list[Array]]:
-    """Returns, for each polygon of a GeoJSON file, the corners (n, 2) of its outline and of its holes in the scene [m].
+def read_area(file: Path, terrain: Terrain) -> list[list[Array]]:
+    """Returns, for each polygon of a file, the corners (n, 2) of its outline and of its holes in the scene [m].
 
-    The coordinates are in the CRS of the member "crs". Without it they are longitude and latitude (RFC 7946) if the DEM
+    The file is KML (.kml), a plan of QGroundControl (.plan), both in longitude and latitude, or GeoJSON, of which the
+    coordinates are in the CRS of the member "crs". Without it they are longitude and latitude (RFC 7946) if the DEM
     names its CRS, all lie within +-180 and +-90 degrees and, read in the CRS of the DEM, none lies on the DEM;
-    otherwise they are in the CRS of the DEM. Raises TwinError unless the file contains polygons only, whose
-    coordinates can be transformed, and the terrain has coordinates.
+    otherwise they are in the CRS of the DEM. Raises TwinError unless the file contains polygons (GeoJSON: nothing
+    else), whose coordinates can be transformed, and the terrain has coordinates.
     """
-    tree = read_json(file, "plan.polygon", _POLYGONS, _MAX_GEOJSON_BYTES)
-    rings = [[p.exterior, *p.interiors] for p in _polygons(tree, file)]
+    suffix, crs = file.suffix.lower(), _LONGITUDE_LATITUDE
+    if suffix in (".kml", ".plan"):
+        polygons = kml_polygons(file) if suffix == ".kml" else qgc_polygons(file)
+    else:
+        tree = read_json(file, KEY, _POLYGONS, MOST_BYTES)
+        polygons, crs = _polygons(tree, file), _named_crs(tree)
+    rings = [[p.exterior, *p.interiors] for p in polygons]
     corners = shapely.get_coordinates([ring for polygon in rings for ring in polygon])
     if not np.isfinite(corners).all():
-        raise TwinError("plan.polygon", f"{file.name!r} has a coordinate that is not finite", _POLYGONS)
-    origin = _georeference("plan.polygon", terrain)
-    crs = _named_crs(tree)
+        raise TwinError(KEY, f"{file.name!r} has a coordinate that is not finite", "finite numbers")
+    origin = _georeference(KEY, terrain)
     if crs is None and _is_longitude_latitude(corners, terrain, origin):
         crs = _LONGITUDE_LATITUDE
     if crs is not None:

@@ -22,12 +22,14 @@ from twin.errors import TwinError
 from twin.imaging.scene.mesh_raster import DrawnMesh, Target, draw_meshes
 from twin.imaging.scene.object_shadows import FROM_ABOVE
 from twin.imaging.scene.object_view import Objects, draw_objects
-from twin.scenario.model import Scenario
+from twin.scenario.model import Scenario, TerrainConfig
 from twin.terrains.holes import known_nodes
+from twin.terrains.input_statement import InputStatement
 from twin.terrains.objects.coloured_mesh import Mesh, extent, median_edge_m
 from twin.terrains.objects.floor_mesh import FloorTiles, divided, downward_part, levelled, raised, tiles_of, upward_part
 from twin.terrains.objects.mesh_file import TexturedMesh, read_textured_mesh
 from twin.terrains.terrain import texture_shape
+from twin.terrains.vertical_axis import ASSUMED
 from twin.world.top_surface import FROM_BELOW, OVERHANG_M, Layer, TopSurface, row_blocks, true_heights, view_from_above
 
 FIELD = "terrain.mesh_file"
@@ -49,7 +51,8 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     assert t.mesh_file is not None  # `scenario_checks.floor_contradictions`
     file = Path(t.mesh_file)
     y_up = t.mesh_up == "y" or (t.mesh_up is None and file.suffix.lower() == ".glb")
-    whole = _divided(levelled(read_textured_mesh(file, FIELD, y_up), t.mesh_scale), file)
+    read = read_textured_mesh(file, FIELD, y_up)
+    whole = _divided(levelled(read, t.mesh_scale), file)
     grid = _node_grid(whole.mesh, t.grid_m, file)
     top = -_depth([whole.mesh], grid, FROM_ABOVE)
     covered = np.isfinite(top)
@@ -65,7 +68,17 @@ def load_mesh_floor(scenario: Scenario) -> MeshFloor:
     low = _lowest(upward, grid)
     under_m = np.asarray(minimum_filter(np.where(np.isfinite(low), low, top_m), 3) - MARGIN_M, np.float32)
     texture = _texture(drawn, grid, colours, scenario)
-    return MeshFloor(_terrain(top_m, grid, texture, covered), _terrain(under_m, grid, colours, covered), tiles)
+    terrain = replace(_terrain(top_m, grid, texture, covered), stated=_stated(read, t, grid.cell_m, covered))
+    return MeshFloor(terrain, _terrain(under_m, grid, colours, covered), tiles)
+
+
+def _stated(read: TexturedMesh, t: TerrainConfig, spacing_m: float, covered: NDArray[np.bool_]) -> InputStatement:
+    heights, up = read.mesh.vertices_m[:, 2], "by the format of the file" if t.mesh_up is None else "terrain.mesh_up"
+    return InputStatement(
+        Path(t.mesh_file or "").name, "", None, spacing_m, "edges of the mesh, terrain.grid_m", t.mesh_scale,
+        "terrain.mesh_scale" if "mesh_scale" in t.model_fields_set else ASSUMED, "up", up, float(heights.min()),
+        float(heights.max()), "", float(1 - covered.mean()), f"{len(read.images) or 'no'} textures of the mesh",
+    )  # fmt: skip
 
 
 def floor_surface(floor: MeshFloor, grid: MapGrid) -> TopSurface:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,6 +168,11 @@ class Mission:
         share = unknown_share(self.plan, self.terrain)
         area = [f"{100 * share:.3g} % of the asked area has no height and is not part of it."] if share > 0 else []
         return self.terrain.hole_notes + area
+
+    @property
+    def stated_input(self) -> dict[str, Any]:
+        """Returns the input statement of the floor as JSON; {} for a generated floor."""
+        return self.terrain.stated._asdict() if self.terrain.stated else {}
 
     @property
     def tracks(self) -> range:

@@ -1,0 +1,85 @@
+"""Files of a planned path for other programs: QGroundControl, KML, GPX and CSV."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from twin.core.records import Array
+from twin.errors import TwinError
+from twin.exports.planned_path import PlannedPath
+
+# MAVLink: commands and frames of mission items, type of the vehicle, and autopilot (ArduPilot)
+_WAYPOINT, _CHANGE_SPEED = 16, 178
+_RELATIVE_ALTITUDE, _NO_POSITION = 3, 2
+_SUBMARINE, _ARDUPILOT = 12, 3
+_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
+
+
+def write_qgc(path: PlannedPath, file: Path) -> None:
+    """Writes a mission of QGroundControl for ArduSub, whose altitudes are relative to the sea surface.
+
+    The zero of the elevations is taken to be the surface. Raises TwinError if a waypoint is not below it.
+    """
+    if (highest_m := float(path.crs[:, 2].max())) >= 0:
+        problem = f"the path is up to {highest_m:.2f} m above the zero of the elevations, not below the sea surface"
+        raise TwinError("--to qgc", problem, "--origin E,N,H, with H the elevation of z = 0 above the sea surface")
+    items = [_simple_item(_CHANGE_SPEED, _NO_POSITION, [1, path.speed_mps, -1, 0, 0, 0, 0])]
+    rows = np.column_stack([path.holds_s, path.heading_deg.round(2), _geographic(path)]).tolist()
+    for hold_s, heading_deg, longitude, latitude, altitude_m in rows:
+        altitude = round(altitude_m, 3)
+        params = [hold_s, 0, 0, heading_deg, latitude, longitude, altitude]
+        shown = {"AMSLAltAboveTerrain": None, "Altitude": altitude, "AltitudeMode": 1}
+        items.append(shown | _simple_item(_WAYPOINT, _RELATIVE_ALTITUDE, params))
+    mission = {
+        "version": 2, "firmwareType": _ARDUPILOT, "vehicleType": _SUBMARINE, "globalPlanAltitudeMode": 1,
+        "cruiseSpeed": path.speed_mps, "hoverSpeed": path.speed_mps, "plannedHomePosition": [*rows[0][3:1:-1], 0.0],
+        "items": [item | {"doJumpId": number} for number, item in enumerate(items, 1)],
+    }  # fmt: skip
+    tree = {
+        "fileType": "Plan", "version": 1, "groundStation": "QGroundControl", "mission": mission,
+        "geoFence": {"version": 2, "circles": [], "polygons": []}, "rallyPoints": {"version": 2, "points": []},
+    }  # fmt: skip
+    file.write_text(json.dumps(tree, indent=1), encoding="utf-8")
+
+
+def _simple_item(command: int, frame: int, params: list[Any]) -> dict[str, Any]:
+    return {"type": "SimpleItem", "command": command, "frame": frame, "params": params, "autoContinue": True}
+
+
+def write_kml(path: PlannedPath, file: Path) -> None:
+    """Writes KML 2.2 with a line for each track, at elevations above sea level."""
+    places = []
+    for track in sorted(set(path.track.tolist())):
+        points = " ".join(f"{x:.9f},{y:.9f},{height:.3f}" for x, y, height in _geographic(path)[path.track == track])
+        places.append(
+            f"<Placemark><name>track {track}</name><LineString><altitudeMode>absolute</altitudeMode>"
+            f"<coordinates>{points}</coordinates></LineString></Placemark>\n"
+        )
+    head = f'{_XML}<kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{escape(path.name)}</name>\n'
+    file.write_text(f"{head}{''.join(places)}</Document></kml>\n", encoding="utf-8")
+
+
+def write_gpx(path: PlannedPath, file: Path) -> None:
+    """Writes GPX 1.1 with one route; `ele` is the elevation, negative below sea level."""
+    points = "".join(
+        f'<rtept lat="{y:.9f}" lon="{x:.9f}"><ele>{height:.3f}</ele></rtept>\n' for x, y, height in _geographic(path)
+    )
+    head = f'{_XML}<gpx version="1.1" creator="twin" xmlns="http://www.topografix.com/GPX/1/1">'
+    file.write_text(f"{head}<rte><name>{escape(path.name)}</name>\n{points}</rte></gpx>\n", encoding="utf-8")
+
+
+def write_csv(path: PlannedPath, file: Path) -> None:
+    columns = path.track, path.scene_m, path.crs, path.longitude_latitude, path.heading_deg, path.holds_s
+    head = "track,x_m,y_m,z_m,easting,northing,elevation_m,longitude_deg,latitude_deg,heading_deg,hold_s"
+    form = ["%d"] + ["%.3f"] * 6 + ["%.9f"] * 2 + ["%.2f", "%g"]
+    np.savetxt(file, np.column_stack(columns), form, ",", header=head, comments="")
+
+
+def _geographic(path: PlannedPath) -> Array:
+    """Returns longitude, latitude and elevation (n, 3) of the waypoints [deg, deg, m]."""
+    return np.column_stack([path.longitude_latitude, path.crs[:, 2]])
