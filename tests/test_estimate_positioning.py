@@ -564,7 +564,7 @@ class Script:
     def tracking_cov(self):
         return None if self.row == 0 else np.eye(6) * (0.001 * self.row) ** 2
 
-    def restart_tracking(self):
+    def restart_tracking(self, velocity=None):
         pass
 
     def register_with_mosaic(self, world_from_camera):
@@ -606,7 +606,7 @@ class Stumbling(Script):
         self.believed = self.believed @ geometry.exp(np.array([0.0, 0.0, np.deg2rad(30), 0.1, 0.0, 0.0]))
         return constant_velocity_motion(geometry.inverse(before) @ self.believed), "too few points matched"
 
-    def restart_tracking(self):
+    def restart_tracking(self, velocity=None):
         self.believed = self.poses[self.row]
 
     def measure_motions(self, node, others):

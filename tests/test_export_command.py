@@ -575,7 +575,8 @@ def test_images_along_a_path_show_the_floor_from_its_poses(tmp_path):
     first = prepare(scenario).start_of_body @ scenario.believed_rig().body_from_camera
     moved = first @ geometry.exp(np.array([0.0, 0.0, 0.2, 0.1, 0.05, 0.0]))
     path = Trajectory(np.array([7.0, 7.6, 8.0]), np.array([first, moved, moved]))
-    assert render_path(scenario, path, tmp_path / "run", lambda _: None) == 6  # at 5 Hz
+    path.save(tmp_path / "path.tum", digits=12)
+    assert render_path(scenario, tmp_path / "path.tum", tmp_path / "run", lambda _: None) == 6  # at 5 Hz
     run = load_run(tmp_path / "run")
     np.testing.assert_allclose(run.trajectories["truth"].times_s, np.arange(6) / 5)
     third = geometry.log(geometry.inverse(first) @ run.trajectories["truth"].world_from_camera[1])
@@ -595,5 +596,6 @@ def test_images_along_a_path_show_the_floor_from_its_poses(tmp_path):
         "do not increase": Trajectory(path.times_s[::-1].copy(), path.world_from_camera),
     }
     for problem, given in wrong.items():
+        given.save(tmp_path / "wrong.tum")
         with pytest.raises(TwinError, match=problem):
-            render_path(scenario, given, tmp_path / "wrong", lambda _: None)
+            render_path(scenario, tmp_path / "wrong.tum", tmp_path / "wrong", lambda _: None)

@@ -13,7 +13,7 @@ from twin.scenario.file import load_scenario
 from twin.scenario.model import CurrentConfig, Scenario, VehicleConfig, WavesConfig
 from twin.scenario.model_files import VEHICLE
 from twin.simulate.compiled_vehicle import CompiledVehicle
-from twin.simulate.hull import trimmed_hull
+from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.mujoco_vehicle import MujocoVehicle
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import flow_at, make_sea, mean_current_mps
@@ -211,11 +211,7 @@ def integrated(section, sea, start, commands, period_s):
 @pytest.mark.long
 @pytest.mark.parametrize("model", [*VEHICLE.built_in(), "coupled"])
 def test_trajectories_agree_with_an_independent_integration(model):
-    """60 s of random thrust and angles of fins in a sheared, gusty, wavy current: within 1 mm and 0.1 deg.
-
-    The AUV flies 64 m meanwhile; its error of 9 mm and 0.01 deg at the default step falls with the square of the step,
-    so it is compared at an eighth of the step.
-    """
+    """60 s of random thrust and angles of fins in a sheared, gusty, wavy current: within 1 mm and 0.1 deg."""
     if model == "coupled":
         section = coupled(np.random.default_rng(3))
     else:
@@ -224,7 +220,7 @@ def test_trajectories_agree_with_an_independent_integration(model):
     commands = np.random.default_rng(1).uniform(-0.35, 0.35, (120, section.n_commands))
     if section.is_steered_by_fins:
         commands[:, 0] = np.abs(commands[:, 0])  # ahead, so that the fins act
-    body = CompiledVehicle(section, sea_of(), start, 1 / 960 if section.is_steered_by_fins else 1 / 120)
+    body = CompiledVehicle(section, sea_of(), start, physics_timestep_s(30.0, section))
     for command in commands:
         body.step(command, 0.5)
     pose, _ = integrated(section, sea_of(), start, commands, 0.5)

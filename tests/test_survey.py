@@ -130,7 +130,7 @@ def test_frames_contain_only_images_their_exposure_time_readings_and_the_choice_
     fields = {"index", "time_s", "left", "right", "readings", "keyframe", "exposure"}
     assert set(records.Frame.__dataclass_fields__) == fields
     assert set(records.Readings.__dataclass_fields__) == {
-        "pressure_z_m", "ahrs_rpy_rad", "dvl_mps", "usbl_m", "altitude_m", "beacons", "imu", "up",
+        "pressure_z_m", "ahrs_rpy_rad", "dvl_mps", "usbl_m", "altitude_m", "beacons", "imu", "up", "late",
     }  # fmt: skip
 
 

@@ -46,7 +46,7 @@ def flown(mission, rng=None):
     to_camera, found = geometry.adjoint(geometry.inverse(camera)), []
     body = CompiledVehicle(
         mission.scenario.vehicle, make_sea(mission.scenario, rng), mission.start_of_body,
-        physics_timestep_s(rate_hz), start_velocity_mps=mission.start_velocity_mps,
+        physics_timestep_s(rate_hz, mission.scenario.vehicle), start_velocity_mps=mission.start_velocity_mps,
     )  # fmt: skip
     for position, velocity, yaw, acceleration in zip(*planned(mission), strict=True):
         reference = mission.plan.reference(1, 0.0)._replace(

@@ -10,7 +10,7 @@ from twin.core import geometry
 from twin.core.height_field import cast_pixels, height_field, ray_grid
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
-from twin.simulate.sensors import Altimeter
+from twin.simulate.echo_sounders import Altimeter
 from twin.world.floor_following import EchoCorrection, FloorFollower
 from twin.world.height_change import HeightChange
 from twin.world.mission import prepare

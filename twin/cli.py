@@ -121,14 +121,13 @@ def render(
     allow_plugins: AllowPlugins = False,
 ) -> None:
     """Render stereo images and truth along a path, at the frame rate of the rig, for `twin export`."""
-    from twin.datasets.tum import read_trajectory
     from twin.exports.rendered_path import render_path
 
     _require_rendering()
-    scenario, path = api.load_scenario(scene, overrides, allow_plugins), read_trajectory(poses)
+    scenario = api.load_scenario(scene, overrides, allow_plugins)
     folder = outputs.run_folder(scenario) if out is None else outputs.new_folder(out)
     with console.replay_bar() as progress:
-        n = render_path(scenario, path, folder, lambda share: progress("render", share))
+        n = render_path(scenario, poses, folder, lambda share: progress("render", share))
     print(f"{n} stereo pairs: {folder / 'frames'}\nExact truth and data sets: twin export {folder} --list")
 
 

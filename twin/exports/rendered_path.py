@@ -13,6 +13,7 @@ from twin.core.geometry import Array
 from twin.core.output_folder import sole_writer
 from twin.core.records import Frame, Readings, Trajectory
 from twin.core.timing import Stopwatch
+from twin.datasets.tum import read_trajectory
 from twin.errors import TwinError
 from twin.report.frame_recorder import FrameRecorder
 from twin.report.run_writer import RunFolder
@@ -23,18 +24,18 @@ _LEAST_CLEARANCE_M = 0.1  # between a camera and the floor: the near plane of th
 _OPTION = "--poses"
 
 
-def render_path(scenario: Scenario, given: Trajectory, out: Path, progress: Callable[[float], None]) -> int:
+def render_path(scenario: Scenario, poses: Path, out: Path, progress: Callable[[float], None]) -> int:
     """Renders stereo pairs at the frame rate of the rig along a path, and returns their number.
 
-    `given` has poses world_from_camera of the left camera at times [s]; between them, the motion is uniform. The folder
+    `poses` is a TUM file of poses world_from_camera of the left camera; between them, the motion is uniform. The folder
     has all frames without readings, and the true poses: `twin export` writes images and exact truth from it. Raises
-    TwinError if the times do not increase, or a pose is closer than 0.1 m to the floor.
+    TwinError if the file is damaged, its times do not increase, or a pose is closer than 0.1 m to the floor.
     """
     from twin.world.rendered_world import RenderedWorld
 
     with sole_writer(out):
         mission = prepare(scenario)
-        path = _at_frames(given, mission.rig.frame_rate_hz)
+        path = _at_frames(read_trajectory(poses), mission.rig.frame_rate_hz)
         _check_clearance(path, mission)
         twists = _twists(path.world_from_camera, mission.rig.body_from_camera, mission.rig.frame_rate_hz)
         numbers = list(range(len(path)))

@@ -61,7 +61,9 @@ def swath_numbers(
     if yaw is not None:
         off_leg |= is_turning(yaw)
     legs = np.full(len(track), -1)
-    numbered = ~away if yaw is None else ~away & ~is_turning(yaw)
+    numbered = ~away
+    if yaw is not None:  # without arcs, which cross the direction of the legs
+        numbered &= ~(is_turning(yaw) & (np.abs(np.diff(reference, axis=0, append=reference[-1:])).max(axis=1) > 1e-9))
     legs[numbered] = leg_numbers(reference[numbered])
     return np.where(off_leg, -1, legs + np.searchsorted(planned.get("legs_after_gaps", ()), legs, side="right"))
 

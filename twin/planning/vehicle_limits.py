@@ -114,8 +114,9 @@ def _settles(mission: Mission, latency_s: float) -> bool:
     pilot = make_pilot(changed) if fins else RovPilot(changed)
     still = steady_current(np.zeros(3))
     vehicle = CompiledVehicle(
-        scenario.vehicle, still, start, physics_timestep_s(mission.rig.frame_rate_hz), start_velocity_mps=velocity_mps
-    )
+        scenario.vehicle, still, start, physics_timestep_s(mission.rig.frame_rate_hz, scenario.vehicle),
+        start_velocity_mps=velocity_mps,
+    )  # fmt: skip
     camera, start_m, yaw = mission.rig.body_from_camera, mission.start[:3, 3], mission.plan.reference(1, 0.0).yaw
     velocity = mission.plan.speed_mps * start[:3, 0]  # along the bow
     to_camera, excursion_m = geometry.adjoint(geometry.inverse(camera)), 0.0

@@ -44,7 +44,7 @@ class SurrogateWorld(World):
         if scenario.vehicle.dynamics == "rigid":
             vehicle = CompiledVehicle(
                 scenario.vehicle, make_sea(scenario, rng["sea"]), mission.start_of_body,
-                physics_timestep_s(rig.frame_rate_hz), floor_of(mission),
+                physics_timestep_s(rig.frame_rate_hz, scenario.vehicle), floor_of(mission),
                 tether_of(scenario.tether, mission.start_of_body[:3, 3]), mission.start_velocity_mps,
             )  # fmt: skip
         else:

@@ -294,9 +294,10 @@ def _illumination(scenario: Scenario) -> Illumination:
 
 def motion_rate_hz(scenario: Scenario) -> float:
     """Returns the rate of the simulated steps of the vehicle: timesteps or, for a kinematic vehicle, frames."""
-    frame_rate_hz = scenario.rig.frame_rate_hz
-    rigid = scenario.vehicle.dynamics == "rigid"
-    return round(1 / (frame_rate_hz * physics_timestep_s(frame_rate_hz))) * frame_rate_hz if rigid else frame_rate_hz
+    frame_rate_hz, vehicle = scenario.rig.frame_rate_hz, scenario.vehicle
+    if vehicle.dynamics != "rigid":
+        return frame_rate_hz
+    return round(1 / (frame_rate_hz * physics_timestep_s(frame_rate_hz, vehicle))) * frame_rate_hz
 
 
 def _check_beacon(number: int, beacon: BeaconConfig, terrain: terrains.Terrain) -> None:

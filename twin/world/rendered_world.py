@@ -36,7 +36,7 @@ class RenderedWorld(World):
         rig, rng = cameras.rendered_rig, streams(scenario.seed)
         vfov_deg = float(np.rad2deg(2 * np.arctan(rig.height_px / 2 / rig.focal_px)))
         body = scenario.vehicle.mass_kg, scenario.vehicle.inertia_kgm2
-        scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz), *body)
+        scene = build(mission.rendered_terrain, physics_timestep_s(rig.frame_rate_hz, scenario.vehicle), *body)
         vehicle = (
             MujocoVehicle(
                 scene.model,
