@@ -39,6 +39,7 @@ from twin.core.records import (
 from twin.core.settings import EstimatorSettings
 from twin.core.threads import one_blas_thread
 from twin.core.timing import StageTimer, Stopwatch
+from twin.estimate.blind_frames import BlindFrame, aligned, blind_frame
 from twin.estimate.calibration_errors import length_scales
 from twin.estimate.late_readings import ReadingsBetweenNodes, motion_since
 from twin.estimate.mapping.footprint import MapTile, footprint_grid, footprint_tiles, steps_between, with_margin
@@ -104,6 +105,7 @@ class Navigator:
         self.log = PoseLog()
         self._watch, self._between = ReadingWatch(), ReadingsBetweenNodes(rig, noise)
         self._blind: _Blindness | None = None
+        self._blind_frames: list[BlindFrame] = []
 
     def _image_vision(self, folder: Path | None, noise: SensorNoise) -> StereoVision:
         if folder is None:
@@ -156,11 +158,16 @@ class Navigator:
         velocity_mps = frame.readings.dvl_mps
         if measured and blind is not None:
             motion, frame, interval_s = self._after_blindness(blind, motion, frame)
+        since_node = self.filter.since_node, self.filter.since_node_cov
         moved = self.filter.advance(motion, frame.readings, interval_s, measured)
+        moved_since = self.filter.since_node, self.filter.since_node_cov
         if frame.readings.dvl_mps is None and velocity_mps is not None:
             self.filter.dvl.resume(velocity_mps)
         self.filter.fuse_vertical(frame.readings)
         frame = replace(frame, readings=self.filter.without_rejected(frame.readings, rejected))
+        if not measured:
+            guessed = frame.readings.dvl_mps is None and self.network.noise.imu is None
+            self._blind_frames.append(blind_frame(len(self.log), since_node, moved_since, frame.readings, guessed))
         step = motion.a_from_b if measured else geometry.inverse(last) @ self.filter.world_from_camera
         self._blind, n_keyframes = None if measured else blind, len(self.network.keyframes)
         if status in REPEATS:
@@ -371,6 +378,7 @@ class Navigator:
         final = log.online.array
         if self.settings.use_ga and len(rows):
             final = interpolate_between_keyframes(log.steps.array, log.variances.array, rows, self.network.poses)
+            final = aligned(final, self._blind_frames, set(rows.tolist()), self.rig, self.network.noise)
         return SurveyResult(
             f2f=Trajectory(times_s, log.f2f.array),
             online=Trajectory(times_s, log.online.array),
