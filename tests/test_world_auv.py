@@ -186,7 +186,7 @@ def test_arcs_need_fins_and_fins_that_can_turn():
 def test_surveys_by_the_surrogate_and_rendered_are_complete(tmp_path, sets):
     metrics = survey.run(load_scenario("auv", sets), tmp_path / "run", outputs=()).metrics
     assert metrics["status"] == "complete"
-    assert metrics["trajectory"]["final"]["rmse_m"] < 0.04 and metrics["control"]["cross_track_rmse_m"] < 0.12
+    assert metrics["trajectory"]["final"]["ate_rmse_m"] < 0.04 and metrics["control"]["cross_track_rmse_m"] < 0.12
 
 
 def test_the_start_points_along_the_velocity_through_the_mean_current():
