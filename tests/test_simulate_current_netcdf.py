@@ -6,6 +6,7 @@ import pytest
 from twin.errors import TwinError
 from twin.scenario.model import CurrentConfig, Scenario, SunConfig
 from twin.simulate.sea import flow_at, make_sea
+from twin.world.scenario_checks import contradictions
 
 xarray = pytest.importorskip("xarray")
 pytest.importorskip("h5netcdf")
@@ -13,6 +14,7 @@ pytest.importorskip("h5netcdf")
 LONGITUDES, LATITUDES = np.array([-3.5, -3.25, -3.0]), np.array([54.0, 54.25])
 DEPTHS, HOURS = np.array([2.0, 8.0, 11.5, 14.0]), np.array([0, 1, 3])
 START = np.datetime64("2026-05-01T06:00:00", "ns")
+UNUSED = "file_start", "file_place_deg"
 EAST, NORTH, UP = (f"{way}_sea_water_velocity" for way in ("eastward", "northward", "upward"))
 
 
@@ -114,7 +116,7 @@ def test_levels_have_the_direction_and_reference_that_the_file_states(tmp_path, 
     expected = sea_of(csv_of(data, tmp_path))
     attributes = {"standard_name": name, "units": "m"} | ({"positive": positive} if positive else {})
     data["lev"] = ("lev", values, attributes)
-    sea = sea_of(written(data, tmp_path), depth_m=12.5 if name == "depth" else 0.0)
+    sea = sea_of(written(data, tmp_path), depth_m=12.5)
     shift = 3.0 if name == "height_above_sea_floor" else 0.0
     np.testing.assert_array_equal(sea.heights_m, expected.heights_m + shift)
     assert sea.mean_mps.tobytes() == expected.mean_mps.tobytes()
@@ -124,10 +126,11 @@ def test_packed_values_are_unpacked_and_levels_below_the_floor_left_out(tmp_path
     data = model_of(places=False)
     for name in "uvw":
         data[name] = np.round(data[name], 3)
-        data[name][:, 3] = np.nan if name != "v" else 30.0  # a fill value that is not declared
+    data["u"][:, 3] = np.nan
+    data["v"][:, 2] = 30.0  # a fill value that is not declared
     packing = {"dtype": "int16", "scale_factor": 0.001, "_FillValue": -32768}
     sea = sea_of(written(data, tmp_path, encoding={name: packing for name in "uvw"}))
-    expected = sea_of(csv_of(data.isel(lev=slice(0, 3)), tmp_path))
+    expected = sea_of(csv_of(data.isel(lev=slice(0, 2)), tmp_path))
     np.testing.assert_array_equal(sea.heights_m, expected.heights_m)
     np.testing.assert_allclose(sea.mean_mps, expected.mean_mps, atol=1e-15)
 
@@ -178,6 +181,21 @@ def test_a_file_of_another_form_is_refused_in_one_line(tmp_path, change, keys, p
     with pytest.raises(TwinError, match=problem) as caught:
         sea_of(file, **keys)
     assert "\n" not in str(caught.value)
+
+
+def test_a_table_of_too_many_values_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("twin.simulate.current_netcdf._MOST_VALUES", 11)
+    with pytest.raises(TwinError, match="u has .*'time': 3, 'lev': 4"):
+        sea_of(written(model_of(places=False), tmp_path))
+
+
+def test_keys_of_netcdf_without_such_a_file_are_errors():
+    keys = CurrentConfig(velocity_mps=(0.1, 0, 0), file_start="2026-05-01T06:00", file_place_deg=(1.0, 2.0))
+    found = [str(error) for error in contradictions(Scenario(current=keys))]
+    assert found == [f"current.{key}: is unused: current.file is not NetCDF (allowed: a file *.nc)" for key in UNUSED]
+    assert not list(
+        contradictions(Scenario(current=keys.model_copy(update={"velocity_mps": (0, 0, 0), "file": "x.nc"})))
+    )
 
 
 @pytest.mark.parametrize(("keys", "problem"), [

@@ -168,9 +168,8 @@ def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
             ("turning radius", f"{radii[0]:.1f} m as planned, {radii[1]:.1f} m at full rudder"),
             ("endurance", f"{limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
         ]
-    supply = [] if limits.voltage_v is None else [("supply voltage", f"{limits.voltage_v:g} V")]
     return [
-        *supply,
+        *([] if limits.voltage_v is None else [("supply voltage", f"{limits.voltage_v:g} V")]),
         ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
         ("righting moment", f"{limits.righting_nm_per_deg:.3f} N m per degree"),
         ("top speed", of_axes(limits.speeds_mps, "m/s", 2)),

@@ -77,11 +77,10 @@ FilePath = Annotated[str, AfterValidator(_path)]
 
 def _instant(text: str) -> str:
     try:
-        if datetime.fromisoformat(text).tzinfo is None:
-            return text
+        datetime.strptime(text, "%Y-%m-%dT%H:%M")
     except ValueError:
-        pass
-    raise PydanticCustomError("instant", "an instant in UTC, as 2026-05-01T06:00")
+        raise PydanticCustomError("instant", "an instant in UTC, as 2026-05-01T06:00") from None
+    return text
 
 
 Instant = Annotated[str, AfterValidator(_instant)]
@@ -391,9 +390,7 @@ class VehicleConfig(Section):
     @classmethod
     def _require_curves(cls, value: float | None, info: ValidationInfo) -> float | None:
         known = [curve.voltage_v for curve in info.data.get("thrust_curves", ())]
-        if value is not None and not (
-            known == sorted(set(known)) and min(known, default=0) <= value <= max(known, default=0)
-        ):
+        if value is not None and (known != sorted(set(known)) or not known or not known[0] <= value <= known[-1]):
             raise PydanticCustomError(
                 "voltage", "within those of thrust_curves, which increase: {known}", {"known": known}
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -66,17 +65,12 @@ def _columns(data: Any, current: CurrentConfig, depth_m: float) -> list[Any]:
             raise TwinError(_KEY, problem, f"velocities along time and level, with {_PLACE_KEY} if at several places")
     if time not in parts[0].dims:
         return [0 * heights_m, heights_m, *parts]
-    start = data[time].values.min()
-    if current.file_start is not None:
-        start = np.datetime64(datetime.fromisoformat(current.file_start))
+    start = np.datetime64(current.file_start or data[time].values.min())
     return [(data[time] - start) / np.timedelta64(1, "s"), heights_m, *parts]
 
 
 def _named(data: Any, name: str, dims: Iterable[str] | None = None) -> list[Any]:
-    """Returns the variable with a standard name along no other dimensions than `dims`, as a list of one or none.
-
-    Raises ValueError if there are several, or the units are not those allowed.
-    """
+    """Returns a list of the variable with a standard name along no other dimensions than `dims`, empty without one."""
     named = [data[key] for key, variable in data.variables.items() if variable.attrs.get("standard_name") == name]
     found = [variable for variable in named if dims is None or set(variable.dims) <= set(dims)]
     units = [variable.attrs.get("units") for variable in found]
