@@ -1,5 +1,7 @@
 """Motion of the water: statistics of gusts and waves, closed forms, gradients, and trajectories in it (DOP853)."""
 
+import sys
+
 import numpy as np
 import pytest
 from physics_world import bare_model
@@ -150,8 +152,8 @@ def test_a_current_file_is_interpolated_over_time_and_height(tmp_path):
     ("time_s,height_m,east_mps\n0,0,1\n", "has no column north_mps"),
     ("time_s,height_m,east_mps,north_mps\n0,0,1,nan\n", "no number in row 2"),
     ("time_s,height_m,east_mps,north_mps\n0,0,1,x\n", "cannot be read"),
-    ("time_s,height_m,east_mps,north_mps\n0,0,1,1\n0,1,1,1\n1,0,1,1\n", "has 3 rows for 2 times and 2 heights"),
-    ("time_s,height_m,east_mps,north_mps\n", "has 0 rows"),
+    ("time_s,height_m,east_mps,north_mps\n0,0,1,1\n0,1,1,1\n1,0,1,1\n", "has 3 velocities for 2 times and 2 heights"),
+    ("time_s,height_m,east_mps,north_mps\n", "has 0 velocities"),
     ("", "cannot be read"),
 ])  # fmt: skip
 def test_a_damaged_current_file_is_refused(tmp_path, text, problem):
@@ -159,6 +161,12 @@ def test_a_damaged_current_file_is_refused(tmp_path, text, problem):
     file.write_text(text)
     with pytest.raises(TwinError, match=problem):
         make_sea(Scenario(current=CurrentConfig(file=str(file))))
+
+
+def test_a_netcdf_file_without_its_packages_names_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "xarray", None)
+    with pytest.raises(TwinError, match=r"current.file: needs the package xarray.*seabed-twin\[ocean\]"):
+        make_sea(Scenario(current=CurrentConfig(file=str(tmp_path / "current.nc"))))
 
 
 def test_a_neutral_vehicle_without_thrust_follows_an_accelerating_uniform_current():

@@ -37,6 +37,7 @@ class VehicleLimits:
     """Limits of a rigid vehicle in still water, and energy of the planned survey in its mean current."""
 
     title: str
+    voltage_v: float | None  #: stated supply voltage of the thrusters
     buoyancy_n: float  #: net buoyancy, positive upwards
     righting_nm_per_deg: float  #: moment that turns a tilted vehicle back
     speeds_mps: dict[str, float]  #: top speed by direction: the first thruster saturates
@@ -67,6 +68,7 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
     directions = np.column_stack([np.cos(_BEARINGS), np.sin(_BEARINGS), np.zeros_like(_BEARINGS)])
     return VehicleLimits(
         title=vehicle.title,
+        voltage_v=vehicle.voltage_v,
         buoyancy_n=hull.buoyancy_n - hull.weight_n,
         righting_nm_per_deg=math.radians(hull.buoyancy_n * float(hull.centre_of_buoyancy_m[2])),
         speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in axes.items()},
@@ -167,6 +169,7 @@ def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
             ("endurance", f"{limits.cruise_h:.1f} h at {limits.speed_mps:g} m/s"),
         ]
     return [
+        *([] if limits.voltage_v is None else [("supply voltage", f"{limits.voltage_v:g} V")]),
         ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
         ("righting moment", f"{limits.righting_nm_per_deg:.3f} N m per degree"),
         ("top speed", of_axes(limits.speeds_mps, "m/s", 2)),

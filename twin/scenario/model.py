@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Mapping
 from dataclasses import fields
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self, get_type_hints
@@ -55,6 +56,8 @@ SixNumbers = tuple[Coordinate, Coordinate, Coordinate, Coordinate, Coordinate, C
 Matrix6 = tuple[SixNumbers, SixNumbers, SixNumbers, SixNumbers, SixNumbers, SixNumbers]
 PerMetre = Annotated[Number, Field(ge=0, le=100)]
 OffAxisDeg = Annotated[Number, Field(ge=0, le=90)]
+LongitudeDeg = Annotated[Number, Field(ge=-180, le=360)]
+LatitudeDeg = Annotated[Number, Field(ge=-90, le=90)]
 WhiteGain = Annotated[Number, Field(ge=1, le=16)]
 Latency = Annotated[Number, Field(ge=0, le=5)]
 BlurPx = Annotated[Number, Field(ge=0, le=2)]
@@ -70,6 +73,17 @@ def _path(text: str) -> str:
 
 
 FilePath = Annotated[str, AfterValidator(_path)]
+
+
+def _instant(text: str) -> str:
+    try:
+        datetime.strptime(text, "%Y-%m-%dT%H:%M")
+    except ValueError:
+        raise PydanticCustomError("instant", "an instant in UTC, as 2026-05-01T06:00") from None
+    return text
+
+
+Instant = Annotated[str, AfterValidator(_instant)]
 
 
 _NUMBER_KINDS: dict[Any, Literal["int_type", "float_type"]] = {
@@ -210,6 +224,23 @@ class ThrusterConfig(Section):
         return value
 
 
+def _rising(table: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+    commands, thrusts = [row[0] for row in table], [row[1] for row in table]
+    rising = all(a < b for a, b in pairwise(commands)) and all(a <= b for a, b in pairwise(thrusts))
+    if not (rising and commands and commands[0] == -1 and commands[-1] == 1 and thrusts[0] < 0 < thrusts[-1]):
+        raise PydanticCustomError("thrust_table", "increasing pairs from command -1 (thrust below 0) to 1 (above 0)")
+    return table
+
+
+class ThrustCurveConfig(Section):
+    """Thrust at rest and electrical power of a thruster at one supply voltage."""
+
+    voltage_v: Positive
+    """supply voltage [V]"""
+    table: Annotated[tuple[tuple[Number, Number, Coefficient], ...], AfterValidator(_rising)] = Field(max_length=1000)
+    """commands from -1 to 1, thrusts [N] and powers [W], interpolated linearly"""
+
+
 class FinConfig(Section):
     """Fin or lifting part of a hull, in the axes of the body; its chord is along the x axis at an angle of 0.
 
@@ -299,6 +330,11 @@ class VehicleConfig(Section):
     first; unused with thrust_table"""
     thrust_table: tuple[tuple[Number, Number], ...] = Field(default=(), max_length=1000)
     """thrust at rest: pairs of command and thrust [N], interpolated linearly; replaces thrust_coefficients"""
+    thrust_curves: tuple[ThrustCurveConfig, ...] = Field(default=(), max_length=32)
+    """thrust and power at different supply voltages; used with voltage_v"""
+    voltage_v: float | None = None
+    """supply voltage, for which thrust and power are interpolated linearly between thrust_curves; they replace
+    thrust_table, thrust_coefficients and power_coefficient; default: these hold [V]"""
     thruster_lag: tuple[tuple[Number, ...], tuple[Number, ...]] = ((6136.0, 108700.0), (1.0, 89.0, 9258.0, 108700.0))
     """transfer function from steady to actual thrust: coefficients of numerator and denominator, that of the highest
     power of s first"""
@@ -347,12 +383,16 @@ class VehicleConfig(Section):
 
     @field_validator("thrust_table")
     @classmethod
-    def _require_increasing(cls, value: tuple[tuple[float, float], ...]) -> tuple[tuple[float, float], ...]:
-        commands, thrusts = [u for u, _ in value], [n for _, n in value]
-        rising = all(a < b for a, b in pairwise(commands)) and all(a <= b for a, b in pairwise(thrusts))
-        if value and not (rising and commands[0] == -1 and commands[-1] == 1 and thrusts[0] < 0 < thrusts[-1]):
+    def _require_increasing(cls, value: tuple[tuple[float, float], ...]) -> Any:
+        return value and _rising(value)
+
+    @field_validator("voltage_v")
+    @classmethod
+    def _require_curves(cls, value: float | None, info: ValidationInfo) -> float | None:
+        known = [curve.voltage_v for curve in info.data.get("thrust_curves", ())]
+        if value is not None and (known != sorted(set(known)) or not known or not known[0] <= value <= known[-1]):
             raise PydanticCustomError(
-                "thrust_table", "increasing pairs from command -1 (thrust below 0) to 1 (above 0)"
+                "voltage", "within those of thrust_curves, which increase: {known}", {"known": known}
             )
         return value
 
@@ -698,8 +738,12 @@ class CurrentConfig(Section):
     """log: roughness length of the sea floor; 0.05 over reefs (Lentz et al. 2017) [m]"""
     file: FilePath | None = None
     """measured or modelled current, which replaces velocity_mps and profile: CSV with the columns time_s, height_m,
-    east_mps, north_mps and, if known, up_mps; interpolated linearly, constant after its last time.
-    It covers the duration of the legs and, with more than one height, the heights of the path"""
+    east_mps, north_mps and, if known, up_mps, or NetCDF (.nc) of the CF convention; interpolated linearly, constant
+    after its last time. It covers the duration of the legs and, with more than one height, the heights of the path"""
+    file_start: Instant | None = None
+    """NetCDF: start of the survey in UTC, as 2026-05-01T06:00; default: the first time of the file"""
+    file_place_deg: tuple[LongitudeDeg, LatitudeDeg] | None = None
+    """NetCDF: longitude and latitude of the survey, where the file has several places; the nearest is taken [deg]"""
     gust_mps: float = Field(default=0.0, ge=0, le=2)
     """gusts: standard deviation of the velocity to the east, and to the north [m/s]"""
     gust_vertical_mps: float | None = Field(default=None, ge=0, le=2)
@@ -712,6 +756,10 @@ class CurrentConfig(Section):
     """period of the tide; 12.42: semi-diurnal lunar [h]"""
     tide_phase_deg: float = Field(default=0.0, ge=-360, le=360)
     """phase of the tide at the start; 0: greatest current along tide_mps [deg]"""
+
+    @property
+    def is_netcdf(self) -> bool:
+        return self.file is not None and self.file.lower().endswith(".nc")
 
     @property
     def is_still(self) -> bool:

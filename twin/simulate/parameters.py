@@ -36,6 +36,9 @@ def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
     along = np.array([thruster.direction for thruster in vehicle.thrusters], float)
     directions = along * np.sqrt(1 / (along**2).sum(axis=1, keepdims=True))
     numerator, denominator = (np.array(part, float) for part in vehicle.thruster_lag)
+    table = np.array(vehicle.thrust_table, float).reshape(-1, 2).T
+    if vehicle.voltage_v is not None:
+        table = thrust_and_power(vehicle, vehicle.voltage_v)[:2]
     return VehicleParameters(
         mass_kg=vehicle.mass_kg,
         inertia_kgm2=np.array(vehicle.inertia_kgm2),
@@ -46,11 +49,21 @@ def parameters_of(vehicle: VehicleConfig) -> VehicleParameters:
         drag_centre_m=np.array(vehicle.drag_centre_m, float),
         thrust_configuration=np.vstack([directions.T, np.cross(positions, directions).T]),
         thrust_coefficients=np.array(vehicle.thrust_coefficients, float),
-        thrust_table=np.array(vehicle.thrust_table, float).reshape(-1, 2).T.copy(),
+        thrust_table=table.copy(),
         thruster_lag=(numerator / denominator[0], denominator / denominator[0]),
         half_size_m=np.array(vehicle.size_m) / 2,
         hull_centre_m=np.array(vehicle.hull_centre_m, float),
     )
+
+
+def thrust_and_power(vehicle: VehicleConfig, voltage_v: float) -> Array:
+    """Returns commands, thrusts [N] and powers [W] (3, m) of a thruster: linear between the voltages of its curves."""
+    tables = [np.array(curve.table).T for curve in vehicle.thrust_curves]
+    voltages = [curve.voltage_v for curve in vehicle.thrust_curves]
+    command = np.unique(np.concatenate([table[0] for table in tables]))
+    weights = [np.interp(voltage_v, voltages, unit) for unit in np.eye(len(tables))]
+    at_commands = [[np.interp(command, table[0], row) for row in table[1:]] for table in tables]
+    return np.vstack([command, np.tensordot(weights, at_commands, axes=1)])
 
 
 def _matrix(diagonal: Sequence[float], full: Sequence[Sequence[float]] | None) -> Array:

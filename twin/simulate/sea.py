@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -36,7 +37,7 @@ def make_sea(scenario: Scenario, rng: np.random.Generator | None = None) -> Sea:
     Raises TwinError if the file of the current cannot be read, or waves have no depth.
     """
     current = scenario.current
-    times_s, heights_m, mean_mps = _mean(current)
+    times_s, heights_m, mean_mps = _mean(current, scenario.waves.depth_m or scenario.sun.depth_m)
     rate = 2 * math.pi / (3600 * current.tide_period_h)
     tide = np.array([*current.tide_mps, rate, math.radians(current.tide_phase_deg)])
     return Sea(
@@ -52,9 +53,9 @@ def steady_current(velocity_mps: Array) -> Sea:
     return Sea(np.zeros(1), np.zeros(1), mean, np.zeros(4), np.zeros((0, 3)), CALM, single_gusts(0))
 
 
-def _mean(current: CurrentConfig) -> tuple[Array, Array, Array]:
+def _mean(current: CurrentConfig, depth_m: float) -> tuple[Array, Array, Array]:
     if current.file is not None:
-        return read_current(current.file)
+        return read_current(current, Path(current.file), depth_m)
     velocity = np.array(current.velocity_mps, float)
     if current.profile == "uniform":
         return np.zeros(1), np.zeros(1), velocity.reshape(1, 1, 3)

@@ -162,6 +162,9 @@ def _of_sea(scenario: Scenario) -> Iterator[TwinError]:
     if current.file is not None:
         problem = "is unused: current.file has the mean current"
         yield from keys_without_effect("current", current, ("velocity_mps", "profile"), problem, "one of the two")
+    if not current.is_netcdf:
+        problem = "is unused: current.file is not NetCDF"
+        yield from keys_without_effect("current", current, ("file_start", "file_place_deg"), problem, "a file *.nc")
     if current.profile == "log" and current.roughness_m >= current.reference_height_m:
         problem = f"{current.roughness_m:g}: the current vanishes at current.reference_height_m"
         yield TwinError("current.roughness_m", problem, f"below {current.reference_height_m:g}")
