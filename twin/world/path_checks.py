@@ -107,6 +107,17 @@ def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearan
     return Clearance(float(gap[k]), float(x[k]), float(y[k]), inside)
 
 
+def room_below_m(plan: SurveyPlan, asked: PlanConfig, chart: Terrain, top: Terrain, beside_m: float) -> float:
+    """Returns by how much a path that is shifted by up to `beside_m` may be lowered, for `plan.clearance_m` [m].
+
+    `chart` is the known floor, `top` this floor with its objects.
+    """
+    x, y, z = plan.all_references().position.T
+    reach_m = VEHICLE_REACH_M + beside_m + (asked.clearance_m if plan.follows_floor else 0.0)
+    least_m = min(_clearance(plan, asked, chart).least_m, (z - highest_near(top, x, y, reach_m)).min())
+    return float(least_m) - asked.clearance_m
+
+
 def highest_near(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array:
     """Returns the height (n,) of the highest floor within a horizontal distance of each of n points.
 
