@@ -1,6 +1,7 @@
 """A controller plug-in changes path and pace: smoothly, within limits, clear of the floor; its faults are named."""
 
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,6 +12,7 @@ from twin import survey
 from twin.core.records import Frame, Readings
 from twin.plugin.protocols import LEAST_PACE, MOST_OFFSET_M, Adaptation
 from twin.session.plugin_adaptation import PluginAdaptation
+from twin.world.floor_following import FloorFollower
 from twin.world.mission import prepare
 from twin.world.mission_flight import Flight
 
@@ -146,8 +148,8 @@ def test_offset_and_pace_are_limited(mission):
     y, z = found.position[-1, 1:] - mission.plan.all_references().position[-1, 1:]
     assert np.hypot(0.0, y) == pytest.approx(MOST_OFFSET_M, abs=0.01) and z == pytest.approx(MOST_OFFSET_M, abs=0.01)
     assert found.n < 1.1 * len(mission.plan.all_references().position) / LEAST_PACE
-    edge = flown(prepare(scenario("plan.centre_m=[0.0,2.2]", "plan.altitude_m=1.5")), np.array([0.0, 3.0, 0.0]))
-    assert edge.position[:, 1].max() <= chart.north_m
+    edge = flown(prepare(scenario("plan.centre_m=[0.0,2.4]", "plan.tracks=0")), np.array([0.0, 3.0, 0.0])).position
+    assert chart.north_m - 0.01 < edge[:, 1].max() <= chart.north_m
 
 
 def test_a_path_is_not_lowered_or_shifted_into_the_floor(mission):
@@ -158,6 +160,27 @@ def test_a_path_is_not_lowered_or_shifted_into_the_floor(mission):
         around = found[:, None, :2] + 0.4 * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=-1)
         assert (found[:, 2:] - heights(around[..., 0], around[..., 1])).min() >= 0.9 - 1e-6
     assert found[:, 2].min() >= path[:, 2].min() - 0.5
+
+
+def test_a_path_is_not_shifted_towards_a_wall(mission):
+    """The floor rises to 0.1 m below the cameras, 0.6 m to the left of the path: 0.2 m more than the vehicle reaches."""
+    x, y, z = mission.plan.all_references().position.T
+    heights, floor = mission.chart.height_m.copy(), mission.chart
+    heights[floor.south_m + np.arange(len(heights)) * floor.spacing_m > y.max() + 0.6] = z.max() - 0.1
+    walled = replace(mission, chart=replace(floor, height_m=heights))
+    near, far = (flown(m, np.array([0.0, 0.5, 0.0])).position[-1, 1] for m in (walled, mission))
+    assert near == pytest.approx(y[-1], abs=1e-9) and far == pytest.approx(y[-1] + 0.5, abs=0.01)
+
+
+def test_the_floor_so_far_is_the_mean_of_its_points():
+    follower = FloorFollower(prepare(scenario()))
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-1, 1, (20_000, 2)), rng.normal(0.7, 0.1, 20_000)])
+    follower.add(points)
+    found = follower.floor_m
+    assert len(found) > 100 and np.abs(found[:, :2]).max() < 1.2
+    # of about 50 points in a cell, with the relief of the chart within it
+    assert np.median(np.abs(found[:, 2] - 0.7)) < 0.02
 
 
 ANGLES = np.linspace(0, 2 * np.pi, 16)
