@@ -148,8 +148,10 @@ def test_offset_and_pace_are_limited(mission):
     y, z = found.position[-1, 1:] - mission.plan.all_references().position[-1, 1:]
     assert np.hypot(0.0, y) == pytest.approx(MOST_OFFSET_M, abs=0.01) and z == pytest.approx(MOST_OFFSET_M, abs=0.01)
     assert found.n < 1.1 * len(mission.plan.all_references().position) / LEAST_PACE
-    edge = flown(prepare(scenario("plan.centre_m=[0.0,2.4]", "plan.tracks=0")), np.array([0.0, 3.0, 0.0])).position
-    assert chart.north_m - 0.01 < edge[:, 1].max() <= chart.north_m
+    beside = prepare(scenario("plan.centre_m=[0.0,2.4]", "plan.tracks=0"))  # its last leg keeps within the floor
+    edge, planned_y = flown(beside, np.array([0.0, 3.0, 0.0])).position, beside.plan.waypoints(1)[:, 1]
+    room_m = chart.north_m - beside.plan.outline()[:, 1].max()
+    assert edge[-1, 1] - planned_y[-1] == pytest.approx(room_m, abs=0.01) and room_m < 0.3
 
 
 def test_a_path_is_not_lowered_or_shifted_into_the_floor(mission):
@@ -162,11 +164,12 @@ def test_a_path_is_not_lowered_or_shifted_into_the_floor(mission):
     assert found[:, 2].min() >= path[:, 2].min() - 0.5
 
 
-def test_a_path_is_not_shifted_towards_a_wall(mission):
-    """The floor rises to 0.1 m below the cameras, 0.6 m to the left of the path: 0.2 m more than the vehicle reaches."""
-    x, y, z = mission.plan.all_references().position.T
+def test_a_path_is_not_shifted_towards_a_wall():
+    """0.9 m beside a path over the floor, a wall rises to its height; it has to be clear within 0.7 m."""
+    mission = prepare(scenario("plan.height=floor"))
+    _, y, z = mission.plan.all_references().position.T
     heights, floor = mission.chart.height_m.copy(), mission.chart
-    heights[floor.south_m + np.arange(len(heights)) * floor.spacing_m > y.max() + 0.6] = z.max() - 0.1
+    heights[floor.south_m + np.arange(len(heights)) * floor.spacing_m > y.max() + 0.9] = z.max()
     walled = replace(mission, chart=replace(floor, height_m=heights))
     near, far = (flown(m, np.array([0.0, 0.5, 0.0])).position[-1, 1] for m in (walled, mission))
     assert near == pytest.approx(y[-1], abs=1e-9) and far == pytest.approx(y[-1] + 0.5, abs=0.01)
