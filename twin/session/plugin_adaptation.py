@@ -74,7 +74,7 @@ class PluginAdaptation:
 
     @cached_property
     def _rooms_m(self) -> list[float]:
-        """Returns by how much the path may be lowered [m]: as planned, and shifted."""
+        """Returns by how much the path may be lowered [m]: as planned, and shifted; the planned one is allowed."""
         mission, top = self._mission, planned_surface(self._mission)
         asked = mission.plan, mission.scenario.plan, mission.chart, top
-        return [room_below_m(*asked, beside_m) for beside_m in (0.0, MOST_OFFSET_M)]
+        return [max(0.0, room_below_m(*asked, 0.0)), room_below_m(*asked, MOST_OFFSET_M)]
