@@ -14,21 +14,21 @@ from twin.simulate.autopilot import steady_thrusts_n
 RESERVE = 0.2  #: share of the battery that stays unused
 
 
-def electrical_power_w(vehicle: VehicleConfig, velocities: Array) -> Array:
+def electrical_power_w(vehicle: VehicleConfig, velocities: Array, pulls: Array | float = 0.0) -> Array:
     """Returns the power (n,) at steady velocities (n, 3) through the water, in the body: hotel load and thrusters.
 
     The power of a propeller at rest grows with its thrust to the power 1.5 (momentum theory); the tables of the T200
     from 10 to 20 V have exponents of 1.4 to 1.7.
     """
-    thrusts = np.abs(steady_thrusts_n(vehicle, velocities))
+    thrusts = np.abs(steady_thrusts_n(vehicle, velocities, pulls))
     return np.asarray(vehicle.hotel_w + vehicle.power_coefficient * (thrusts**1.5).sum(axis=1), np.float64)
 
 
-def energy_of(vehicle: VehicleConfig, velocities: Array, interval_s: float) -> Energy:
+def energy_of(vehicle: VehicleConfig, velocities: Array, interval_s: float, pulls: Array | float = 0.0) -> Energy:
     """Returns the energy at steady velocities (n, 3) through the water, in the body, each held for an interval."""
     if vehicle.dynamics == "kinematic":
         return Energy()
-    survey_wh = float(electrical_power_w(vehicle, velocities).sum()) * interval_s / 3600
+    survey_wh = float(electrical_power_w(vehicle, velocities, pulls).sum()) * interval_s / 3600
     return Energy(survey_wh, max(1, math.ceil(survey_wh / usable_wh(vehicle))))
 
 
