@@ -59,11 +59,8 @@ def test_the_limits_of_a_survey_follow_its_plan_and_its_current():
     still = twin.vehicle("reef")
     lateral = twin.vehicle("reef", overrides=["current.velocity_mps=[0,0.3,0]"])
     assert lateral.survey_wh > 1.3 * still.survey_wh and lateral.load > still.load
-    assert (
-        still.controller == "built in"
-        and still.dives == 1
-        and twin.vehicle("reef", overrides=["vehicle.battery_wh=1"]).dives > 1
-    )
+    assert still.controller == "built in"
+    assert still.dives == 1 and twin.vehicle("reef", overrides=["vehicle.battery_wh=1"]).dives > 1
     rest, cruise = electrical_power_w(VehicleConfig(buoyancy_n=0.0), np.array([[0.0, 0, 0], [0.35, 0, 0]]))
     assert rest == pytest.approx(VehicleConfig().hotel_w) and cruise > rest
     assert still.hover_h == pytest.approx(0.8 * 266.0 / electrical_power_w(VehicleConfig(), np.zeros((1, 3)))[0])
@@ -82,6 +79,7 @@ def test_the_vehicle_holds_the_current_that_is_stated_and_not_more(share, holds)
     assert (np.linalg.norm(body.world_from_body[:3, 3]) < 0.1) == holds
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("share", "holds"), [(0.93, True), (1.1, False)])
 def test_the_vehicle_with_a_tether_holds_the_current_that_is_stated_and_not_more(share, holds):
     """As above, with a tether of 50 m, in a current from the side; the limit is that of the worst direction."""

@@ -97,12 +97,12 @@ def test_the_thrusters_have_to_give_what_the_tether_takes():
 
 
 def test_a_current_that_the_vehicle_holds_without_a_tether_may_be_too_strong_with_it():
-    current, place = ["current.velocity_mps=[-0.45,0.0,0.0]", "plan.speed_mps=0.1"], "tether.length_m=100.0"
+    current, place = ["current.velocity_mps=[-0.47,0.0,0.0]", "plan.speed_mps=0.1"], "tether.length_m=100.0"
     prepare(load_scenario("reef", current))
     with pytest.raises(ScenarioError, match="hold station against it with its tether") as refused:
         prepare(load_scenario("reef", [*current, place]))
     limit = float(str(refused.value).split("up to ")[1].split()[0])
-    prepare(load_scenario("reef", [f"current.velocity_mps=[{-0.9 * limit},0.0,0.0]", "plan.speed_mps=0.01", place]))
+    prepare(load_scenario("reef", [f"current.velocity_mps=[{-0.8 * limit},0.0,0.0]", "plan.speed_mps=0.02", place]))
     with pytest.raises(ScenarioError, match="0.35: too fast for the thrusters with its tether"):
         prepare(load_scenario("reef", ["tether.length_m=900.0"]))
 
