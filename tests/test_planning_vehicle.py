@@ -95,6 +95,7 @@ def test_the_vehicle_with_a_tether_holds_the_current_that_is_stated_and_not_more
     assert (np.linalg.norm(body.world_from_body[:3, 3]) < 0.1) == holds
 
 
+@pytest.mark.long
 def test_a_controller_that_fails_has_no_limits():
     plugin = "control.plugin=test_planning_vehicle:NoCommand"
     with pytest.raises(TwinError, match="vehicle: control.plugin test_planning_vehicle:NoCommand: command returned"):

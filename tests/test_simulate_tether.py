@@ -96,6 +96,7 @@ def test_the_thrusters_have_to_give_what_the_tether_takes():
         assert more[0] @ to_force == pytest.approx(share * PER_M * LENGTH_M * 0.3**2, rel=0.02)  # six segments
 
 
+@pytest.mark.long
 def test_a_current_that_the_vehicle_holds_without_a_tether_may_be_too_strong_with_it():
     current, place = ["current.velocity_mps=[-0.47,0.0,0.0]", "plan.speed_mps=0.1"], "tether.length_m=100.0"
     prepare(load_scenario("reef", current))
