@@ -64,7 +64,7 @@ MUTANTS = [
         ("twin/simulate/image_faults.py", "camera * rig.baseline_m * px_per_m", "0 * rig.baseline_m * px_per_m", "simulate_faults"),
         ("twin/estimate/vision/inertial_filter.py", "advance[9 + i, 12 + j] -= g[i, j]", "advance[9 + i, 12 + j] += g[i, j]", "estimate_inertial"),
         ("twin/estimate/vision/inertial_filter.py", "geometry.so3_exp(rate * (dt / 2)) @ force", "force", "estimate_inertial"),
-        ("twin/world/height_change.py", "slope, decay = self.rate_mps + w * self.offset_m", "slope, decay = self.rate_mps - w * self.offset_m", "world_floor_following"),
+        ("twin/world/path_change.py", "slope, decay = self.rate_mps + w * self.left_m", "slope, decay = self.rate_mps - w * self.left_m", "world_floor_following"),
         ("twin/world/floor_following.py", "np.cos(angle) + gradient * np.sin(angle)", "np.cos(angle) - gradient * np.sin(angle)", "world_floor_following"),
         ("twin/world/floor_following.py", "sampled(top_m, x, y, 0) + self._clearance_m", "sampled(top_m, x, y, 0) - self._clearance_m", "world_floor_following"),
         ("twin/world/gap_filling.py", "self._asked & (self._n < _LEAST_KEYFRAMES)", "self._asked & (self._n < 1)", "world_gap_filling"),

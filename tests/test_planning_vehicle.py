@@ -10,15 +10,17 @@ import twin
 from twin.cli import app
 from twin.controllers.tracking import control_thrusters
 from twin.errors import TwinError
-from twin.planning.vehicle_limits import electrical_power_w, stopping_distance_m
+from twin.planning.vehicle_limits import electrical_power_w, largest_current_mps, stopping_distance_m
 from twin.scenario.file import load_scenario
-from twin.scenario.model import VehicleConfig
+from twin.scenario.model import TetherConfig, VehicleConfig
 from twin.simulate.autopilot import full_force_n, nominal_controller, top_speed_mps
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.hull import trimmed_hull
 from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import steady_current
+from twin.simulate.tether import tether_of
 from twin.simulate.thrusters import steady_thrust_n
+from twin.world.mission import prepare
 
 #: Power and thrust of a T200 at 14 V at a tenth, a quarter, half and all of its thrust (Blue Robotics, 2019).
 T200 = ((4.5, 8.4), (11.2, 32.2), (22.2, 99.4), (44.4, 284.1))
@@ -57,6 +59,7 @@ def test_the_limits_of_a_survey_follow_its_plan_and_its_current():
     still = twin.vehicle("reef")
     lateral = twin.vehicle("reef", overrides=["current.velocity_mps=[0,0.3,0]"])
     assert lateral.survey_wh > 1.3 * still.survey_wh and lateral.load > still.load
+    assert still.controller == "built in"
     assert still.dives == 1 and twin.vehicle("reef", overrides=["vehicle.battery_wh=1"]).dives > 1
     rest, cruise = electrical_power_w(VehicleConfig(buoyancy_n=0.0), np.array([[0.0, 0, 0], [0.35, 0, 0]]))
     assert rest == pytest.approx(VehicleConfig().hotel_w) and cruise > rest
@@ -74,6 +77,37 @@ def test_the_vehicle_holds_the_current_that_is_stated_and_not_more(share, holds)
         pose, twist, still = body.world_from_body, body.twist_body, np.zeros(3)
         body.step(control_thrusters(controller, pose, twist, still, still, still, 0.0), 1 / 30)
     assert (np.linalg.norm(body.world_from_body[:3, 3]) < 0.1) == holds
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("share", "holds"), [(0.93, True), (1.1, False)])
+def test_the_vehicle_with_a_tether_holds_the_current_that_is_stated_and_not_more(share, holds):
+    """As above, with a tether of 50 m, in a current from the side; the limit is that of the worst direction."""
+    section, line = VehicleConfig(), tether_of(TetherConfig(length_m=50.0), np.zeros(3))
+    free, limit = (largest_current_mps(prepare(load_scenario("reef", [f"tether.length_m={m}"]))) for m in (0.0, 50.0))
+    assert limit < 0.8 * free
+    sea = steady_current(np.array([0.0, share * limit, 0.0]))
+    body = CompiledVehicle(section, sea, np.eye(4), 1 / 120, tether=line)
+    controller = nominal_controller(section, 1.2, 30.0)
+    for _ in range(30 * 30):
+        pose, twist, still = body.world_from_body, body.twist_body, np.zeros(3)
+        body.step(control_thrusters(controller, pose, twist, still, still, still, 0.0), 1 / 30)
+    assert (np.linalg.norm(body.world_from_body[:3, 3]) < 0.1) == holds
+
+
+@pytest.mark.long
+def test_a_controller_that_fails_has_no_limits():
+    plugin = "control.plugin=test_planning_vehicle:NoCommand"
+    with pytest.raises(TwinError, match="vehicle: control.plugin test_planning_vehicle:NoCommand: command returned"):
+        twin.vehicle(load_scenario("reef", [plugin], allow_plugins=True))
+
+
+class NoCommand:
+    def __init__(self, setup):
+        pass
+
+    def command(self, estimate, reference):
+        return np.zeros(3)
 
 
 def test_the_command_prints_and_draws_the_limits(tmp_path):

@@ -9,10 +9,12 @@ from twin.core import geometry
 from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.scenario.model import TetherConfig, VehicleConfig
+from twin.simulate.autopilot import steady_thrusts_n
 from twin.simulate.compiled_vehicle import CompiledVehicle
 from twin.simulate.mujoco_vehicle import MujocoVehicle
+from twin.simulate.parameters import parameters_of
 from twin.simulate.sea import steady_current
-from twin.simulate.tether import add_tether, tether_of
+from twin.simulate.tether import add_tether, steady_pulls, tether_of
 from twin.world.mission import prepare
 
 LENGTH_M, AT = 30.0, np.array([0.5, -0.3, 2.0])
@@ -80,6 +82,30 @@ def test_a_survey_with_a_tether_in_a_current_keeps_to_its_path(tmp_path):
         load_scenario("reef", [*SHORT, "current.velocity_mps=[0.1,0.1,0.0]"]), tmp_path / "run", outputs=None
     )
     assert found.status == "complete" and found.metrics["control"]["cross_track_rmse_m"] < 0.03
+
+
+def test_the_thrusters_have_to_give_what_the_tether_takes():
+    """Half of the drag of the line in a current; a quarter of it at its speed: the weights 1 - s and (1 - s)^3."""
+    vehicle, still, yaw = VehicleConfig(), np.zeros((1, 3)), np.array([0.0])
+    line = tether_of(TetherConfig(length_m=LENGTH_M, attachment_m=(0.0, 0.0, 0.0)), np.zeros(3))
+    ahead, to_force = np.array([0.3, 0.0, 0.0]), parameters_of(vehicle).thrust_configuration[0]
+    for current, velocity, share in ((-ahead, still, 1 / 2), (0 * ahead, still + ahead, 1 / 4)):
+        through = velocity - current
+        pulls = steady_pulls(line, current, still, yaw, velocity)
+        more = steady_thrusts_n(vehicle, through, pulls) - steady_thrusts_n(vehicle, through)
+        assert more[0] @ to_force == pytest.approx(share * PER_M * LENGTH_M * 0.3**2, rel=0.02)  # six segments
+
+
+@pytest.mark.long
+def test_a_current_that_the_vehicle_holds_without_a_tether_may_be_too_strong_with_it():
+    current, place = ["current.velocity_mps=[-0.47,0.0,0.0]", "plan.speed_mps=0.1"], "tether.length_m=100.0"
+    prepare(load_scenario("reef", current))
+    with pytest.raises(ScenarioError, match="hold station against it with its tether") as refused:
+        prepare(load_scenario("reef", [*current, place]))
+    limit = float(str(refused.value).split("up to ")[1].split()[0])
+    prepare(load_scenario("reef", [f"current.velocity_mps=[{-0.8 * limit},0.0,0.0]", "plan.speed_mps=0.02", place]))
+    with pytest.raises(ScenarioError, match="0.35: too fast for the thrusters with its tether"):
+        prepare(load_scenario("reef", ["tether.length_m=900.0"]))
 
 
 def test_a_caught_tether_is_no_complete_survey(tmp_path):

@@ -12,8 +12,8 @@ from twin.errors import ScenarioError
 from twin.scenario.file import load_scenario
 from twin.simulate.echo_sounders import Altimeter
 from twin.world.floor_following import EchoCorrection, FloorFollower
-from twin.world.height_change import HeightChange
 from twin.world.mission import prepare
+from twin.world.path_change import PathChange
 from twin.world.planning import floor_of, smoothed_over
 
 HILLS = ["terrain.kind=fractal", "terrain.relief_m=1.2", "terrain.size_m=[12.0, 10.0]", "plan.area_m=[5.0, 3.0]",
@@ -33,7 +33,8 @@ def level_pose(x, y, z):
 def test_the_path_changes_to_new_heights_without_a_step():
     dt = 1e-3
     still = Reference(*(np.zeros((5000, 3)) for _ in range(2)), np.zeros(5000), np.zeros((5000, 3)))
-    changed = HeightChange(0.3, -0.2, 10).added_to(still, 10, 1 / dt)
+    up = np.array([0.0, 0.0, 1.0])
+    changed = PathChange(0.3 * up, -0.2 * up, 10).added_to(still, 10, 1 / dt)
     z, velocity, acceleration = (part[:, 2] for part in (changed.position, changed.velocity, changed.acceleration))
     assert (z[0], velocity[0]) == (0.3, -0.2)
     np.testing.assert_allclose(np.gradient(z, dt)[1:-1], velocity[1:-1], atol=1e-6)

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from twin.errors import TwinError
+from twin.errors import SurveyAborted, TwinError
 
 if TYPE_CHECKING:
     from twin.app.look import ViewLayers
@@ -105,7 +105,7 @@ def vehicle(
 
     Raises:
         ScenarioError: the survey cannot be planned as described.
-        TwinError: the vehicle is kinematic, or the picture cannot be written.
+        TwinError: the vehicle is kinematic, its plug-in fails, or the picture cannot be written.
     """
     from twin.app.outputs import output_file, writing
     from twin.planning import vehicle_drawing, vehicle_limits
@@ -115,7 +115,10 @@ def vehicle(
     if scenario.vehicle.dynamics == "kinematic":
         raise TwinError("vehicle.dynamics", "a kinematic vehicle has no forces", '"rigid"')
     file = None if picture is None else output_file(Path(picture))
-    limits = vehicle_limits.vehicle_limits(prepare(scenario))
+    try:
+        limits = vehicle_limits.vehicle_limits(prepare(scenario))
+    except SurveyAborted as error:  # of a controller of another package
+        raise TwinError("vehicle", str(error), "a controller that flies it") from None
     if file is not None:
         with writing(file):
             vehicle_drawing.draw(scenario.vehicle, limits, file)

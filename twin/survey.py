@@ -128,7 +128,7 @@ def fly(
     scenario = mission.scenario
     by_frame = scenario.control.height == "altimeter" or scenario.navigation.needs_every_frame
     flight = Flight(mission, world, None if by_frame else world.fast_forward(navigator, pilot))
-    adapt = PathAdaptation(flight)
+    adapt = PathAdaptation(flight, pilot)
     frame = flight.start()
     while frame is not None:
         if flight.aligns:

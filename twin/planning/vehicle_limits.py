@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.integrate import solve_ivp
+from scipy.optimize import root_scalar
 
 from twin.controllers.segments import Reference
 from twin.core import geometry
@@ -22,9 +23,11 @@ from twin.simulate.energy import electrical_power_w, usable_wh
 from twin.simulate.hull import physics_timestep_s, trimmed_hull
 from twin.simulate.sea import steady_current
 from twin.simulate.steady_flight import minimum_speed_mps, turning_radius_m
-from twin.world.energy import planned_energy, planned_velocities
+from twin.simulate.tether import steady_pulls, tether_of
+from twin.world.energy import planned_energy, planned_motion
 from twin.world.mission import Mission
-from twin.world.pilot import RovPilot, make_pilot
+from twin.world.path_checks import body_velocities
+from twin.world.pilot import make_pilot
 
 #: Directions in the body, by name.
 AXES = {"forwards": (1.0, 0.0, 0.0), "sideways": (0.0, 1.0, 0.0), "up": (0.0, 0.0, 1.0)}
@@ -34,15 +37,17 @@ _LEG_S, _SETTLED_S, _STABLE_M = 5.0, 20.0, 0.1  # the last _LEG_S of _SETTLED_S 
 
 @dataclass(frozen=True)
 class VehicleLimits:
-    """Limits of a rigid vehicle in still water, and energy of the planned survey in its mean current."""
+    """Limits of a rigid vehicle in still water without tether, and energy of the planned survey in its mean current."""
 
     title: str
     voltage_v: float | None  #: stated supply voltage of the thrusters
+    controller: str  #: what flies it: "built in", or the plug-in
     buoyancy_n: float  #: net buoyancy, positive upwards
     righting_nm_per_deg: float  #: moment that turns a tilted vehicle back
     speeds_mps: dict[str, float]  #: top speed by direction: the first thruster saturates
     forces_n: dict[str, float]  #: force by direction at which the first thruster saturates
-    current_mps: float  #: greatest horizontal current, from any side, in which it holds station; NaN: it cannot
+    #: greatest horizontal current, from any side, in which it holds station, with its tether; NaN: it cannot
+    current_mps: float
     speed_mps: float  #: planned speed
     load: float  #: thrust of the busiest thruster / full thrust, at the planned speed in the mean current
     stopping_m: float  #: distance from the planned speed to rest at full thrust, with the lag of the thrusters
@@ -62,20 +67,20 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
     vehicle, plan = mission.scenario.vehicle, mission.plan
     hull, fins, axes = trimmed_hull(vehicle), vehicle.is_steered_by_fins, axes_of(vehicle)
     speed_mps, ahead = plan.speed_mps, np.array(AXES["forwards"])
-    through_water, energy = planned_velocities(mission), planned_energy(mission)
+    (through_water, pulls), energy = planned_motion(mission), planned_energy(mission)
     assert energy.survey_wh is not None and energy.dives is not None  # a rigid vehicle
     rest, cruise = electrical_power_w(vehicle, np.array([np.zeros(3), speed_mps * ahead]))
-    directions = np.column_stack([np.cos(_BEARINGS), np.sin(_BEARINGS), np.zeros_like(_BEARINGS)])
     return VehicleLimits(
         title=vehicle.title,
         voltage_v=vehicle.voltage_v,
+        controller=mission.scenario.control.plugin or "built in",
         buoyancy_n=hull.buoyancy_n - hull.weight_n,
         righting_nm_per_deg=math.radians(hull.buoyancy_n * float(hull.centre_of_buoyancy_m[2])),
         speeds_mps={name: top_speed_mps(vehicle, np.array(axis)) for name, axis in axes.items()},
         forces_n={name: full_force_n(vehicle, np.array(axis)) for name, axis in axes.items()},
-        current_mps=np.nan if fins else min(top_speed_mps(vehicle, direction) for direction in directions),
+        current_mps=np.nan if fins else largest_current_mps(mission),
         speed_mps=speed_mps,
-        load=float(thrust_loads(vehicle, through_water).max()),
+        load=float(thrust_loads(vehicle, through_water, pulls).max()),
         stopping_m=speed_mps * thruster_lag_s(vehicle)
         + stopping_distance_m(vehicle, speed_mps, full_force_n(vehicle, ahead), 0.0),
         coasting_m=stopping_distance_m(vehicle, speed_mps, 0.0, 0.1 * speed_mps),
@@ -89,6 +94,23 @@ def vehicle_limits(mission: Mission) -> VehicleLimits:
         turning_radius_m=turning_radius_m(vehicle, speed_mps) if fins else 0.0,
         full_rudder_radius_m=turning_radius_m(vehicle, speed_mps, share=1.0) if fins else 0.0,
     )
+
+
+def largest_current_mps(mission: Mission) -> float:
+    """Returns the greatest current from any side in which the vehicle holds station at the start [m/s]."""
+    vehicle, start_m = mission.scenario.vehicle, np.tile(mission.start[:3, 3], (len(_BEARINGS), 1))
+    directions = np.column_stack([np.cos(_BEARINGS), np.sin(_BEARINGS), np.zeros_like(_BEARINGS)])
+    still, tether = np.zeros_like(directions), tether_of(mission.scenario.tether, mission.start[:3, 3])
+    most_mps = min(top_speed_mps(vehicle, direction) for direction in directions)
+
+    def excess(speed_mps: float) -> float:
+        current = np.array([speed_mps, 0.0, 0.0])
+        pulls = steady_pulls(tether, current, start_m, _BEARINGS, still)
+        return float(thrust_loads(vehicle, body_velocities(_BEARINGS, still - current), pulls).max()) - 1
+
+    if not tether.length_m or excess(most_mps) <= 0:
+        return most_mps
+    return float(root_scalar(excess, bracket=(0.0, most_mps), method="brentq").root)
 
 
 def axes_of(vehicle: VehicleConfig) -> dict[str, tuple[float, float, float]]:
@@ -113,8 +135,7 @@ def _settles(mission: Mission, latency_s: float) -> bool:
     late = scenario.model_copy(update={"control": scenario.control.model_copy(update={"latency": latency_s})})
     leg_s, velocity_mps = (_SETTLED_S, mission.start_velocity_mps) if fins else (_LEG_S, np.zeros(3))
     changed, start = replace(mission, scenario=late), mission.start_of_body
-    pilot = make_pilot(changed) if fins else RovPilot(changed)
-    still = steady_current(np.zeros(3))
+    pilot, still = make_pilot(changed), steady_current(np.zeros(3))
     vehicle = CompiledVehicle(
         scenario.vehicle, still, start, physics_timestep_s(mission.rig.frame_rate_hz, scenario.vehicle),
         start_velocity_mps=velocity_mps,
@@ -170,6 +191,7 @@ def rows(limits: VehicleLimits) -> list[tuple[str, str]]:
         ]
     return [
         *([] if limits.voltage_v is None else [("supply voltage", f"{limits.voltage_v:g} V")]),
+        ("controller", limits.controller),
         ("net buoyancy", f"{limits.buoyancy_n:+.1f} N"),
         ("righting moment", f"{limits.righting_nm_per_deg:.3f} N m per degree"),
         ("top speed", of_axes(limits.speeds_mps, "m/s", 2)),

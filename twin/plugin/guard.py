@@ -43,6 +43,10 @@ class GuardedPlugin:
             self._plugin = plugin
         return self._attempt(method, getattr(self._plugin, method), arguments)
 
+    def has(self, method: str) -> bool:
+        """Returns whether the plug-in, which `call` has created, has a method that it may lack."""
+        return self._attempt(method, lambda: callable(getattr(self._plugin, method, None)), ())
+
     def numbers(self, method: str, value: Any, shape: tuple[int, ...]) -> Array:
         """Returns the result of a method as floats; raises PluginFailed unless it has this shape and is finite."""
         try:

@@ -8,7 +8,9 @@ from twin.controllers.allocation import ThrustAllocation
 from twin.controllers.segments import Reference
 from twin.controllers.tracking import HullModel
 from twin.core.geometry import Array
-from twin.core.records import Estimate, Frame, SensorNoise, StereoRig
+from twin.core.records import Estimate, Frame, Readings, SensorNoise, StereoRig
+
+MOST_OFFSET_M, LEAST_PACE = 0.5, 0.1  #: limits of an `Adaptation`
 
 
 class ControllerSetup(NamedTuple):
@@ -33,7 +35,10 @@ class ControllerSetup(NamedTuple):
 
 
 class Controller(Protocol):
-    """Controller (key `control.plugin`, entry points `twin.controllers`), created with a `ControllerSetup`."""
+    """Controller (key `control.plugin`, entry points `twin.controllers`), created with a `ControllerSetup`.
+
+    It may have a method `adapt(situation: Situation) -> Adaptation | None`, called at each keyframe after `command`.
+    """
 
     def command(self, estimate: Estimate, reference: Reference) -> Array:
         """Returns the command that applies until the next frame.
@@ -49,6 +54,25 @@ class Controller(Protocol):
             velocity (3,) in the world [m/s].
         """
         ...
+
+
+class Situation(NamedTuple):
+    """What a controller knows at a keyframe; no truth."""
+
+    time_s: float  #: time since the start
+    estimate: Estimate  #: online estimate of the pose and the velocity of the left camera
+    readings: Readings  #: readings of the navigation sensors that have arrived
+    reference: Reference  #: as the argument of `Controller.command`
+    floor_m: Array  #: (n, 3) floor so far, at the online poses: x, y and mean height of cells with points or echoes
+
+
+class Adaptation(NamedTuple):
+    """What a controller changes of the path from a keyframe on, within limits."""
+
+    #: (3,) offset from the planned path in the world [m], up to `MOST_OFFSET_M` horizontally and vertically, towards
+    #: which the path moves by at most 0.1 m per keyframe and 0.1 m/s
+    offset_m: Array
+    pace: float = 1.0  #: factor of the planned speed, `LEAST_PACE` to 1; a vehicle that flies arcs keeps its speed
 
 
 class EstimatorSetup(NamedTuple):

@@ -128,11 +128,11 @@ class SteppedWorld:
         """Returns the controller of the scenario: a function from the estimate of a frame and this frame to a command.
 
         It steers to the reference of the current frame, and adapts the path to what `estimator` has measured, as
-        `control.height` and `plan.fill_gaps` ask. Raises TwinError if the plug-in that the scenario names cannot be
-        loaded.
+        `control.height`, `plan.fill_gaps` and a plug-in ask. Raises TwinError if the plug-in that the scenario names
+        cannot be loaded.
         """
         steer, flight = make_pilot(self._mission, self.world.thruster_monitor), self.flight
-        adapt = PathAdaptation(flight)
+        adapt = PathAdaptation(flight, steer)
 
         def command(estimate: Estimate, frame: Frame) -> Array:
             found = steer(without_feedback(estimate, flight.reference, frame.readings), flight.reference)

@@ -62,12 +62,12 @@ def top_speed_mps(vehicle: VehicleConfig, direction: Array) -> float:
     return float(real[real > 0].min())
 
 
-def thrust_loads(vehicle: VehicleConfig, velocities: Array) -> Array:
+def thrust_loads(vehicle: VehicleConfig, velocities: Array, pulls: Array | float = 0.0) -> Array:
     """Returns the largest absolute thrust (n,) of a thruster / full thrust, at steady velocities (n, 3).
 
-    Velocities [m/s] are through the water, in the body, which is level, see `steady_thrusts_n`.
+    Velocities [m/s] are through the water, in the body, which is level; `pulls` as in `steady_thrusts_n`.
     """
-    thrusts = steady_thrusts_n(vehicle, velocities)
+    thrusts = steady_thrusts_n(vehicle, velocities, pulls)
     return np.abs(thrusts).max(axis=1, initial=0.0) / full_thrust_n(vehicle)
 
 
@@ -78,15 +78,16 @@ def full_force_n(vehicle: VehicleConfig, direction: Array) -> float:
     return full_thrust_n(vehicle) / float(np.abs(per_newton).max())
 
 
-def steady_thrusts_n(vehicle: VehicleConfig, velocities: Array) -> Array:
+def steady_thrusts_n(vehicle: VehicleConfig, velocities: Array, pulls: Array | float = 0.0) -> Array:
     """Returns the thrusts (n, k) [N] of a level vehicle at steady velocities (n, 3) through the water, in the body.
 
-    The thrusters balance drag, the Munk moment in yaw, and the net buoyancy; the righting moment balances roll and
-    pitch.
+    The thrusters balance drag, the Munk moment in yaw, the net buoyancy, and the wrenches `pulls` (n, 6) of a tether;
+    the righting moment balances roll and pitch.
     """
     hull, rov = trimmed_hull(vehicle), parameters_of(vehicle)
     model = _controller_model(hull)
     wrenches = np.array([feedforward_wrench(model, np.asarray(v, np.float64)) for v in velocities]).reshape(-1, 6)
+    wrenches -= pulls
     wrenches[:, :2] = 0.0
     wrenches[:, 5] += hull.weight_n - hull.buoyancy_n
     return np.asarray(wrenches @ _allocation(rov).thrusts_from_wrench.T, np.float64)

@@ -9,7 +9,7 @@ import numpy as np
 from twin.core.geometry import Array
 from twin.kernels import kernel
 from twin.scenario.model import TetherConfig
-from twin.simulate.sea import flow_at
+from twin.simulate.sea import flow_at, steady_current
 
 _WATER_KG_M3 = 1025.0
 _SEGMENTS = 6  # of the line, each with the flow at its middle
@@ -39,6 +39,19 @@ def tether_of(tether: TetherConfig, start_m: Array) -> Tether:
 
 
 NO_TETHER = tether_of(TetherConfig(), np.zeros(3))
+
+
+def steady_pulls(tether: Tether, current_mps: Array, position_m: Array, yaw: Array, velocity_mps: Array) -> Array:
+    """Returns the wrenches (n, 6) [moment, force] of a tether on a level vehicle in the body [N m, N].
+
+    In a current (3,), at positions (n, 3), yaws (n,) [rad] and velocities (n, 3) in the world.
+    """
+    wrenches, sea, zero = np.zeros((len(yaw), 6)), steady_current(current_mps), np.zeros(3)
+    for k in range(len(yaw) if tether.length_m else 0):
+        c, s, moving = np.cos(yaw[k]), np.sin(yaw[k]), np.concatenate([velocity_mps[k], zero])
+        rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        add_tether(wrenches[k], tether, sea, 0.0, rotation, position_m[k], moving)
+    return wrenches
 
 
 @kernel

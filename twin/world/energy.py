@@ -10,23 +10,28 @@ from twin.core.quality import Energy
 from twin.core.records import Trajectory
 from twin.simulate.energy import energy_of
 from twin.simulate.sea import make_sea, mean_current_mps
+from twin.simulate.tether import steady_pulls, tether_of
 from twin.world.mission import Mission
 from twin.world.path_checks import body_velocities
 
 _INTERVAL_S = 0.5  # between the velocities of a flown path
 
 
-def planned_velocities(mission: Mission) -> Array:
-    """Returns the planned velocities (n, 3) through the mean current at all frames, in the body [m/s]."""
+def planned_motion(mission: Mission) -> tuple[Array, Array]:
+    """Returns the planned velocities (n, 3) through the mean current at all frames, and the pulls (n, 6) of the tether.
+
+    Both are in the body [m/s, N m, N].
+    """
     flown = mission.plan.all_references()
-    n_hold, yaw = mission.n_frames - len(flown.position), np.asarray(flown.yaw)
+    n_hold = mission.n_frames - len(flown.position)
     velocities = np.vstack([flown.velocity, np.zeros((n_hold, 3))])
-    current = mean_current_mps(make_sea(mission.scenario), float(flown.position[:, 2].mean()))
-    return body_velocities(np.append(yaw, np.full(n_hold, yaw[-1])), velocities - current)
+    yaw = np.pad(np.asarray(flown.yaw), (0, n_hold), "edge")
+    return _in_current(mission, np.pad(flown.position, ((0, n_hold), (0, 0)), "edge"), yaw, velocities)
 
 
 def planned_energy(mission: Mission) -> Energy:
-    return energy_of(mission.scenario.vehicle, planned_velocities(mission), 1 / mission.rig.frame_rate_hz)
+    velocities, pulls = planned_motion(mission)
+    return energy_of(mission.scenario.vehicle, velocities, 1 / mission.rig.frame_rate_hz, pulls)
 
 
 def flown_energy(mission: Mission, path: Trajectory) -> Energy:
@@ -35,7 +40,13 @@ def flown_energy(mission: Mission, path: Trajectory) -> Energy:
     times_s, positions = path.times_s[::n], path.positions[::n]
     if len(times_s) < 2 or vehicle.dynamics == "kinematic":
         return Energy()
-    current = mean_current_mps(make_sea(mission.scenario), float(positions[:, 2].mean()))
     yaw = geometry.heading_of_camera(path.world_from_camera[::n][:-1])
-    velocities = np.diff(positions, axis=0) / np.diff(times_s)[:, None] - current
-    return energy_of(vehicle, body_velocities(yaw, velocities), float(times_s[1] - times_s[0]))
+    velocities = np.diff(positions, axis=0) / np.diff(times_s)[:, None]
+    through_water, pulls = _in_current(mission, positions, yaw, velocities)
+    return energy_of(vehicle, through_water, float(times_s[1] - times_s[0]), pulls)
+
+
+def _in_current(mission: Mission, positions: Array, yaw: Array, velocities: Array) -> tuple[Array, Array]:
+    current = mean_current_mps(make_sea(mission.scenario), float(positions[:, 2].mean()))
+    tether = tether_of(mission.scenario.tether, mission.start[:3, 3])
+    return body_velocities(yaw, velocities - current), steady_pulls(tether, current, positions, yaw, velocities)

@@ -19,7 +19,7 @@ _MOST_CELLS = 4_000_000
 _TOP_SHARE = 0.9  # height of the obstacles in a cell: this quantile of the points of a keyframe in it
 #: Floor that has not been measured has the mean height of the measured floor around it, with Gaussian weights: their
 #: standard deviation is this share of the shorter side of an image. Single lines need a larger one than images.
-_CONTINUED = {"altimeter": 1.0, "map": 0.5}
+_CONTINUED = {"altimeter": 1.0, "map": 0.5, "planned": 0.5}
 _FAR_WEIGHT = 1e-3  # of the mean of all measured floor near the vehicle
 
 
@@ -28,6 +28,10 @@ class FloorFollower:
 
     Heights are averages over cells, from readings of the altimeter or from the stereo points of keyframes, at the
     online poses; they are relative to the floor as known before the survey.
+
+    Attributes:
+        rise_m: height of the surface above the asked one; it stays clear of obstacles.
+        beside_m: horizontal distance from the planned path up to which it is clear of obstacles.
     """
 
     def __init__(self, mission: Mission):
@@ -37,7 +41,7 @@ class FloorFollower:
         self._echoes = EchoCorrection(beam) if scenario.control.height == "altimeter" else None
         self._sides_m, self._slopes = smoothed_over(scenario, request), climb_slopes(scenario)
         self._altitude_m, self._clearance_m = request.altitude_m, scenario.plan.clearance_m
-        self._heading = mission.plan.area.heading
+        self._heading, self.rise_m, self.beside_m = mission.plan.area.heading, 0.0, 0.0
         path = mission.plan.outline()[:, :2]
         self._west_south_m = path.min(axis=0) - 2 * max(self._sides_m)
         extent_m = np.ptp(path, axis=0) + 4 * max(self._sides_m)
@@ -76,6 +80,13 @@ class FloorFollower:
         top_m = points_m[inside, 2][order][first + (_TOP_SHARE * (n - 1)).astype(int)]
         self._top_m[at] = np.maximum(self._top_m[at], top_m)
 
+    @property
+    def floor_m(self) -> Array:
+        """Returns the floor measured so far (n, 3): centres of the cells with points and their mean heights [m]."""
+        row, col = np.nonzero(self._n)
+        at_m = self._west_south_m + self._cell_m * (np.column_stack([col, row]) + 0.5)
+        return np.column_stack([at_m, self._known_m(at_m) + self._sum_m[row, col] / self._n[row, col]])
+
     def surface(self, position_m: Array) -> CameraSurface:
         """Returns the surface around a position (x, y) [m]: above the floor as measured and, elsewhere, continued."""
         reach = np.ceil(3 * max(self._sides_m) / self._cell_m).astype(int)
@@ -83,7 +94,7 @@ class FloorFollower:
         col, row = np.clip(nearest, 0, np.array(self._n.shape[::-1]) - 1)  # far off the path, its edge
         part = slice(max(0, row - reach), row + reach + 1), slice(max(0, col - reach), col + reach + 1)
         corner_m = self._west_south_m + self._cell_m * (np.array([part[1].start, part[0].start]) + 0.5)
-        above_m, reach_m = self._continued(part), VEHICLE_REACH_M + self._clearance_m
+        above_m, reach_m = self._continued(part), VEHICLE_REACH_M + self._clearance_m + self.beside_m
         top_m = maximum_filter(self._top_m[part], 2 * int(np.ceil(reach_m / self._cell_m)) + 1)
 
         def sampled(values: Array, x_m: Array, y_m: Array, order: int) -> Array:
@@ -91,7 +102,7 @@ class FloorFollower:
             return map_coordinates(values, np.broadcast_arrays(*at), order=order, mode="nearest")
 
         return surface_above_floor(
-            lambda x, y: self._chart.height_near(x, y) + sampled(above_m, x, y, 1),
+            lambda x, y: self._chart.height_near(x, y) + sampled(above_m, x, y, 1) + self.rise_m,
             SurveyArea("rectangle", self._sides_m, (float(position_m[0]), float(position_m[1])), self._heading),
             self._cell_m, self._altitude_m, self._sides_m, self._slopes,
             lambda x, y: sampled(top_m, x, y, 0) + self._clearance_m,

@@ -30,6 +30,7 @@ from twin.scenario.model import BeaconConfig, Scenario, Source, TaskConfig
 from twin.simulate.hull import physics_timestep_s
 from twin.simulate.sea import make_sea, mean_current_mps
 from twin.simulate.sensors import imu_rate_hz
+from twin.simulate.tether import tether_of
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.world.chart import chart_of
 from twin.world.computer import check_computer
@@ -318,7 +319,8 @@ def _check_path(
     errors.attempt(check_computer, scenario, plan)
     errors.attempt(check_places_of_faults, scenario.faults, plan)
     if (sea := errors.attempt(make_sea, scenario)) is not None:
-        errors.attempt(check_thrust, scenario.vehicle, sea, plan)
+        start_m = plan.reference(1, 0.0).position
+        errors.attempt(check_thrust, scenario.vehicle, sea, plan, tether_of(scenario.tether, start_m))
     camera_m = scenario.believed_rig().body_from_camera[:3, 3]
     for k, lamp in enumerate(scenario.lamps):
         errors.attempt(check_lamp, k, np.array(lamp.position_m), camera_m, terrain, plan)

@@ -5,17 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from twin.controllers.camera_surface import CameraSurface
 from twin.controllers.curves import end_of
 from twin.controllers.segments import Point, Reference, Segment
 from twin.core.geometry import Array
 from twin.core.records import Frame
-from twin.world.height_change import HeightChange
+from twin.core.settings import BRAKING_S
 from twin.world.mission import FrameSequence, Mission
 from twin.world.pace import FULL, Pace
+from twin.world.path_change import PathChange
 from twin.world.world import FastForward, World
 
-_UNCHANGED = HeightChange(0.0, 0.0, 0)
+_UNCHANGED = PathChange(np.zeros(3), np.zeros(3), 0)
+_SAME_FACTOR = 0.01  # a factor of the pace that differs by less is set to the one that it approaches
 
 
 class Flight:
@@ -30,12 +34,14 @@ class Flight:
         n_skipped: number of frames that `fast_forward` simulated in the last step.
         further_path: called with the last reference and the end of the path after its last track; returns the path of
             one more track, () for none.
+        pace_factor: factor of the pace along the path, above 0 to 1, which is approached smoothly.
     """
 
     def __init__(self, mission: Mission, world: World, fast_forward: FastForward | None = None):
         self.mission, self.world = mission, world
         self._fast_forward, self._parts = fast_forward, self._planned_parts()
         self._mission, self._change = mission, _UNCHANGED  # with the heights that the path has now
+        self.pace_factor = self._factor = 1.0
         self.aligns, self.n_skipped = False, 0
         self.further_path: Callable[[Reference, Point], tuple[Segment, ...]] = lambda *_: ()
 
@@ -56,13 +62,23 @@ class Flight:
 
         A vehicle that keeps station keeps its height.
         """
+        self._change_path(self._mission.above(surface), self._change.offset_m)
+
+    def shift(self, offset_m: Array) -> None:
+        """Shifts the path after this frame to an offset (3,) from the planned one, without a step, as `follow` does."""
+        if not np.array_equal(offset_m, self._change.offset_m):
+            self._change_path(self._mission, offset_m)
+
+    def _change_path(self, mission: Mission, offset_m: Array) -> None:
         if self.holding:
             return
-        sequence, path_time_s, last = self._sequence, self._path_time_s, self.reference
-        self._mission = self._mission.above(surface)
-        new = self._mission.plan.reference(sequence.track, path_time_s)
-        rate_mps = last.velocity[2] - sequence.rate * new.velocity[2]
-        self._change = HeightChange(float(last.position[2] - new.position[2]), float(rate_mps), len(self.world) - 1)
+        sequence, path_time_s, last, now = self._sequence, self._path_time_s, self.reference, len(self.world) - 1
+        new = mission.plan.reference(sequence.track, path_time_s)
+        left_m, rate_mps, _ = (part[0] for part in self._change.at(now, 1, mission.plan.request.frame_rate_hz))
+        left_m += self._change.offset_m - offset_m
+        left_m[2] = last.position[2] - new.position[2] - offset_m[2]
+        rate_mps[2] = last.velocity[2] - sequence.rate * new.velocity[2]
+        self._mission, self._change = mission, PathChange(left_m, rate_mps, now, offset_m)
         self.world.end_sequence(self._k + 1)
         self._enter(self._mission.next_frames(sequence.track, path_time_s, FULL))
         self._k = -1
@@ -88,6 +104,7 @@ class Flight:
         self.world.act(command)
         self.n_skipped = 0
         sequence, k = self._sequence, self._k + 1
+        pace = pace if sequence.holding else self._slowed(pace)
         if sequence.holding or (pace == FULL and sequence.rate == 1):
             self._k = k if self._fast_forward is None else self._fast_forward(sequence, k)
             self.n_skipped = self._k - k
@@ -101,6 +118,16 @@ class Flight:
                 return None
             self._enter(*part)
         return self._observe(keyframe)
+
+    def _slowed(self, pace: Pace) -> Pace:
+        if self._factor == self.pace_factor == 1:
+            return pace
+        change_per_s = (self.pace_factor - self._factor) / BRAKING_S
+        self._factor += change_per_s / self.mission.plan.request.frame_rate_hz
+        if abs(self.pace_factor - self._factor) < _SAME_FACTOR:
+            self._factor, change_per_s = self.pace_factor, 0.0
+        change_per_s = self._factor * pace.change_per_s + change_per_s * pace.rate
+        return Pace(self._factor * pace.rate, change_per_s, pace.keyframe)
 
     def _planned_parts(self) -> Iterator[tuple[FrameSequence, bool]]:
         """Yields the planned sequences, each with the value of `aligns` at its first frame."""
@@ -117,7 +144,7 @@ class Flight:
         yield self._mission.station_keeping_frames(track, 1), True
 
     def _enter(self, sequence: FrameSequence, aligns: bool = False) -> None:
-        if self._change != _UNCHANGED:
+        if self._change is not _UNCHANGED:
             reference = self._change.added_to(
                 sequence.reference, len(self.world), self.mission.plan.request.frame_rate_hz
             )

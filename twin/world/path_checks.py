@@ -19,6 +19,7 @@ from twin.scenario.model import FaultConfig, PlanConfig, Scenario, VehicleConfig
 from twin.simulate.autopilot import thrust_loads, top_speed_mps
 from twin.simulate.sea import Sea, strongest_currents_mps
 from twin.simulate.steady_flight import minimum_speed_mps
+from twin.simulate.tether import NO_TETHER, Tether, steady_pulls
 from twin.terrains import Terrain
 from twin.terrains.objects.placed_object import PlacedObject
 from twin.terrains.objects.scattering import disc_of
@@ -105,6 +106,17 @@ def _clearance(plan: SurveyPlan, asked: PlanConfig, terrain: Terrain) -> Clearan
     gap = z - highest_near(terrain, x, y, VEHICLE_REACH_M + asked.clearance_m)
     k = int(gap.argmin())
     return Clearance(float(gap[k]), float(x[k]), float(y[k]), inside)
+
+
+def room_below_m(plan: SurveyPlan, asked: PlanConfig, chart: Terrain, top: Terrain, beside_m: float) -> float:
+    """Returns by how much a path that is shifted by up to `beside_m` may be lowered, for `plan.clearance_m` [m].
+
+    `chart` is the known floor, `top` this floor with its objects.
+    """
+    x, y, z = plan.all_references().position.T
+    reach_m = VEHICLE_REACH_M + beside_m + (asked.clearance_m if plan.follows_floor else 0.0)
+    least_m = min(_clearance(plan, asked, chart).least_m, (z - highest_near(top, x, y, reach_m)).min())
+    return float(least_m) - asked.clearance_m
 
 
 def highest_near(terrain: Terrain, x_m: Array, y_m: Array, reach_m: float) -> Array:
@@ -229,27 +241,33 @@ def check_speed(vehicle: VehicleConfig, asked: PlanConfig, speed_mps: float) -> 
         raise TwinError("plan.speed_mps", f"{asked.speed_mps:g}: too fast for the thrusters", f"up to {reach:.2f}")
 
 
-def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan) -> None:
+def check_thrust(vehicle: VehicleConfig, sea: Sea, plan: SurveyPlan, tether: Tether = NO_TETHER) -> None:
     """Raises TwinError if a thruster saturates: to hold station in the current, or at the planned velocities in it.
 
     The current is its mean with the strongest tide, at the heights of the path; gusts and waves are shorter. Also
     raises TwinError if a file of the current does not cover times and heights of the path. A kinematic vehicle, and a
-    path at constant height without current, are not checked.
+    path at constant height without current and tether, are not checked; of a vehicle with fins, only the speed is.
     """
     if vehicle.dynamics == "kinematic":
         return
     planned = plan.all_references()
     lowest_m, highest_m = float(planned.position[:, 2].min()), float(planned.position[:, 2].max())
     _check_coverage(sea, lowest_m, highest_m, len(planned.position) / plan.request.frame_rate_hz)
-    rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity]), 3)
+    position = np.round(planned.position) if tether.length_m else np.zeros((len(planned.position), 3))
+    rounded = np.round(np.column_stack([np.asarray(planned.yaw), planned.velocity, position]), 3)
     distinct = np.unique(rounded, axis=0)
-    yaw, velocity = distinct[:, 0], distinct[:, 1:]
+    yaw, velocity, position = distinct[:, 0], distinct[:, 1:4], distinct[:, 4:]
     for current in strongest_currents_mps(sea, lowest_m, highest_m):
         if vehicle.is_steered_by_fins:
             if current.any():
                 _check_speed_through(vehicle, current, velocity)
-        elif current.any() or plan.follows_floor or plan.request.cross_rise_m:
-            _check_thrust_in(vehicle, current, plan.speed_mps, yaw, velocity)
+        elif current.any() or plan.follows_floor or plan.request.cross_rise_m or tether.length_m:
+
+            def load(current: Array, velocity: Array) -> float:
+                pulls = steady_pulls(tether, current, position, yaw, velocity)
+                return float(thrust_loads(vehicle, body_velocities(yaw, velocity - current), pulls).max())
+
+            _check_thrust_in(load, current, plan.speed_mps, velocity, " with its tether" if tether.length_m else "")
 
 
 def _check_speed_through(vehicle: VehicleConfig, current: Array, velocity: Array) -> None:
@@ -273,16 +291,18 @@ def _check_coverage(sea: Sea, lowest_m: float, highest_m: float, duration_s: flo
             raise TwinError("current.file", problem, "a file that covers it")
 
 
-def _check_thrust_in(vehicle: VehicleConfig, current: Array, cruise_mps: float, yaw: Array, velocity: Array) -> None:
-    hold, speed_mps = body_velocities(yaw, -np.tile(current, (len(yaw), 1))), float(np.linalg.norm(current))
-    if (factor := _saturating_factor(vehicle, lambda k: k * hold)) is not None:
+def _check_thrust_in(
+    load: Callable[[Array, Array], float], current: Array, cruise_mps: float, velocity: Array, tether: str
+) -> None:
+    """Raises TwinError if the thrust load(current, velocities) is above 1 to hold station or at velocities (n, 3)."""
+    speed_mps = float(np.linalg.norm(current))
+    if (factor := _saturating_factor(lambda k: load(k * current, 0 * velocity))) is not None:
         raise TwinError(
-            "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it",
+            "current.velocity_mps", f"{speed_mps:.2f} m/s: the thrusters cannot hold station against it{tether}",
             f"up to {np.floor(100 * factor * speed_mps) / 100:.2f} m/s in this direction",
         )  # fmt: skip
-    factor = _saturating_factor(vehicle, lambda k: body_velocities(yaw, k * velocity - current))
-    if factor is not None:
-        against = f" in a current of {speed_mps:.2f} m/s" if current.any() else " where it rises"
+    if (factor := _saturating_factor(lambda k: load(current, k * velocity))) is not None:
+        against = f" in a current of {speed_mps:.2f} m/s{tether}" if current.any() else tether or " where it rises"
         raise TwinError(
             "plan.speed_mps", f"{cruise_mps:g}: too fast for the thrusters{against}",
             f"up to {np.floor(1000 * factor * cruise_mps) / 1000:.3f}",
@@ -300,11 +320,9 @@ def climb_slope(vehicle: VehicleConfig, speed_mps: float) -> float:
     return _CLIMB_SHARE * climb / speed_mps
 
 
-def _saturating_factor(vehicle: VehicleConfig, velocities: Callable[[float], Array]) -> float | None:
-    """Returns the factor below 1 at which velocities(factor) (n, 3) saturate a thruster; None if there is none."""
-    if _load(vehicle, velocities(1.0)) <= 1:
-        return None
-    return _root(lambda factor: _load(vehicle, velocities(factor)) - 1, 1.0)
+def _saturating_factor(load: Callable[[float], float]) -> float | None:
+    """Returns the factor below 1 at which load(factor) is 1, a thruster saturates; None if there is none."""
+    return None if load(1.0) <= 1 else _root(lambda factor: load(factor) - 1, 1.0)
 
 
 def _root(function: Callable[[float], float], high: float) -> float:

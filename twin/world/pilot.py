@@ -18,7 +18,7 @@ from twin.errors import SurveyAborted
 from twin.kernels import kernel
 from twin.plugin.guard import GuardedPlugin
 from twin.plugin.loading import CONTROLLERS
-from twin.plugin.protocols import ControllerSetup
+from twin.plugin.protocols import Adaptation, ControllerSetup, Situation
 from twin.simulate.autopilot import allocation_without, nominal_controller, thruster_lag_s
 from twin.simulate.fin_control import fin_autopilot
 from twin.simulate.parameters import moves_along_all_axes
@@ -42,7 +42,7 @@ def make_pilot(mission: Mission, monitor: ThrusterMonitor | None = None) -> Pilo
     scenario = mission.scenario
     n_late = frames_of_latency(mission.scenario)
     if scenario.control.plugin is not None:
-        return _late(_plugin_pilot(mission, scenario.control.plugin), n_late)
+        return PluginPilot(mission, scenario.control.plugin)
     if scenario.vehicle.is_steered_by_fins:
         return _late(AuvPilot(mission), n_late)
     return (
@@ -78,18 +78,35 @@ def without_feedback(estimate: Estimate, reference: Reference, readings: Reading
     return estimate._replace(world_from_camera=pose, camera_velocity=twist)
 
 
-def _plugin_pilot(mission: Mission, name: str) -> PilotOfEstimates:
-    """Returns the pilot that gives the commands of the plug-in; a call raises PluginFailed if they are unusable."""
-    scenario, rig = mission.scenario, mission.rig
-    nominal = nominal_controller(scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz)
-    n = scenario.vehicle.n_commands if scenario.vehicle.dynamics == "rigid" else 3
-    setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
-    plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
+class PluginPilot:
+    """Pilot that gives the commands of a plug-in; calls raise PluginFailed if what it returns is unusable."""
 
-    def command(estimate: Estimate, reference: Reference) -> Array:
-        return plugin.numbers("command", plugin.call("command", estimate, reference), (n,))
+    def __init__(self, mission: Mission, name: str):
+        scenario, rig = mission.scenario, mission.rig
+        nominal = nominal_controller(scenario.vehicle, scenario.control.natural_frequency_radps, rig.frame_rate_hz)
+        n = scenario.vehicle.n_commands if scenario.vehicle.dynamics == "rigid" else 3
+        setup = ControllerSetup(rig, 1 / rig.frame_rate_hz, nominal.hull, nominal.allocation, n)
+        self._plugin = plugin = GuardedPlugin("control.plugin", CONTROLLERS, name, ["command"], setup)
+        self._command = _late(
+            lambda *known: plugin.numbers("command", plugin.call("command", *known), (n,)), frames_of_latency(scenario)
+        )
 
-    return command
+    def __call__(self, estimate: Estimate, reference: Reference) -> Array:
+        return self._command(estimate, reference)
+
+    @property
+    def adapts(self) -> bool:
+        """Returns whether the plug-in changes the path; known after the first command."""
+        return self._plugin.has("adapt")
+
+    def adaptation(self, situation: Situation) -> Adaptation | None:
+        asked = self._plugin.call("adapt", situation)
+        if asked is None:
+            return None
+        if not isinstance(asked, Adaptation):
+            self._plugin.refuse("adapt", type(asked).__name__, "an Adaptation or None")
+        numbers = self._plugin.numbers
+        return Adaptation(numbers("adapt", asked.offset_m, (3,)), float(numbers("adapt", asked.pace, ())))
 
 
 def _kinematic_pilot(mission: Mission) -> PilotOfEstimates:
