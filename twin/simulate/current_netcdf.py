@@ -36,8 +36,9 @@ def netcdf_rows(file: Path, current: CurrentConfig, depth_m: float) -> Array:
     read or is not of this form, or the place is not in it.
     """
     xarray = optional("xarray", "ocean", _KEY)
-    with reading(file, _KEY, _WANTED), file.open("rb") as stream:  # xarray takes some names for addresses
-        with xarray.open_dataset(stream, decode_timedelta=False) as data:
+    optional("netCDF4", "ocean", _KEY)
+    with reading(file, _KEY, _WANTED):  # an absolute path: xarray takes other names for addresses
+        with xarray.open_dataset(file.absolute(), engine="netcdf4", decode_timedelta=False) as data:
             columns = xarray.broadcast(*_columns(data, current, depth_m))
             rows = np.zeros((columns[0].size, 5))
             rows[:, : len(columns)] = np.column_stack([column.values.ravel() for column in columns])
