@@ -149,6 +149,11 @@ def test_errors_against_a_recorded_truth_are_judged_by_their_covariances():
         n_errors = len(rows) / every  # their mean chi-square of 3 has the standard deviation sqrt(6 / n)
         assert found["nees_position_mean"] == pytest.approx(3.0, abs=4 * np.sqrt(6 / n_errors)), (every, alignment)
         assert found["within_2sigma_position"] == pytest.approx(0.954, abs=0.02)
+    first = Trajectory(times_s[:10], estimate[:10])
+    short = SurveyResult(first, first, first, rows[:5], np.zeros(5, np.int64), node_cov[:5])
+    expected = np.mean(np.sum(errors[rows[1:5]] ** 2 / np.diag(cov), axis=1))  # not the one at which it was aligned
+    found = recorded_consistency(short, Trajectory(times_s[:10], moved @ poses[:10]), "first")
+    assert found["nees_position_mean"] == pytest.approx(expected)
 
 
 @pytest.mark.parametrize("offset_s", (1.0, -0.6))
