@@ -87,10 +87,8 @@ _NEEDS: dict[str, tuple[Callable[[RunContents], bool], str, str]] = {
 
 def chosen_formats(names: Sequence[str]) -> list[str]:
     """Returns the formats in names, each once; a name may list several with commas; raises TwinError if unknown."""
-    parts, known = (
-        [part.strip() for name in names for part in name.split(",") if part.strip()],
-        [*FORMATS, *PATH_FORMATS],
-    )
+    parts = [part.strip() for name in names for part in name.split(",") if part.strip()]
+    known = [*FORMATS, *PATH_FORMATS]
     for part in parts:
         if part not in known:
             close = difflib.get_close_matches(part, known, 1)

@@ -167,11 +167,10 @@ def _clock_offset(estimate: Trajectory, truth: Trajectory) -> tuple[float, float
         inside = (times_s >= true_s[0] + shift_s) & (times_s <= true_s[-1] + shift_s)
         if inside.sum() < max(_MIN_ASSOCIATED, _LEAST_COVERED * len(times_s)):
             return np.inf
-        at = [np.interp(times_s[inside], true_s + shift_s, axis) for axis in true_m.T]
-        moved = geometry.transform(
-            rigid_alignment(estimate.positions[inside], np.column_stack(at)), estimate.positions[inside]
-        )
-        return float(np.sqrt(np.mean(np.sum((moved - np.column_stack(at)) ** 2, axis=1))))
+        estimated = estimate.positions[inside]
+        true = np.column_stack([np.interp(times_s[inside], true_s + shift_s, axis) for axis in true_m.T])
+        moved = geometry.transform(rigid_alignment(estimated, true), estimated)
+        return float(np.sqrt(np.mean(np.sum((moved - true) ** 2, axis=1))))
 
     misfits_m = np.array([misfit_m(shift_s) for shift_s in shifts_s])
     best, as_given_m = int(np.argmin(misfits_m)), float(misfits_m[len(shifts_s) // 2])
