@@ -29,8 +29,8 @@ def check_no_undeclared_holes(values: NDArray[np.float64], file: Path, remedy: s
         if heights.size == 0:
             continue
         low, high, n_cells = heights.min(), heights.max(), np.count_nonzero(finite == value)
-        gap, problem = max(low - value, value - high), f"has the value {value:g} in {n_cells} cells, far from all others"
-        problem += f" ({low:g} to {high:g}), and does not declare it as nodata"
+        gap, problem = max(low - value, value - high), f"has the value {value:g} in {n_cells} cells, far from"
+        problem += f" all others ({low:g} to {high:g}), and does not declare it as nodata"
         if gap > max(_LEAST_GAP, _MOST_RANGES * (high - low)):
             raise height_error(file, problem, remedy.format(f"{value:g}"))
         if n_cells > 1 and gap > high - low:

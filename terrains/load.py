@@ -1,4 +1,4 @@
-"""Terrains from files: heights from GeoTIFF, grids as text, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
+"""Terrains from files: heights from GeoTIFF, text grids, 16-bit PNG or .npy, texture from a photo or an orthophoto."""
 
 from __future__ import annotations
 
