@@ -223,30 +223,46 @@ def _interpolated_noise(t):
 
 
 @kernel(forceinline=True, fastmath=True)
-def _accumulate(sums, centre, disparity, residual, slope, locking, i, j, weight, support):
-    """Adds the neighbours at offset (i, j) of the pixels `centre` of a row to the sums (13, n) of the plane fits."""
-    s0, s1, s2, s3, s4, s5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-    s6, s7, s8, s9, s10, s11, s12 = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11], sums[12]
+def _accumulate(sums, centre, disparity, residual, slope, locking, i, weight, support):
+    """Adds the neighbours at column offset i of the pixels `centre` of a row to the sums (9, n) of their row."""
+    s0, s1, s2, s3, s4 = sums[0], sums[1], sums[2], sums[3], sums[4]
+    s5, s6, s7, s8 = sums[5], sums[6], sums[7], sums[8]
     for u in range(centre.size):
         e = disparity[u] - centre[u]
         w = weight if abs(e) < support else np.float32(0)
         wg = w * slope[u]
         m = wg * slope[u]
         q = m * e + wg * residual[u]
-        mi, mj = m * i, m * j
+        mi = m * i
         s0[u] += m
         s1[u] += mi
-        s2[u] += mj
-        s3[u] += mi * i
-        s4[u] += mi * j
-        s5[u] += mj * j
-        s6[u] += q
-        s7[u] += q * i
-        s8[u] += q * j
-        s9[u] += w * residual[u] * residual[u]
-        s10[u] += w
-        s11[u] += w * m
-        s12[u] += w * locking[u]
+        s2[u] += mi * i
+        s3[u] += q
+        s4[u] += q * i
+        s5[u] += w * residual[u] * residual[u]
+        s6[u] += w
+        s7[u] += w * m
+        s8[u] += w * locking[u]
+
+
+@kernel(forceinline=True, fastmath=True)
+def _add_row(sums, row, j, weight):
+    """Adds the sums (9, n) of the neighbours in a row at offset j, with its weight, to those (13, n) of the planes."""
+    for u in range(row.shape[1]):
+        m, mi, q = weight * row[0, u], weight * row[1, u], weight * row[3, u]
+        sums[0, u] += m
+        sums[1, u] += mi
+        sums[2, u] += m * j
+        sums[3, u] += weight * row[2, u]
+        sums[4, u] += mi * j
+        sums[5, u] += m * j * j
+        sums[6, u] += q
+        sums[7, u] += weight * row[4, u]
+        sums[8, u] += q * j
+        sums[9, u] += weight * row[5, u]
+        sums[10, u] += weight * row[6, u]
+        sums[11, u] += weight * weight * row[7, u]
+        sums[12, u] += weight * row[8, u]
 
 
 @kernel
@@ -263,17 +279,19 @@ def _fit_planes(disparity, residual, slope, locking, noise, window, support, pri
     unit_variance = np.full((height, width), np.float32(np.inf))
     gain = np.ones((height, width), np.float32)
     mean_square = np.zeros((height, width), np.float32)
-    sums = np.empty((13, width), np.float32)
+    sums, row = np.empty((13, width), np.float32), np.empty((9, width), np.float32)
     for v in range(height):
         sums[:] = 0
         for j in range(max(-half, -v), min(half, height - 1 - v) + 1):
+            row[:] = 0
             for i in range(-half, half + 1):
                 lo, hi = max(0, -i), min(width, width - i)
-                neighbours, weight = (v + j, slice(lo + i, hi + i)), window[j + half] * window[i + half]
+                neighbours = v + j, slice(lo + i, hi + i)
                 _accumulate(
-                    sums[:, lo:hi], disparity[v, lo:hi], disparity[neighbours], residual[neighbours],
-                    slope[neighbours], locking[neighbours], np.float32(i), np.float32(j), weight, support,
+                    row[:, lo:hi], disparity[v, lo:hi], disparity[neighbours], residual[neighbours],
+                    slope[neighbours], locking[neighbours], np.float32(i), window[i + half], support,
                 )  # fmt: skip
+            _add_row(sums, row, np.float32(j), window[j + half])
         for u in range(width):
             if disparity[v, u] < 0:
                 continue
