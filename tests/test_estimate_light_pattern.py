@@ -5,9 +5,16 @@ import pytest
 from seafloor_scene import digitise, down_camera, plane, render_view, small_rig
 
 from twin.core.records import MapGrid
-from twin.estimate.mapping.map_builder import KeyframePath, build_map, gray_levels
+from twin.estimate.mapping.map_builder import KeyframePath, build_map
 from twin.estimate.vision import disparity
-from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
+from twin.estimate.vision.light_pattern import (
+    DEGREE,
+    light_pattern,
+    pattern_coefficients,
+    pattern_difference,
+    pattern_fit,
+)
+from twin.estimate.vision.matching import luma
 
 RIG = small_rig(80, 60)  # images binned by 4
 INSIDE = np.s_[4:-4, 16:-4]
@@ -33,7 +40,7 @@ def test_noise_of_interpolated_pixels_does_not_bias_disparities_of_faint_texture
     rng, errors = np.random.default_rng(1), []
     for x_m in np.arange(12) * 0.7:
         pair, truth = faint_pair(x_m, RIG.focal_px * RIG.baseline_m / (4 + fraction), rng)
-        errors.append(disparity.dense_disparity(*pair, 16).disparity_px[INSIDE] - truth)
+        errors.append(disparity.dense_disparity(*pair).disparity_px[INSIDE] - truth)
     assert abs(np.nanmedian(errors)) < 0.03
 
 
@@ -41,11 +48,12 @@ def test_the_light_of_lamps_is_not_matched_as_texture_once_it_is_known():
     rng = np.random.default_rng(2)
     surveyed = [faint_pair(x_m, 2.2, rng, lamps=60.0, contrast=0.06) for x_m in np.arange(12) * 0.7]
     truth = surveyed[0][1]
-    pattern = light_pattern([pattern_fit(pair) for pair, _ in surveyed], (60, 80))
-    assert pattern is not None
+    coefficients = pattern_coefficients([pattern_fit(pair) for pair, _ in surveyed])
+    assert coefficients is not None
+    pattern = light_pattern(coefficients, (60, 80))
 
     def gross(left, right):
-        found = [disparity.dense_disparity(p[0] - left, p[1] - right, 16) for p, _ in surveyed]
+        found = [disparity.dense_disparity(p[0] - left, p[1] - right) for p, _ in surveyed]
         error = np.abs(np.array([f.with_sigma_below(0.5).disparity_px for f in found]) - truth)
         return np.mean(error[np.isfinite(error)] > 1), np.isfinite(error).mean()
 
@@ -61,7 +69,8 @@ def test_the_map_of_a_faintly_textured_floor_is_right_without_the_light_pattern(
     grays = [faint_pair(x, 2.2, rng, lamps=60.0, contrast=0.06)[0] for x in x_m]
     pairs = [tuple(np.repeat(g[..., None], 3, 2).astype(np.uint8) for g in pair) for pair in grays]
     path = KeyframePath(np.array([down_camera(x, 0.3 * x, 2.2) for x in x_m]), *np.zeros((2, len(x_m), 6, 6)))
-    pattern = light_pattern([pattern_fit(gray_levels(pair)) for pair in pairs], (60, 80))
+    fits = [pattern_fit([luma(image) for image in pair]) for pair in pairs]
+    pattern = light_pattern(pattern_coefficients(fits), (60, 80))
     grid = MapGrid(-1.0, 2.0, 0.1, 30, 52)
     median, median_before = (
         np.nanmedian(np.abs(build_map(pairs, path, RIG, grid, pattern=p).height_m)) for p in (pattern, None)
@@ -74,9 +83,9 @@ def test_coefficients_that_vary_between_the_images_as_much_as_their_mean_are_lef
     rng = np.random.default_rng(3)
     fits = rng.normal(0.0, 1.0, (30, 2, 7, 7))
     fits[:, :, 0, 2] += 20.0  # the light
-    pattern = light_pattern(list(fits), (60, 80))
-    assert pattern is not None
-    found, mean = pattern_fit(pattern), fits.mean(axis=0)
+    coefficients = pattern_coefficients(list(fits))
+    assert coefficients is not None
+    found, mean = pattern_fit(light_pattern(coefficients, (60, 80))), fits.mean(axis=0)
     np.testing.assert_allclose(found[:, 0, 2], mean[:, 0, 2], rtol=0.02)
     others = np.ones((2, 7, 7), bool)
     others[:, 0, 2] = False
@@ -87,15 +96,22 @@ def test_texture_that_dominates_the_light_is_not_taken_for_a_light_pattern():
     """The images of the survey overlap by 90 %, so that their mean contains the texture of the floor."""
     rng = np.random.default_rng(3)
     fits = [pattern_fit(faint_pair(x_m, 2.2, rng, lamps=4.0, contrast=1.0)[0]) for x_m in np.arange(12) * 0.2]
-    assert light_pattern(list(fits), (60, 80)) is None
+    assert pattern_coefficients(list(fits)) is None
 
 
 def test_the_brightness_of_the_images_does_not_decide_whether_there_is_a_light_pattern():
     rng = np.random.default_rng(4)
     fits = rng.normal(0.0, 1.0, (20, 2, 7, 7))
     fits[:, :, 0, 0] += 100.0
-    assert light_pattern(list(fits), (60, 80)) is None
+    assert pattern_coefficients(list(fits)) is None
 
 
 def test_one_keyframe_has_no_light_pattern():
-    assert light_pattern([np.ones((2, 7, 7))], (60, 80)) is None
+    assert pattern_coefficients([np.ones((2, 7, 7))]) is None
+
+
+def test_the_difference_of_two_light_patterns_is_that_of_their_images():
+    a, b = np.random.default_rng(5).normal(0.0, 1.0, (2, 2, DEGREE + 1, DEGREE + 1))
+    images = light_pattern(a, (600, 800)) - light_pattern(b, (600, 800)) - (a - b)[:, 0, 0, None, None]
+    assert pattern_difference(a, b) == pytest.approx(np.sqrt((images**2).mean((1, 2))).max(), rel=0.02)
+    assert pattern_difference(a, None) == pytest.approx(pattern_difference(None, a))

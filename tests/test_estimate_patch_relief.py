@@ -5,7 +5,7 @@ import numpy as np
 import seafloor_scene
 
 from twin.core.settings import EstimatorSettings
-from twin.estimate.vision import disparity, matching, patches, stereo
+from twin.estimate.vision import disparity, patches, stereo
 
 PATCH_PX, HALF = 11, 5
 COLUMNS, ROWS = np.meshgrid(np.arange(48.0), np.arange(48.0))
@@ -74,7 +74,7 @@ def slopes_over_uneven_floor(seed):
     floor = seafloor_scene.Seafloor(0.2 * height / height.std(), 0.1, -8.0, -8.0, texels, texture_px_m=0.076)
     *pair, depth = seafloor_scene.stereo_pair(floor, rig, seafloor_scene.down_camera(0, 0, 3.35), rng)
     left, right = (cv2.GaussianBlur(image.astype(np.float32), (3, 3), 0.5) for image in pair)
-    dense = disparity.search(matching.normalise(left), matching.normalise(right), 48)
+    dense = disparity.match_densely(left, right).best_px
     points = stereo.match_stereo_points(left, right, dense, rig, EstimatorSettings(points=1000, patch_px=15))
     true_px = (rig.focal_px * rig.baseline_m / depth).astype(np.float32)
     return points.disparity_slope, patches.disparity_slope(true_px, points.pixels, 15)

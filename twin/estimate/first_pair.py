@@ -11,10 +11,10 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Frame, Image, Map, StereoRig
 from twin.core.settings import EstimatorSettings
-from twin.estimate.mapping.map_builder import ImagePair, gray_levels
+from twin.estimate.mapping.map_builder import ImagePair
 from twin.estimate.vision import disparity, matching, stereo
 from twin.estimate.vision.disparity import Disparity
-from twin.estimate.vision.light_pattern import MeanIllumination, light_pattern, pattern_fit
+from twin.estimate.vision.light_pattern import MeanIllumination, light_pattern, pattern_coefficients, pattern_fit
 from twin.estimate.vision.stereo import StereoPoints
 
 _MIN_POINTS = 30  # smallest number of matched points from which anything is concluded
@@ -58,7 +58,7 @@ class FloorPlane(NamedTuple):
 
 
 def inspect_pair(frame: Frame, rig: StereoRig, settings: EstimatorSettings | None = None) -> PairInspection:
-    """Matches a stereo pair over the widest range of disparities, and again exchanged (see `_SWAPPED_SHARE`)."""
+    """Matches a stereo pair and again exchanged (see `_SWAPPED_SHARE`)."""
     chosen, square = settings or EstimatorSettings(), rig.with_square_pixels()
     left, right = _square_images(frame, rig)
     dense, points = _matched(left, right, square, chosen)
@@ -75,10 +75,8 @@ def _square_images(frame: Frame, rig: StereoRig) -> ImagePair:
 
 def _matched(left: Image, right: Image, rig: StereoRig, settings: EstimatorSettings) -> tuple[Disparity, StereoPoints]:
     grays = matching.gray(left, 1), matching.gray(right, 1)
-    widest_px = disparity.SearchRange(rig).max_disparity_px
-    bytes_left, bytes_right = (np.round(gray).astype(np.uint8) for gray in grays)
-    dense = disparity.dense_disparity(bytes_left, bytes_right, widest_px)
-    return dense, stereo.match_stereo_points(*grays, dense.disparity_px, rig, settings)
+    dense = disparity.match_densely(*(np.round(gray).astype(np.uint8) for gray in grays))
+    return dense.fine, stereo.match_stereo_points(*grays, dense.best_px, rig, settings)
 
 
 def floor_plane(points: StereoPoints) -> FloorPlane | None:
@@ -136,15 +134,13 @@ def inspect_light(pair: PairInspection, frames: Iterable[Frame], rig: StereoRig)
     mean = np.zeros((2, pair.rig.height_px, pair.rig.width_px), np.float32)
     for frame in frames:
         images = _square_images(frame, rig)
-        grays = gray_levels(images)
+        grays = matching.luma(images[0]), matching.luma(images[1])
         mean += np.array(grays)
         fits.append(pattern_fit(grays))
         illumination.add(images[0])
-    pattern = light_pattern(fits, mean.shape[1:])
-    dense = pair.disparity
-    if pattern is not None:
-        left, right = gray_levels((pair.left, pair.right))
-        widest_px = disparity.SearchRange(pair.rig).max_disparity_px
-        dense = disparity.dense_disparity(left - pattern[0], right - pattern[1], widest_px)
+    coefficients, dense = pattern_coefficients(fits), pair.disparity
+    if coefficients is not None:
+        levels = np.array([matching.luma(image) for image in (pair.left, pair.right)])
+        dense = disparity.dense_disparity(*(levels - light_pattern(coefficients, levels.shape[1:])))
     even = np.clip(np.round(pair.left * illumination.gain()), 0, 255).astype(np.uint8)
-    return LightInspection(len(fits), mean[0] / len(fits), mean[1] / len(fits), even, pattern is not None, dense)
+    return LightInspection(len(fits), mean[0] / len(fits), mean[1] / len(fits), even, coefficients is not None, dense)

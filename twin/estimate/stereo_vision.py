@@ -18,7 +18,6 @@ from twin.core.records import (
     Frame,
     Image,
     ImuReadings,
-    Map,
     MapGrid,
     SensorNoise,
     StereoObservation,
@@ -27,13 +26,14 @@ from twin.core.records import (
 )
 from twin.core.settings import EstimatorSettings
 from twin.core.timing import StageTimer, Stopwatch
-from twin.estimate.mapping.map_builder import ImagePair, KeyframePath, build_map, gray_levels
+from twin.estimate.mapping.map_builder import KeyframePath, MapView, build_map
 from twin.estimate.vision import disparity, epipolar_calibration, matching, stereo, wide_search
+from twin.estimate.vision.disparity import DenseMatch
 from twin.estimate.vision.epipolar_calibration import EpipolarCalibration
 from twin.estimate.vision.f2f import FrameToFrame
 from twin.estimate.vision.image_quality import contrast, repetition, saturated_fraction
 from twin.estimate.vision.image_spool import ImageSpool
-from twin.estimate.vision.light_pattern import light_pattern, pattern_fit
+from twin.estimate.vision.light_pattern import light_pattern, pattern_coefficients, pattern_difference, pattern_fit
 from twin.estimate.vision.mosaic import Mosaic, Registration, can_represent, viewing_plane
 from twin.estimate.vision.pair_matching import SEARCH_PX, PairMatcher
 from twin.estimate.vision.repeated_images import RepeatedImages
@@ -42,6 +42,9 @@ from twin.estimate.vision.two_view_motion import Motion
 
 _MIN_POINTS = 12  # smallest number of matched points for a keyframe
 _PATTERN_PAIRS = 100  # largest number of keyframes from which the light pattern is estimated
+#: A pair is matched again for the map if the light pattern has changed by more since then, RMS [grey levels]: half the
+#: smallest noise.
+_PATTERN_CHANGE = 0.2
 
 
 class StereoVision:
@@ -84,12 +87,12 @@ class StereoVision:
     def _configure(self, binning: int) -> None:
         self.binning, self.rig = binning, self.full_rig.binned(binning)
         self.spool = ImageSpool(self._folder, binning)
-        self._pattern_fits: dict[int, Array] = {}  # by frame index
+        self._pattern_fits: dict[int, Array] = {}  # by frame index, as `_known_patterns` is
+        self._known_patterns: dict[int, Array | None] = {}  # coefficients of that without which a pair was matched
         self.f2f = FrameToFrame(
             self.rig, self.settings.patch_px, self._imu_noise, self.settings.stops_if_blind
         )  # fmt: skip
         self.matcher = PairMatcher(self.rig, self.spool, self.settings.patch_px)
-        self.search_range = disparity.SearchRange(self.rig)
         self._gray = self._depth_m = np.zeros((self.rig.height_px, self.rig.width_px), np.float32)
         self._image = self._gray.astype(np.uint8)
 
@@ -130,21 +133,21 @@ class StereoVision:
         with self.stopwatch("stereo"):
             if self._points is None:
                 self._choose_scale(left, right, frame.readings.imu)
-            corrected, gray, dense_px, points = self._match_pair(right)
+            corrected, gray, dense, points = self._match_pair(left, right, row)
             if len(points.xyz) >= _MIN_POINTS:
                 self.calibration.add(points, self.rig, self.settings.patch_px)
                 if self.calibration.update(self.full_rig):
-                    corrected, gray, dense_px, points = self._match_pair(right)
+                    corrected, gray, dense, points = self._match_pair(left, right, row)
             self.stereo_observations.append(self._observation(row, frame.left, points))
         if len(points.xyz) < _MIN_POINTS:
+            del self._pattern_fits[row]
             return None
-        far_enough_px = np.where(dense_px > 1.0, dense_px, np.nan)
+        far_enough_px = np.where(dense.best_px > 1.0, dense.best_px, np.nan)
         depth_m = self.rig.focal_px * self.rig.baseline_m / far_enough_px
         self._points, self._depth_m = points, depth_m.astype(np.float32)
-        self.spool.put(row, left, corrected, (self._gray, gray))
+        self.spool.put(row, left, corrected, (self._gray, gray), dense.fine)
         self.matcher.removed_yaw[row] = float(self.calibration.removed[1])
         self.matcher.twists[row] = self.f2f.filter.velocity.copy()
-        self._pattern_fits[row] = pattern_fit(gray_levels(self._binned(left, corrected)))
         return points
 
     def _choose_scale(self, left: Image, right: Image, imu: ImuReadings | None) -> None:
@@ -156,18 +159,22 @@ class StereoVision:
             self._set_image(left)
             self.f2f.step(self._image, imu=imu)
 
-    def _match_pair(self, right: Image) -> tuple[Image, matching.Gray, Map, StereoPoints]:
-        """Matches the current left image with a right image, from which known rectification errors are removed.
+    def _match_pair(self, left: Image, right: Image, row: int) -> tuple[Image, matching.Gray, DenseMatch, StereoPoints]:
+        """Matches a left image with a right one, from which known rectification errors are removed.
 
         Returns the corrected right image, its grey levels at the image scale, its disparity, and points.
         """
         right = self.calibration.rectify(right, self.full_rig)
         gray = matching.gray(right, self.binning)
-        dense_px = disparity.search(self._image, matching.normalise(gray), self.search_range.max_disparity_px)
-        points = stereo.match_stereo_points(self._gray, gray, dense_px, self.rig, self.settings)
-        # black images match at disparity 0, which says nothing about the next pair
-        self.search_range.update(dense_px if len(points.xyz) >= _MIN_POINTS else dense_px[:0])
-        return right, gray, dense_px, points
+        levels = np.array([matching.luma(matching.binned(image, self.binning)) for image in (left, right)])
+        self._pattern_fits[row] = pattern_fit(levels)
+        self._known_patterns[row] = known = self._pattern(list(self._pattern_fits))
+        dense = disparity.match_densely(*(levels - light_pattern(known, gray.shape)))
+        return right, gray, dense, stereo.match_stereo_points(self._gray, gray, dense.best_px, self.rig, self.settings)
+
+    def _pattern(self, rows: Sequence[int]) -> Array | None:
+        """Returns the coefficients of the light pattern from keyframes at given frame indices."""
+        return pattern_coefficients([self._pattern_fits[row] for row in rows[:: -(-len(rows) // _PATTERN_PAIRS)]])
 
     def _observation(self, row: int, left: Image, points: StereoPoints) -> StereoObservation:
         """Returns the quality of a stereo pair; row differences are in pixels of the full image with square pixels."""
@@ -262,16 +269,19 @@ class StereoVision:
         self, result: SurveyResult, grid: MapGrid, step_cov: Array, progress: Callable[[int], None]
     ) -> ElevationMap:
         rows = result.keyframe_rows
-        pairs = (self._binned(*self.spool.pair(int(row))) for row in rows)
         removed_rad = np.array([self.matcher.removed_yaw[row] for row in rows.tolist()])
         yaw_rad = result.quality.calibration.yaw_rad - removed_rad
-        chosen = rows[:: -(-len(rows) // _PATTERN_PAIRS)] if len(rows) else rows
-        pattern = light_pattern([self._pattern_fits[int(row)] for row in chosen], self._gray.shape)
+        coefficients = self._pattern(rows.tolist()) if len(rows) else None
+        pattern = light_pattern(coefficients, self._gray.shape)
+        views = (self._map_view(row, coefficients) for row in rows.tolist())
         path = KeyframePath(result.final.world_from_camera[rows], result.node_cov, step_cov, yaw_rad)
-        return build_map(pairs, path, self.rig, grid, progress, pattern, result.quality.calibration)
+        return build_map(views, path, self.rig, grid, progress, pattern, result.quality.calibration)
 
-    def _binned(self, left: Image, right: Image) -> ImagePair:
-        return matching.binned(left, self.binning), matching.binned(right, self.binning)
+    def _map_view(self, row: int, pattern: Array | None) -> MapView:
+        left = matching.binned(self.spool.left(row), self.binning)
+        if pattern_difference(self._known_patterns[row], pattern) <= _PATTERN_CHANGE:
+            return left, self.spool.disparity(row)
+        return left, matching.binned(self.spool.right(row), self.binning)
 
     def left_image(self, row: int) -> Image | None:
         return self.spool.left(row)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 
 from twin.core import geometry
@@ -18,7 +17,9 @@ from twin.estimate.mapping import depth_filter, elevation, surface
 from twin.estimate.mapping.depth_filter import DepthMap
 from twin.estimate.mapping.surface import HeightPatch
 from twin.estimate.vision import disparity
+from twin.estimate.vision.disparity import Disparity
 from twin.estimate.vision.light_pattern import MeanIllumination
+from twin.estimate.vision.matching import luma
 
 #: Largest standard deviation of a stereo disparity that enters the map [px]. Beyond this limit, texture is as weak as
 #: noise, and half of the pixels are mismatches. A limit of 1 px doubles the number of cells with errors above 0.1 m; a
@@ -30,6 +31,8 @@ MAX_RELATIVE_SIGMA = 0.2
 
 
 ImagePair = tuple[Image, Image]  # left and right image (H, W, 3)
+#: Left image (H, W, 3), and the right one or the disparity between them without the light pattern, if it is known.
+MapView = tuple[Image, Image | Disparity]
 
 
 class KeyframePath(NamedTuple):
@@ -49,7 +52,7 @@ class _FilterState(NamedTuple):
 
 
 def build_map(
-    pairs: Iterable[ImagePair],
+    views: Iterable[MapView],
     path: KeyframePath,
     rig: StereoRig,
     grid: MapGrid,
@@ -63,11 +66,10 @@ def build_map(
     """
     rig = replace(rig, baseline_m=rig.baseline_m * (1 + calibration.baseline_error))
     mapper, illumination = elevation.ElevationMapper(grid), MeanIllumination(rig)
-    search_range = disparity.SearchRange(rig)
     poses, old = path.world_from_camera, None
     yaw_rad = np.zeros(len(poses)) if path.yaw_rad is None else path.yaw_rad
-    turned = zip(pairs, yaw_rad.tolist(), strict=True)
-    stereo = prefetched(_measure_depth(pair, yaw, search_range, rig, pattern) for pair, yaw in turned)
+    turned = zip(views, yaw_rad.tolist(), strict=True)
+    stereo = prefetched(_measure_depth(view, yaw, rig, pattern) for view, yaw in turned)
     for k, (left, gray, stereo_depth) in enumerate(stereo):
         depth, inherited = stereo_depth, None
         if old is not None:
@@ -101,29 +103,23 @@ def with_calibration_sigma(
     return replace(found, sigma_m=np.sqrt(found.sigma_m**2 + variance).astype(found.sigma_m.dtype))
 
 
-def gray_levels(pair: ImagePair) -> tuple[Map, Map]:
-    """Returns the grey levels (H, W) of the left and the right image, not rounded to whole levels."""
-    left, right = (np.asarray(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_RGB2GRAY), np.float32) for image in pair)
-    return left, right
-
-
-def _measure_depth(
-    pair: ImagePair, yaw_rad: float, search_range: disparity.SearchRange, rig: StereoRig, pattern: Map | None
-) -> tuple[Image, Map, DepthMap]:
+def _measure_depth(view: MapView, yaw_rad: float, rig: StereoRig, pattern: Map | None) -> tuple[Image, Map, DepthMap]:
     """Returns the left image, its grey levels without the light pattern, and its depth from this pair alone."""
-    left, right = gray_levels(pair)
-    if pattern is not None:
-        left, right = left - pattern[0], right - pattern[1]
-    stereo = disparity.dense_disparity(left, right, search_range.max_disparity_px)
+    image, other = view
+    left = luma(image) if pattern is None else luma(image) - pattern[0]
+    if isinstance(other, Disparity):
+        stereo = other
+    else:
+        right = luma(other)
+        stereo = disparity.dense_disparity(left, right if pattern is None else right - pattern[1])
     stereo = stereo.with_sigma_below(np.minimum(MAX_STEREO_SIGMA_PX, MAX_RELATIVE_SIGMA * stereo.disparity_px))
-    search_range.update(stereo.disparity_px)
     if rig.port is not None:
         stereo = stereo._replace(disparity_px=_without_refraction(stereo.disparity_px, rig))
     if yaw_rad:
         column = (np.arange(left.shape[1]) - stereo.disparity_px - rig.cx_px) / rig.focal_px  # in the right image
         offset_px = (yaw_rad * rig.focal_px * (1 + column**2)).astype(np.float32)
         stereo = stereo._replace(disparity_px=stereo.disparity_px - offset_px)
-    return pair[0], left, depth_filter.stereo_depth(stereo, rig)
+    return image, left, depth_filter.stereo_depth(stereo, rig)
 
 
 def _without_refraction(disparity_px: Map, rig: StereoRig) -> Map:

@@ -6,8 +6,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from twin.core.records import Image, Map, StereoRig
+from twin.core.records import Image, Map
+from twin.core.threads import in_pair
 from twin.estimate.vision import epipolar
 
 #: Block size of semi-global matching [px]. In turbid water, more pixels are matched with a block of 5 px than with one
@@ -22,6 +24,9 @@ CONSISTENCY_PX = 1.0
 #: Standard deviation of errors that the refinement does not model (interpolation, relief inside the window) [px].
 MIN_SIGMA_PX = 0.03
 MAX_DISPARITY_FRACTION = 0.4  #: largest disparity that is searched, as a fraction of the image width
+#: Images are reduced by this factor to find the range of disparities; smallest number of known ones; quantile of them,
+#: and relative and absolute [px] margin beyond it at both ends.
+_REDUCTION, _LEAST_KNOWN, _QUANTILE, _MARGIN, _MARGIN_PX = 4, 100, 0.001, 0.1, 8
 #: Largest standard deviation of a valid disparity, computed as if pixel noise were independent [px].
 MAX_SIGMA_PX = 1.0
 
@@ -38,55 +43,93 @@ class Disparity(NamedTuple):
         unknown = np.float32(np.nan)
         return Disparity(np.where(accepted, self.disparity_px, unknown), np.where(accepted, self.sigma_px, unknown))
 
+    def packed(self) -> NDArray[np.uint16]:
+        """Returns it as whole numbers (2, H, W): disparities in steps of a 65,000th of the widest, sigmas as halves."""
+        steps = np.rint(np.nan_to_num(self.disparity_px) / _step_px(self.disparity_px.shape[1]))
+        return np.stack([steps.astype(np.uint16), self.sigma_px.astype(np.float16).view(np.uint16)])
 
-def dense_disparity(left: Image | Map, right: Image | Map, max_disparity_px: int) -> Disparity:
+    @classmethod
+    def unpacked(cls, packed: NDArray[np.uint16]) -> Disparity:
+        sigma_px = packed[1].view(np.float16).astype(np.float32)
+        disparity_px = packed[0] * _step_px(packed.shape[2])
+        return cls(np.where(np.isnan(sigma_px), np.float32(np.nan), disparity_px), sigma_px)
+
+
+class DenseMatch(NamedTuple):
+    """Disparity of a stereo pair before and after the refinement."""
+
+    coarse_px: Map  #: (H, W) float32 disparity accurate to about 0.2 px [px], NaN where unknown
+    fine: Disparity
+
+    @property
+    def best_px(self) -> Map:
+        """Returns the refined disparity (H, W) [px], or the coarse one where that is unknown."""
+        return np.where(np.isfinite(self.fine.disparity_px), self.fine.disparity_px, self.coarse_px)
+
+
+def match_densely(left: Image | Map, right: Image | Map) -> DenseMatch:
     """Returns the disparity of the pixels of the left image that are matched in the right one; NaN elsewhere.
 
     Semi-global matching (Hirschmueller 2008; OpenCV, three path directions) of images (H, W) with locally normalised
     contrast, with a left-right check, is refined by `epipolar.refine` (bias on a rendered reef 0.002 instead of 0.02
     px). The standard deviation is that without the prior of the refinement.
     """
-    coarse = search_consistent(_normalise_contrast(left), _normalise_contrast(right), max_disparity_px)
+    coarse = _search_consistent(_normalise_contrast(left), _normalise_contrast(right))
     fine = epipolar.refine(left.astype(np.float32), right.astype(np.float32), coarse, epipolar.STEREO)
     sigma = np.hypot(fine.measurement_sigma_px, np.float32(MIN_SIGMA_PX))
-    return Disparity(fine.disparity_px, sigma).with_sigma_below(MAX_SIGMA_PX * fine.variance_inflation**0.5)
+    limit_px = MAX_SIGMA_PX * fine.variance_inflation**0.5
+    return DenseMatch(coarse, Disparity(fine.disparity_px, sigma).with_sigma_below(limit_px))
 
 
-class SearchRange:
-    """Largest disparity to search: the widest one at first, then adapted to the disparities of the last pair."""
-
-    def __init__(self, rig: StereoRig):
-        self._widest_px = self.max_disparity_px = int(MAX_DISPARITY_FRACTION * rig.width_px)
-
-    def update(self, disparity_px: Map) -> None:
-        """Adapts the range to the disparities (H, W) of the last pair; sets the widest range if too few are known."""
-        known = disparity_px[np.isfinite(disparity_px)]
-        wanted = 1.3 * np.quantile(known, 0.995) + 8 if known.size > 100 else self._widest_px
-        self.max_disparity_px = min(int(wanted), self._widest_px)
+def dense_disparity(left: Image | Map, right: Image | Map) -> Disparity:
+    """Returns the refined disparity of `match_densely`."""
+    return match_densely(left, right).fine
 
 
-def search(left: Image, right: Image, max_disparity_px: int) -> Map:
+def search_range(left: Image, right: Image) -> tuple[int, int]:
+    """Returns the smallest and the largest disparity to search in images (H, W) of normalised contrast [px].
+
+    They are found in reduced images, at a fiftieth of the time; the whole range if too few pixels match there.
+    """
+    widest_px = int(MAX_DISPARITY_FRACTION * left.shape[1])
+    size = left.shape[1] // _REDUCTION, left.shape[0] // _REDUCTION
+    small_left, small_right = (
+        np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8) for image in (left, right)
+    )
+    small_range = 0, -(-widest_px // _REDUCTION)
+    found = search(small_left, small_right, small_range, SPECKLE_PX // _REDUCTION**2)
+    known = found[np.isfinite(found)]
+    if known.size < _LEAST_KNOWN:
+        return 0, widest_px
+    low, high = _REDUCTION * np.quantile(known, (_QUANTILE, 1 - _QUANTILE))
+    return max(int(low * (1 - _MARGIN)) - _MARGIN_PX, 0), min(int(high * (1 + _MARGIN)) + _MARGIN_PX, widest_px)
+
+
+def search(left: Image, right: Image, range_px: tuple[int, int], speckle_px: int = SPECKLE_PX) -> Map:
     """Returns the disparity (H, W) [px] by semi-global matching, accurate to about 0.2 px; NaN where unknown.
 
     The images (H, W) have normalised contrast. They are padded on the left; otherwise the left margin, as wide as the
-    search range (rounded up to a multiple of 16), would have no disparity.
+    largest disparity searched (their number is a multiple of 16), would have no disparity.
     """
-    count = -(-max_disparity_px // 16) * 16
+    low, high = range_px
+    count = -(-max(high - low, 1) // 16) * 16
     matcher = cv2.StereoSGBM.create(
-        0, count, BLOCK_PX, P1=8 * BLOCK_PX**2, P2=32 * BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=63,
-        speckleWindowSize=SPECKLE_PX, speckleRange=1, mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
+        low, count, BLOCK_PX, P1=8 * BLOCK_PX**2, P2=32 * BLOCK_PX**2, disp12MaxDiff=1, preFilterCap=63,
+        speckleWindowSize=speckle_px, speckleRange=1, mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
     )  # fmt: skip
-    padded = [cv2.copyMakeBorder(image, 0, 0, count, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
-    disparity = matcher.compute(*padded)[:, count:].astype(np.float32) / np.float32(16)
+    margin = low + count
+    padded = [cv2.copyMakeBorder(image, 0, 0, margin, 0, cv2.BORDER_REPLICATE) for image in (left, right)]
+    disparity = matcher.compute(*padded)[:, margin:].astype(np.float32) / np.float32(16)
     column = np.arange(left.shape[1], dtype=np.float32)
-    disparity[(disparity < 0) | (disparity > column)] = np.nan
+    disparity[(disparity < low) | (disparity > column)] = np.nan
     return disparity.astype(np.float32)
 
 
-def search_consistent(left: Image, right: Image, max_disparity_px: int) -> Map:
+def _search_consistent(left: Image, right: Image) -> Map:
     """Returns the disparity from `search`, with NaN at the pixels that fail the left-right consistency check."""
-    disparity = search(left, right, max_disparity_px)
-    mirrored = search(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]), max_disparity_px)
+    range_px = search_range(left, right)
+    flipped = np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1])
+    disparity, mirrored = in_pair(lambda: search(left, right, range_px), lambda: search(*flipped, range_px))
     v, u = np.nonzero(np.isfinite(disparity))
     forward = disparity[v, u]
     # the right image shows the pixel at column u - d, which is width - 1 - (u - d) in the mirrored image
@@ -94,6 +137,10 @@ def search_consistent(left: Image, right: Image, max_disparity_px: int) -> Map:
     consistent = np.full_like(disparity, np.nan)
     consistent[v, u] = np.where(np.abs(backward - forward) <= CONSISTENCY_PX, forward, np.nan)
     return consistent
+
+
+def _step_px(width_px: int) -> np.float32:
+    return np.float32(MAX_DISPARITY_FRACTION * width_px / 65000)
 
 
 def _normalise_contrast(image: Image | Map) -> Image:

@@ -1,4 +1,4 @@
-"""Storage of the keyframes' images on disk."""
+"""Storage of the keyframes' images and disparities on disk."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from twin.core.records import Image
 from twin.estimate.vision import matching
+from twin.estimate.vision.disparity import Disparity
 
 _CACHE_BYTES = 384 * 2**20
 
@@ -20,7 +21,8 @@ _CACHE_BYTES = 384 * 2**20
 class ImageSpool:
     """Stores stereo pairs on disk as lossless PNG, with a cache of limited size of the last grey levels used.
 
-    `gray` may be called by several threads. Methods but `close` raise OSError if images could not be read or written.
+    Their disparities are kept until `close`. `gray` may be called by several threads. Methods but `close` raise OSError
+    if files could not be read or written.
 
     Args:
         folder: folder of the images; created if missing.
@@ -35,10 +37,17 @@ class ImageSpool:
         self._writing: Future[None] | None = None
         self._gray: OrderedDict[int, tuple[NDArray[np.float16], NDArray[np.float16]]] = OrderedDict()
 
-    def put(self, row: int, left: Image, right: Image, gray: tuple[matching.Gray, matching.Gray]) -> None:
-        """Stores the full stereo pair of a keyframe, which another thread writes, and its binned grey levels."""
+    def put(
+        self,
+        row: int,
+        left: Image,
+        right: Image,
+        gray: tuple[matching.Gray, matching.Gray],
+        disparity: Disparity | None = None,
+    ) -> None:
+        """Stores the full stereo pair of a keyframe, which another thread writes; binned grey levels and disparity."""
         self.flush()
-        self._writing = self._writer.submit(self._write, row, left, right)
+        self._writing = self._writer.submit(self._write, row, left, right, disparity)
         with self._lock:
             self._cache(row, gray)
 
@@ -51,14 +60,24 @@ class ImageSpool:
     def close(self) -> None:
         """Waits until all pairs are written, and ends the thread; an error of the last pair is not raised."""
         self._writer.shutdown()
+        for file in self.folder.glob("*_disparity.npy"):
+            file.unlink(missing_ok=True)
 
     def pair(self, row: int) -> tuple[Image, Image]:
         """Returns the left and the right image (H, W, 3) of the keyframe at frame index `row`."""
-        return self.left(row), self._read(row, "right")
+        return self.left(row), self.right(row)
 
     def left(self, row: int) -> Image:
         self.flush()
         return self._read(row, "left")
+
+    def right(self, row: int) -> Image:
+        self.flush()
+        return self._read(row, "right")
+
+    def disparity(self, row: int) -> Disparity:
+        self.flush()
+        return Disparity.unpacked(np.load(self._path(row, "disparity", ".npy")))
 
     def gray(self, row: int) -> tuple[matching.Gray, matching.Gray]:
         """Returns the binned grey levels of both images of the keyframe at frame index `row`, in half precision."""
@@ -75,13 +94,15 @@ class ImageSpool:
         while len(self._gray) > 1 and len(self._gray) * pair[0].nbytes > _CACHE_BYTES:
             self._gray.popitem(last=False)
 
-    def _write(self, row: int, left: Image, right: Image) -> None:
+    def _write(self, row: int, left: Image, right: Image, disparity: Disparity | None) -> None:
         for side, image in (("left", left), ("right", right)):
             data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1]
             self._path(row, side).write_bytes(data.tobytes())
+        if disparity is not None:
+            np.save(self._path(row, "disparity", ".npy"), disparity.packed())
 
-    def _path(self, row: int, side: str) -> Path:
-        return self.folder / f"{row:06d}_{side}.png"
+    def _path(self, row: int, side: str, suffix: str = ".png") -> Path:
+        return self.folder / f"{row:06d}_{side}{suffix}"
 
     def _read(self, row: int, side: str) -> Image:
         path = self._path(row, side)

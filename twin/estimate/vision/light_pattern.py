@@ -19,14 +19,14 @@ from twin.core.records import Image, Map, StereoRig
 DEGREE = 6
 
 
-def pattern_fit(pair: tuple[Map, Map]) -> Array:
+def pattern_fit(pair: Sequence[Map] | Map) -> Array:
     """Returns the coefficients (2, d, d) of Legendre polynomials fitted to a pair, by degree along columns and rows."""
     rows, columns = (_fitting_matrix(n) for n in pair[0].shape)
     return np.array([rows @ image.astype(np.float64) @ columns.T for image in pair])
 
 
-def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> Map | None:
-    """Returns the light pattern (2, H, W) of a survey from the fits of its keyframes, in chronological order.
+def pattern_coefficients(fits: Sequence[Array]) -> Array | None:
+    """Returns the coefficients (2, d, d) of the light pattern from fits of keyframes, in chronological order.
 
     A coefficient is its mean m over the n keyframes times max(0, 1 - v / m^2) (positive-part shrinkage, James & Stein
     1961), which leaves texture and relief in the images. Images of neighbouring keyframes overlap, so the variance of
@@ -44,8 +44,24 @@ def light_pattern(fits: Sequence[Array], shape: tuple[int, int]) -> Map | None:
     if _power_without_mean(mean**2) <= _power_without_mean(scatter):
         return None
     variance = scatter * _images_per_independent_image(deviation) / len(fits)
-    kept = np.maximum(1 - variance / np.maximum(mean**2, 1e-12), 0) * mean
-    return np.array([_polynomials(shape[0]) @ side @ _polynomials(shape[1]).T for side in kept], np.float32)
+    return np.asarray(np.maximum(1 - variance / np.maximum(mean**2, 1e-12), 0) * mean)
+
+
+def light_pattern(coefficients: Array | None, shape: tuple[int, ...]) -> Map:
+    """Returns the images (2, H, W) of a light pattern; zeros for None."""
+    if coefficients is None:
+        return np.zeros((2, *shape), np.float32)
+    return np.array([_polynomials(shape[0]) @ side @ _polynomials(shape[1]).T for side in coefficients], np.float32)
+
+
+def pattern_difference(a: Array | None, b: Array | None) -> float:
+    """Returns the RMS difference of two light patterns, without constants, of the image that differs most."""
+    difference = np.zeros((2, DEGREE + 1, DEGREE + 1))
+    for sign, coefficients in ((1, a), (-1, b)):
+        difference += 0 if coefficients is None else sign * coefficients
+    norms = 1 / (2 * np.arange(DEGREE + 1) + 1)  # mean squares of the polynomials
+    difference[:, 0, 0] = 0
+    return float(np.sqrt(np.max(np.einsum("kij,i,j->k", difference**2, norms, norms))))
 
 
 def _power_without_mean(squares: Array) -> float:

@@ -24,6 +24,11 @@ _FLAT_GRAY = 2.0  # standard deviation of sensor noise [grey levels]; keeps unif
 _FORWARD_BACKWARD_PX = 0.5
 
 
+def luma(rgb: Image) -> Gray:
+    """Returns the grey levels (H, W) of an image (H, W, 3), neither smoothed nor rounded to whole levels."""
+    return np.asarray(cv2.cvtColor(rgb.astype(np.float32), cv2.COLOR_RGB2GRAY), np.float32)
+
+
 def gray(rgb: Image | Gray, binning: int = 1) -> Gray:
     """Returns the slightly smoothed grey levels (H / binning, W / binning) in which patches are matched.
 

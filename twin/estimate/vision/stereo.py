@@ -13,7 +13,7 @@ from twin.core import geometry
 from twin.core.geometry import Array
 from twin.core.records import Displacement, Exposure, Image, Map, Mask, Readings, StereoRig
 from twin.core.settings import EstimatorSettings
-from twin.estimate.vision import disparity, epipolar, matching, patches
+from twin.estimate.vision import disparity, matching, patches
 
 BINNINGS = (1, 2, 4)  #: numbers of pixels that may be averaged along each side
 _MIN_MATCHED = 2 / 3  # smallest sufficient fraction of matched corners, see `choose_binning`
@@ -146,13 +146,13 @@ def corners_with_disparity(left: matching.Gray, dense_px: Map, settings: Estimat
 def match_stereo_points(
     left: matching.Gray, right: matching.Gray, dense_px: Map, rig: StereoRig, settings: EstimatorSettings
 ) -> StereoPoints:
-    """Matches corners of the left image in the right one, to sub-pixel accuracy, from an initial disparity (H, W) [px].
+    """Matches corners of the left image in the right one, to sub-pixel accuracy, from a refined disparity (H, W) [px].
 
     Grey levels are those of `matching.gray`; the rig is that of the images, with square pixels.
     """
     patch_px = settings.patch_px
     pixels, disparity_px = corners_with_disparity(left, dense_px, settings)
-    slope = patches.disparity_slope(_refined(dense_px, left, right), pixels, patch_px)
+    slope = patches.disparity_slope(dense_px, pixels, patch_px)
     warp = np.tile(np.eye(2), (len(pixels), 1, 1))
     warp[:, 0] -= slope
     guess = pixels - np.column_stack([disparity_px, np.zeros(len(pixels))])
@@ -182,8 +182,7 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
         if rig.width_px % binning or rig.height_px % binning:
             break
         scaled, left_gray, right_gray = rig.binned(binning), matching.gray(left, binning), matching.gray(right, binning)
-        widest_px = disparity.SearchRange(scaled).max_disparity_px
-        dense_px = disparity.search(matching.normalise(left_gray), matching.normalise(right_gray), widest_px)
+        dense_px = disparity.match_densely(left_gray, right_gray).best_px
         pixels, _ = corners_with_disparity(left_gray, dense_px, settings)
         points = match_stereo_points(left_gray, right_gray, dense_px, scaled, settings)
         fraction = len(points.xyz) / max(len(pixels), 1)
@@ -192,15 +191,6 @@ def choose_binning(left: Image, right: Image, rig: StereoRig, settings: Estimato
         if fraction > best_fraction:
             best, best_fraction = binning, fraction
     return best
-
-
-def _refined(dense_px: Map, left: matching.Gray, right: matching.Gray) -> Map:
-    """Returns disparities (H, W) [px] for the slopes of patches: refined ones, or the initial ones where that fails.
-
-    Semi-global matching makes slopes 8 to 12 % too small over coarse texture, which biased the rotation of links.
-    """
-    refined = epipolar.refine(left, right, dense_px, epipolar.STEREO).disparity_px
-    return np.where(np.isfinite(refined), refined, dense_px)
 
 
 def _local_mean(dense_px: Map, side_px: int) -> Map:

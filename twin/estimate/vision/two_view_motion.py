@@ -31,7 +31,8 @@ HUBER = 1.5
 _LOCKING_SIGMA_PX = 0.006
 MAX_LOCKING_PX = 3 * _LOCKING_SIGMA_PX  #: largest plausible estimate of the amplitude
 _MIN_POINTS = 12
-_ITERATIONS = 6  # Gauss-Newton iterations of `pair_motion`
+_ITERATIONS = 6  # most Gauss-Newton iterations of `pair_motion`
+_CONVERGED = 1e-2  # the iteration ends after a step smaller than this many standard deviations
 _CLOSED_FORMS = 4  # iterations of `exact_depth_motion`
 CUTOFF = 4.0  # residuals of `pair_motion` beyond this many standard deviations have zero weight
 _PRIOR_POINTS = 50  # weight of the expected covariance of the scores in `_scatter_cov`, as a number of points
@@ -147,6 +148,8 @@ def _adjust_pair(
         structure = adjust_structure(observations, measured, update)
         a_from_b = a_from_b @ geometry.exp(update[:6])
         amplitude_px += float(update[6:].sum())
+        if update @ normals.normal @ update < (_CONVERGED * normals.scale) ** 2:
+            break
     if abs(amplitude_px) > MAX_LOCKING_PX:
         return _adjust_pair(measured, baseline_m, guess, settings._replace(locking=None))
     if normals is None or np.count_nonzero(normals.weight) < _MIN_POINTS:
